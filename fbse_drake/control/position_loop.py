@@ -1,0 +1,101 @@
+"""Joint position control (paper eq. 68)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from fbse_drake.errors import InputError
+from fbse_drake.robot.description import RobotDescription
+from fbse_drake.sampling import is_tick
+
+
+@dataclass(frozen=True)
+class PositionLoopConfig:
+    """Gains by joint (see `RobotDescription.per_joint`); defaults are the paper's."""
+
+    # Proportional gain [Nm/rad] and derivative gain [Nm s/rad].
+    kp: dict[str, float] = field(
+        default_factory=lambda: {
+            "hip_yaw": 6000.0,
+            "hip_roll": 2000.0,
+            "hip_pitch": 2000.0,
+            "knee_pitch": 3000.0,
+            "ankle_pitch": 3000.0,
+            "ankle_roll": 6000.0,
+        }
+    )
+    kd: dict[str, float] = field(default_factory=lambda: {"all": 1.0})
+    # Largest torque in either direction [Nm].
+    torque_limit: dict[str, float] = field(default_factory=lambda: {"all": 300.0})
+    # Is the reference's feed-forward torque (gravity and inertia) added?
+    feedforward: bool = True
+    # Period of the control [s].
+    period: float = 0.001
+
+    def __post_init__(self) -> None:
+        if self.period <= 0:
+            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+        for name in ("kp", "kd", "torque_limit"):
+            values: Mapping[str, Any] = getattr(self, name)
+            for joint, value in values.items():
+                if value < 0:
+                    raise InputError(f"{name}.{joint}: expected a number >= 0, found {value:g}")
+
+
+def position_loop(error: np.ndarray, error_rate: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> np.ndarray:
+    """Torque of the position loop, tau_pos = kp (theta_ref - theta) + kd (theta_ref_dot - theta_dot), paper eq. (68) [Nm]."""
+    return kp * error + kd * error_rate
+
+
+class PositionLoop(LeafSystem):
+    """Position loop with feed-forward and friction compensation, held between its ticks.
+
+    .. pydrake_system::
+
+        name: PositionLoop
+        input_ports:
+        - estimated_state
+        - desired_state
+        - feedforward_torque
+        - friction_estimate
+        output_ports:
+        - torque_command
+
+    States are [positions, velocities], shape (2n,) [rad, rad/s]; torques have shape (n,) [Nm]. The command is the position loop's
+    torque plus feed-forward plus friction estimate, within the limits; `feedforward_torque` and `friction_estimate` may be left
+    unconnected and count as zero. At a tick the command is that of the tick's own inputs. Discrete state: the command being held.
+    """
+
+    def __init__(self, config: PositionLoopConfig, names: RobotDescription):
+        """Raises InputError for an unknown joint or one without a gain."""
+        super().__init__()
+        n = len(names.joint_names)
+        self._n, self._period = n, config.period
+        self._kp = names.per_joint(config.kp, key="control.kp")
+        self._kd = names.per_joint(config.kd, key="control.kd")
+        self._limit = names.per_joint(config.torque_limit, key="control.torque_limit")
+        self._estimated_state = self.DeclareVectorInputPort("estimated_state", 2 * n)
+        self._desired_state = self.DeclareVectorInputPort("desired_state", 2 * n)
+        self._feedforward = self.DeclareVectorInputPort("feedforward_torque", n)
+        self._friction = self.DeclareVectorInputPort("friction_estimate", n)
+        self._held = self.DeclareDiscreteState(n)
+        sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
+        self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._hold)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        if not is_tick(context.get_time(), self._period):
+            output.SetFromVector(context.get_discrete_state(self._held).value())
+            return
+        error = self._desired_state.Eval(context) - self._estimated_state.Eval(context)
+        torque = position_loop(error[: self._n], error[self._n :], self._kp, self._kd)
+        for port in (self._feedforward, self._friction):
+            if port.HasValue(context):
+                torque = torque + port.Eval(context)
+        output.SetFromVector(np.minimum(np.maximum(torque, -self._limit), self._limit))
+
+    def _hold(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._held).set_value(self.torque_command.Eval(context))

@@ -1,0 +1,163 @@
+"""Logs: named channels over time, from a simulation or from a robot.
+
+Row k holds what is known at `time[k]`: joint positions and velocities at that time; IMU and foot forces over the plant's step that ends
+then; commanded torque and friction torque of the step that begins then.
+"""
+
+import json
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fbse_drake.errors import InputError, located
+
+FORMAT_VERSION = 1
+
+# Channel name pattern -> unit, shape of one sample (n joints, m rows of any number).
+_CHANNELS: list[tuple[str, str, tuple[str | int, ...]]] = [
+    (r"time", "s", ()),
+    (r"(truth/|reference/|estimate/)?joint/position", "rad", ("n",)),
+    (r"(truth/|reference/|estimate/)?joint/velocity", "rad/s", ("n",)),
+    (r"(truth/|reference/|estimate/)?joint/acceleration", "rad/s^2", ("n",)),
+    (r"(truth/|reference/|estimate/)?joint/\w*torque\w*", "Nm", ("n",)),
+    (r"joint/temperature", "degC", ("n",)),
+    (r"imu/linear_acceleration", "m/s^2", (3,)),
+    (r"imu/angular_velocity", "rad/s", (3,)),
+    (r"(truth/)?foot/\w+/pad_force", "N", ("m", 3)),
+    (r"(truth/)?foot/\w+/wrench", "Nm, N", (6,)),
+    (r"\w+/foot/\w+/position", "m", (3,)),
+    (r"\w+/foot/\w+/support", "1", ()),
+    (r"\w+/(base|com)/position", "m", (3,)),
+    (r"\w+/base/orientation", "1", (4,)),
+    (r"\w+/(base|com)/velocity", "m/s", (3,)),
+    (r"\w+/(base|com)/acceleration", "m/s^2", (3,)),
+    (r"\w+/base/angular_velocity", "rad/s", (3,)),
+    (r"\w+/base/angular_acceleration", "rad/s^2", (3,)),
+    (r"\w+/zmp", "m", (2,)),
+]
+_REQUIRED = ("time", "joint/position", "joint/torque_command")
+
+
+@dataclass(frozen=True)
+class Log(Mapping[str, np.ndarray]):
+    """Channels by name, `log["joint/position"]`, and what is known about them.
+
+    The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`, `joint/velocity` and
+    `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force) and `imu/angular_velocity` (N, 3) in the IMU frame,
+    `foot/<side>/pad_force` (N, pads, 3) in the sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
+    `reference/`, `estimate/` or `truth/`.
+
+    Raises:
+        InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.
+    """
+
+    channels: dict[str, np.ndarray]
+    # "joints": names in column order; "sides"; "frames"; "period" [s]; "source"; "scenario": YAML text; "outcome".
+    meta: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        for name in _REQUIRED:
+            if name not in self.channels:
+                raise InputError(f"channel {name} is missing (required: {', '.join(_REQUIRED)})")
+        for key in ("joints", "period"):
+            if key not in self.meta:
+                raise InputError(f"meta has no {key}")
+        n, samples = len(self.meta["joints"]), len(self.channels["time"])
+        if samples == 0:
+            raise InputError("no samples")
+        for name, values in self.channels.items():
+            _, sample_shape = _channel_kind(name)
+            expected = (samples, *(n if size == "n" else size for size in sample_shape))
+            if len(values.shape) != len(expected) or any(e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)):
+                raise InputError(f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}")
+            finite = np.isfinite(values).reshape(samples, -1).all(axis=1)
+            if not finite.all():
+                raise InputError(f"channel {name}: not a finite number in row {int(finite.argmin())}")
+        backwards = np.diff(self.channels["time"]) <= 0
+        if backwards.any():
+            row = int(backwards.argmax()) + 1
+            raise InputError(f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} s)")
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.channels:
+            raise KeyError(f"no channel {name} in this log (there are: {', '.join(self.channels)})")
+        return self.channels[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.channels)
+
+    def __len__(self) -> int:
+        return len(self.channels)
+
+    @property
+    def time(self) -> np.ndarray:
+        return self.channels["time"]
+
+    @property
+    def joints(self) -> list[str]:
+        return self.meta["joints"]
+
+    @property
+    def sides(self) -> list[str]:
+        return self.meta.get("sides", [])
+
+    def unit(self, name: str) -> str:
+        """Unit of a channel, as `rad/s`."""
+        return _channel_kind(name)[0]
+
+    def save(self, path: str | Path) -> None:
+        """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""
+        path = Path(path)
+        meta = {"format_version": FORMAT_VERSION, **self.meta, "units": {name: self.unit(name) for name in self.channels}}
+        partial = path.with_name(f".{path.name}.part")
+        try:
+            with open(partial, "wb") as file:
+                np.savez_compressed(file, meta=np.array(json.dumps(meta)), **self.channels)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Log":
+        """Reads what `save` wrote.
+
+        Raises:
+            InputError: no such file, truncated, not a log, or another format version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                content = {name: file[name] for name in file.files}
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or 'not a log file (npz)'}") from None
+        except (zipfile.BadZipFile, ValueError, EOFError, zlib.error) as error:
+            raise InputError(f"{path}: truncated or not a log file (npz): {error}") from None
+        if "meta" not in content:
+            raise InputError(f"{path}: not a log file: it has no meta")
+        try:
+            meta = json.loads(str(content.pop("meta")))
+        except json.JSONDecodeError:
+            raise InputError(f"{path}: meta is not JSON text") from None
+        version = meta.pop("format_version", None)
+        meta.pop("units", None)
+        if version != FORMAT_VERSION:
+            raise InputError(f"{path}: log format version {version}, this program reads {FORMAT_VERSION}")
+        with located(f"{path}: "):
+            return cls(content, meta)
+
+
+def _channel_kind(name: str) -> tuple[str, tuple[str | int, ...]]:
+    for pattern, unit, shape in _CHANNELS:
+        if re.fullmatch(pattern, name):
+            return unit, shape
+    raise InputError(f"channel {name}: not a channel of a log (see fbse_drake.log.Log)")
+
+
+def _shape_text(shape: tuple[Any, ...]) -> str:
+    return " x ".join(map(str, shape))

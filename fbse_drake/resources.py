@@ -1,0 +1,29 @@
+"""Finds the models and scenarios that ship with the package."""
+
+from pathlib import Path
+
+from fbse_drake.errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def folder(name: str) -> Path:
+    """The folder `models` or `scenarios`: inside an installed package, beside the package in a checkout."""
+    installed = _PACKAGE / name
+    return installed if installed.is_dir() else _PACKAGE.parent / name
+
+
+def find(name_or_path: str | Path, *, kind: str) -> Path:
+    """The YAML file that a user means by a path or by the name of a file in the folder `kind`.
+
+    Raises:
+        InputError: no such file; the message lists the names that exist.
+    """
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    shipped = folder(kind) / f"{name_or_path}.yaml"
+    if path.suffix == "" and shipped.is_file():
+        return shipped
+    names = ", ".join(sorted(p.stem for p in folder(kind).glob("*.yaml") if not p.stem.endswith(".dmd")))
+    raise InputError(f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {names})")

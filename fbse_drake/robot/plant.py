@@ -1,0 +1,200 @@
+"""Plants: a robot's model in Drake, with the names of its description resolved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import AddContactMaterial, Box, GeometryId, ProximityProperties, Role, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import Frame, RigidBody
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from fbse_drake.errors import InputError
+from fbse_drake.robot.description import RobotDescription, load_description
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Level ground with point contact."""
+
+    # Coulomb friction coefficient of the ground's surface; the pads' own is in the robot's model.
+    friction: float = 0.8
+    # Contact stiffness [N/m] and Hunt-Crossley dissipation [s/m] of one point.
+    stiffness: float = 1.0e6
+    dissipation: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("friction", "stiffness", "dissipation"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A finalized plant together with its description. Joint vectors have the description's order, shape (n,)."""
+
+    plant: MultibodyPlant
+    description: RobotDescription
+
+    @property
+    def joint_names(self) -> list[str]:
+        return self.description.joint_names
+
+    @cached_property
+    def has_floating_base(self) -> bool:
+        return self.base.is_floating_base_body()
+
+    @cached_property
+    def base(self) -> RigidBody:
+        return self.plant.GetBodyByName(self.description.base)
+
+    @cached_property
+    def imu(self) -> Frame:
+        return self.plant.GetFrameByName(self.description.imu)
+
+    def sole(self, side: str) -> Frame:
+        return self.plant.GetFrameByName(self.description.legs[side].sole)
+
+    @cached_property
+    def position_index(self) -> np.ndarray:
+        """Place of each joint's angle in the plant's positions, shape (n,)."""
+        return np.array([self.plant.GetJointByName(name).position_start() for name in self.joint_names])
+
+    @cached_property
+    def velocity_index(self) -> np.ndarray:
+        """Place of each joint's rate in the plant's velocities, shape (n,)."""
+        return np.array([self.plant.GetJointByName(name).velocity_start() for name in self.joint_names])
+
+    @cached_property
+    def joint_state_selector(self) -> np.ndarray:
+        """Matrix that takes the plant's state to [joint positions, joint velocities], shape (2n, state)."""
+        columns = np.concatenate([self.position_index, self.plant.num_positions() + self.velocity_index])
+        return np.eye(self.plant.num_multibody_states())[columns]
+
+    @cached_property
+    def joint_force_selector(self) -> np.ndarray:
+        """Matrix that takes joint torques to generalized forces, shape (velocities, n)."""
+        return np.eye(self.plant.num_velocities())[:, self.velocity_index]
+
+    @cached_property
+    def actuation_selector(self) -> np.ndarray:
+        """Matrix that takes joint torques to the plant's actuation vector, shape (actuators, n)."""
+        return self.plant.MakeActuationMatrix().T @ self.joint_force_selector
+
+    def base_pose_positions(self, X_WB: RigidTransform) -> np.ndarray:
+        """Default positions of the plant with the base at X_WB, shape (positions,)."""
+        context = self.plant.CreateDefaultContext()
+        if self.has_floating_base:
+            self.plant.SetFloatingBaseBodyPoseInWorldFrame(context, self.base, X_WB)
+        return self.plant.GetPositions(context)
+
+    def set_joint_positions(self, context: Context, q: np.ndarray) -> None:
+        positions = self.plant.GetPositions(context)
+        positions[self.position_index] = q
+        self.plant.SetPositions(context, positions)
+
+    def joint_compliance(self, context: Context) -> np.ndarray:
+        """Joint accelerations per joint torque of the free robot: the joints' block of the inverse mass matrix,
+        shape (n, n) [1/(kg m^2)]. Contact with the ground can only make it smaller."""
+        index = self.velocity_index
+        return np.linalg.inv(self.plant.CalcMassMatrix(context))[np.ix_(index, index)]
+
+
+def make_robot(
+    description: str | Path,
+    *,
+    rotor_inertia: Mapping[str, float] | None = None,
+    fix_base: bool = False,
+    builder: DiagramBuilder | None = None,
+    config: MultibodyPlantConfig | None = None,
+    ground: Ground | None = None,
+) -> tuple[Robot, SceneGraph]:
+    """Loads a robot's model into a plant.
+
+    Args:
+        description: name or path of a robot description (`models/*.yaml`).
+        rotor_inertia: reflected rotor inertia [kg m^2] by joint, see `RobotDescription.per_joint`.
+        fix_base: welds the base to the world where the model has it by default (a gantry).
+        builder: the diagram that gets the plant and its scene graph; by default one that is thrown away, which is what a
+            model needs that is only computed with.
+        config: Drake's plant settings.
+        ground: level ground at z = 0; without it there is none.
+
+    Raises:
+        InputError: unknown file, joint, frame, body or pad.
+    """
+    names, path = load_description(description)
+    plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), builder or DiagramBuilder())
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
+    try:
+        ProcessModelDirectives(LoadModelDirectives(str(path.parent / names.directives)), parser)
+    except RuntimeError as error:
+        raise InputError(f"{path}: directives: {str(error).splitlines()[0]}") from None
+    _check_names(plant, names, path)
+
+    inertia = names.per_joint(rotor_inertia or {}, key="rotor_inertia", default=0.0)
+    actuators = {plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()}
+    for joint, value in zip(names.joint_names, inertia, strict=True):
+        actuators[joint].set_default_rotor_inertia(value)
+        actuators[joint].set_default_gear_ratio(1.0)
+    if fix_base:
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(names.base))
+    if ground is not None:
+        _add_ground(plant, ground)
+    plant.Finalize()
+    return Robot(plant, names), scene_graph
+
+
+def pad_geometries(robot: Robot, scene_graph: SceneGraph) -> dict[str, list[GeometryId]]:
+    """Collision geometries of each foot's force sensor pads, in the description's order.
+
+    Raises:
+        InputError: the foot has no such collision geometry.
+    """
+    inspector = scene_graph.model_inspector()
+    found = {}
+    for side, leg in robot.description.legs.items():
+        body = robot.plant.GetBodyByName(leg.foot)
+        frame = robot.plant.GetBodyFrameIdOrThrow(body.index())
+        ids = {inspector.GetName(i).split("::")[-1]: i for i in inspector.GetGeometries(frame, Role.kProximity)}
+        for name in leg.pads:
+            if name not in ids:
+                raise InputError(f"legs.{side}.pads.{name}: {leg.foot} has no such collision geometry (there are: {', '.join(ids)})")
+        found[side] = [ids[name] for name in leg.pads]
+    return found
+
+
+def _check_names(plant: MultibodyPlant, names: RobotDescription, path: Path) -> None:
+    def check(key: str, name: str, exists: bool, kind: str) -> None:
+        if not exists:
+            raise InputError(f"{path}: {key}: the model has no {kind} called {name}")
+
+    check("base", names.base, plant.HasBodyNamed(names.base), "body")
+    check("imu", names.imu, plant.HasFrameNamed(names.imu), "frame")
+    actuated = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices()]
+    for side, leg in names.legs.items():
+        for joint in leg.joints:
+            check(f"legs.{side}.joints", joint, joint in actuated, "actuated joint")
+        check(f"legs.{side}.foot", leg.foot, plant.HasBodyNamed(leg.foot), "body")
+        check(f"legs.{side}.sole", leg.sole, plant.HasFrameNamed(leg.sole), "frame")
+
+
+def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
+    size, thickness = 20.0, 1.0
+    X_WG = RigidTransform([0, 0, -thickness / 2])
+    properties = ProximityProperties()
+    AddContactMaterial(
+        properties=properties,
+        friction=CoulombFriction(ground.friction, ground.friction),
+        point_stiffness=ground.stiffness,
+        dissipation=ground.dissipation,
+    )
+    plant.RegisterCollisionGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", properties)
+    plant.RegisterVisualGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", np.array([0.86, 0.88, 0.9, 1.0]))
+
+

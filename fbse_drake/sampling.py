@@ -1,0 +1,16 @@
+"""Clock ticks of sampled systems.
+
+Drake's discrete plant with sampled output ports steps in an *unrestricted* update, which comes before all *discrete* updates of the same
+time. A discrete update of another system would therefore see the plant's state of the next tick. All systems here that remember
+something from tick to tick do so in unrestricted updates, which see the same state as the plant's own.
+"""
+
+
+def tick_index(time: float, period: float) -> int:
+    """Number of the last tick at or before a time; times within a millionth of a period count as on it."""
+    return int(time / period + 1e-6)
+
+
+def is_tick(time: float, period: float) -> bool:
+    """Does a tick fall on this time?"""
+    return abs(time - tick_index(time, period) * period) < 1e-6 * period

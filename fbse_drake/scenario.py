@@ -1,0 +1,193 @@
+"""What can be said in a scenario file.
+
+A file holds one or more named scenarios. What is left out has the default below; `--set a.b.c=value` goes on top.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydrake.common.yaml import yaml_load
+from pydrake.multibody.plant import MultibodyPlantConfig
+
+from fbse_drake import resources, schema
+from fbse_drake.control.position_loop import PositionLoopConfig
+from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
+from fbse_drake.errors import InputError, located
+from fbse_drake.robot.description import load_description
+from fbse_drake.robot.plant import Ground
+from fbse_drake.sensors.encoders import EncoderConfig
+from fbse_drake.sensors.foot_force import FootForceConfig
+from fbse_drake.sensors.imu import ImuConfig
+from fbse_drake.walking.reference import ReferenceConfig
+from fbse_drake.walking.walk import Walk
+
+JointEffectConfig = StribeckFriction | CoulombViscousFriction
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """A robot's body and the physical effects in it; the same words for the robot and for the model of it."""
+
+    # Name or path of a robot description (models/*.yaml).
+    description: str = "biped"
+    # Welds the base to the world where the model file has it (a gantry).
+    fix_base: bool = False
+    # Reflected rotor inertia by joint [kg m^2].
+    rotor_inertia: dict[str, float] = field(default_factory=dict)
+    # Physical effects, each under a name of your choice.
+    effects: dict[str, JointEffectConfig] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for joint, value in self.rotor_inertia.items():
+            if value < 0:
+                raise InputError(f"rotor_inertia.{joint}: expected a number >= 0, found {value:g}")
+
+
+@dataclass(frozen=True)
+class SensorsConfig:
+    """Sensors of the robot; without errors by default."""
+
+    encoders: EncoderConfig = field(default_factory=EncoderConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    foot_force: FootForceConfig = field(default_factory=FootForceConfig)
+
+
+@dataclass(frozen=True)
+class FallConfig:
+    """When the robot counts as fallen."""
+
+    # Height of the base over its height at the start.
+    height_ratio: float = 0.7
+    # Tilt of the base [rad].
+    tilt: float = 0.8
+
+
+@dataclass(frozen=True)
+class LogConfig:
+    """What is recorded."""
+
+    # Time between samples [s].
+    period: float = 0.001
+
+
+def _plant_config() -> MultibodyPlantConfig:
+    # "lagged" holds stance feet still; "sap" lets them creep by millimetres over a walk.
+    return MultibodyPlantConfig(time_step=0.001, contact_model="point", discrete_contact_approximation="lagged")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One experiment. SI units throughout."""
+
+    # One sentence for the reader of the report.
+    title: str = ""
+    # Seed of all sensor noise.
+    seed: int = 0
+    # Length of the experiment [s].
+    duration: float = 11.5
+    # What really happens.
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    # What is believed of it (feed-forward, estimators, predictions); by default the robot's body without its effects.
+    model: RobotConfig | None = None
+    # Drake's settings of the robot's plant, whose time_step must be > 0.
+    plant: MultibodyPlantConfig = field(default_factory=_plant_config)
+    ground: Ground = field(default_factory=Ground)
+    # The motion: !Walk, !Squat, !Sway or !JointSines.
+    reference: ReferenceConfig = field(default_factory=Walk)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
+    fall: FallConfig = field(default_factory=FallConfig)
+    log: LogConfig = field(default_factory=LogConfig)
+
+    def __post_init__(self) -> None:
+        if self.duration <= 0:
+            raise InputError(f"duration: expected a number > 0, found {self.duration:g}")
+        if self.seed < 0:
+            raise InputError(f"seed: expected a whole number >= 0, found {self.seed}")
+        if self.plant.time_step <= 0:
+            raise InputError(f"plant.time_step: expected a number > 0, found {self.plant.time_step:g}")
+        if not self.plant.use_sampled_output_ports:
+            raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
+        periods = {
+            "control.period": self.control.period,
+            "log.period": self.log.period,
+            "sensors.encoders.period": self.sensors.encoders.period,
+        }
+        for key, period in periods.items():
+            steps = period / self.plant.time_step
+            if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:
+                raise InputError(f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}")
+
+    @property
+    def believed(self) -> RobotConfig:
+        """The model, also where the scenario leaves it out."""
+        if self.model is not None:
+            return self.model
+        return RobotConfig(self.robot.description, self.robot.fix_base, self.robot.rotor_inertia)
+
+
+def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario.
+
+    Args:
+        scenario: path of a file, or the name of one in `scenarios/`.
+        name: which scenario of the file; by default its only one, or the one called like the file.
+        overrides: `a.b.c=value` on top of the file, values in YAML.
+
+    Raises:
+        InputError: file not found, unknown key, wrong type, impossible value, unknown joint.
+    """
+    return read_scenario(scenario, name, overrides)[1]
+
+
+def read_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> tuple[str, Scenario]:
+    """As `load_scenario`; returns the scenario's name as well."""
+    path = resources.find(scenario, kind="scenarios")
+    file = schema.load_tree(path)
+    if name is None:
+        name = next(iter(file)) if len(file) == 1 else path.stem
+    if name not in file:
+        raise InputError(f"{path}: no scenario called {name} (there are: {', '.join(map(str, file))})")
+    tree = file[name] if file[name] is not None else {}
+    source = str(path)
+    for override in overrides:
+        tree = schema.merge(tree, _override(override))
+        source = f"{path} with {', '.join(overrides)}"
+    result = schema.build(Scenario, tree, file=f"{source}: {name}")
+    with located(f"{source}: {name}: "):
+        check_joints(result)
+    return name, result
+
+
+def check_joints(scenario: Scenario) -> None:
+    """Refuses per-joint values of joints that the robot has not."""
+    for key, config in (("robot", scenario.robot), ("model", scenario.believed)):
+        with located(f"{key}."):
+            names, _ = load_description(config.description)
+            names.per_joint(config.rotor_inertia, key="rotor_inertia", default=0.0)
+            for effect, value in config.effects.items():
+                value.resolve(names, key=f"effects.{effect}")
+    names, _ = load_description(scenario.robot.description)
+    for key in ("kp", "kd", "torque_limit"):
+        names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
+
+
+def dump_scenario(scenario: Scenario, name: str) -> str:
+    """YAML text that `load_scenario` reads back to an equal scenario."""
+    return schema.dump(scenario, child_name=name)
+
+
+def _override(text: str) -> dict[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {text}: expected KEY=VALUE, as in --set reference.step_length=0.05")
+    try:
+        tree: Any = yaml_load(data=f"value: {value}")["value"]
+    except yaml.YAMLError:
+        raise InputError(f"--set {text}: {value!r} is not valid YAML") from None
+    for part in reversed(key.strip().split(".")):
+        tree = {part: tree}
+    return tree

@@ -1,0 +1,186 @@
+"""Typed YAML: builds frozen dataclasses from a document, with errors that name the file, the key and what is allowed.
+
+The document is parsed and written by `pydrake.common.yaml` (tags choose between alternatives: `reference: !Squat {...}`).
+Its typed loader assigns to attributes, which frozen dataclasses refuse, so the last step, tree to dataclass, is done here.
+"""
+
+import collections.abc
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydrake.common.yaml import yaml_dump, yaml_dump_typed, yaml_load_file
+
+from fbse_drake.errors import InputError
+
+T = TypeVar("T")
+
+_SCALARS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
+
+def load_tree(path: Path) -> dict[str, Any]:
+    """Parses a YAML file; a tag becomes the key `_tag` of its mapping.
+
+    Raises:
+        InputError: the file cannot be read, is no YAML or no mapping.
+    """
+    try:
+        tree = yaml_load_file(path)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f":{mark.line + 1}" if mark else ""
+        raise InputError(f"{path}{where}: not valid YAML: {getattr(error, 'problem', error)}") from None
+    if not isinstance(tree, dict):
+        raise InputError(f"{path}: expected a mapping of keys to values, found {_describe(tree)}")
+    return tree
+
+
+def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
+    """`tree` with the values of `override` on top; a mapping with another tag replaces, others merge key by key."""
+    merged = dict(tree)
+    for key, value in override.items():
+        old = merged.get(key)
+        same_kind = isinstance(old, dict) and isinstance(value, dict) and value.get("_tag", old.get("_tag")) == old.get("_tag")
+        merged[key] = merge(old, value) if same_kind else value
+    return merged
+
+
+def build(schema: type[T], tree: Any, *, file: str, key: str = "", default: T | None = None) -> T:
+    """Builds an object of the dataclass `schema` from a parsed document.
+
+    Args:
+        tree: what `load_tree` returned, or a part of it.
+        file, key: where the tree stands, for messages.
+        default: takes the place of the schema's own defaults.
+
+    Raises:
+        InputError: unknown key, wrong type or a value that the dataclass itself refuses.
+    """
+    return _build(schema, tree, default, f"{file}: ", key)
+
+
+def dump(value: Any, *, child_name: str | None = None) -> str:
+    """YAML text of a dataclass; `build(load)` of it gives an equal object."""
+    return yaml_dump_typed(value, child_name=child_name)
+
+
+def dump_tree(tree: dict[str, Any]) -> str:
+    """YAML text of a tree as `load_tree` gives it."""
+    return yaml_dump(tree)
+
+
+def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
+    origin, args = typing.get_origin(schema), typing.get_args(schema)
+    if schema in _SCALARS:
+        return _scalar(schema, value, file, key)
+    if origin in (typing.Union, types.UnionType):
+        return _alternative(args, value, default, file, key)
+    if origin is list:
+        if not isinstance(value, list):
+            raise InputError(f"{file}{key}: expected a list, found {_describe(value)}")
+        return [_build(args[0], item, None, file, f"{key}[{i}]") for i, item in enumerate(value)]
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")
+        old = default or {}
+        items = {str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()}
+        return {**old, **items}
+    return _mapping(schema, value, default, file, key)
+
+
+def _scalar(schema: type, value: Any, file: str, key: str) -> Any:
+    if schema is float and isinstance(value, str):
+        try:
+            value = float(value)  # YAML 1.1 reads 1e6 as a text
+        except ValueError:
+            pass
+    matches = isinstance(value, schema) or (schema is float and isinstance(value, int))
+    if not matches or (isinstance(value, bool) and schema is not bool):
+        raise InputError(f"{file}{key}: expected {_SCALARS[schema]}, found {_describe(value)}")
+    if schema is float and math.isnan(value):
+        raise InputError(f"{file}{key}: expected a number, found NaN")
+    return schema(value)
+
+
+def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, key: str) -> Any:
+    if type(None) in options:
+        if value is None:
+            return None
+        options = tuple(option for option in options if option is not type(None))
+    if len(options) == 1:
+        return _build(options[0], value, default, file, key)
+    names = {option.__name__: option for option in options}
+    tag = value.get("_tag") if isinstance(value, dict) else None
+    if tag is None and type(default) in options:
+        tag = f"!{type(default).__name__}"
+    if tag is None or tag[1:] not in names:
+        found = f"the tag {tag}" if tag else f"{_describe(value)} without a tag"
+        raise InputError(f"{file}{key}: expected one of {', '.join(f'!{name}' for name in names)}, found {found}")
+    schema = names[tag[1:]]
+    return _mapping(schema, value, default if type(default) is schema else None, file, key)
+
+
+def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
+    if not isinstance(value, collections.abc.Mapping):
+        raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")
+    fields = _fields(schema)
+    content = {k: v for k, v in value.items() if k != "_tag"}
+    prefix = f"{key}." if key else ""
+    for name in content:
+        if name not in fields:
+            close = difflib.get_close_matches(str(name), fields, n=1)
+            hint = f", did you mean {close[0]}?" if close else ""
+            raise InputError(f"{file}{prefix}{name}: unknown key{hint} (allowed: {', '.join(fields)})")
+    if default is None:
+        default = _default_of(schema, content, file, key)
+    values = {name: _build(fields[name], v, getattr(default, name, None), file, prefix + name) for name, v in content.items()}
+    try:
+        if not dataclasses.is_dataclass(schema):
+            drake_config = schema(**{name: getattr(default, name) for name in fields})
+            for name, v in values.items():
+                setattr(drake_config, name, v)
+            return drake_config
+        return schema(**values) if default is _MISSING else dataclasses.replace(default, **values)
+    except InputError as error:
+        raise InputError(f"{file}{prefix}{error}") from None
+
+
+_MISSING = object()
+
+
+def _default_of(schema: Any, content: collections.abc.Mapping, file: str, key: str) -> Any:
+    """An object with the schema's defaults, or _MISSING where some field has none (all of those must then be given)."""
+    if not dataclasses.is_dataclass(schema):
+        return schema()
+    required = [
+        f.name for f in dataclasses.fields(schema) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    ]
+    missing = [name for name in required if name not in content]
+    if missing:
+        raise InputError(f"{file}{key or 'top level'}: the key {missing[0]} is missing")
+    return _MISSING if required else schema()
+
+
+def _fields(schema: Any) -> dict[str, Any]:
+    if dataclasses.is_dataclass(schema):
+        return typing.get_type_hints(schema)
+    return {field.name: field.type for field in schema.__fields__}
+
+
+def _describe(value: Any) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
+    return f"{value!r}"

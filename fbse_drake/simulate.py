@@ -1,0 +1,209 @@
+"""Runs a scenario and records it."""
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
+
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import FallConfig, Scenario, dump_scenario
+from fbse_drake.station import Station, build_station
+
+# Output ports of the station that are recorded.
+_RECORDED = (
+    "measured_joint_state",
+    "measured_imu",
+    "measured_pad_force",
+    "torque_command",
+    "plant_state",
+    "generalized_acceleration",
+    "true_pad_force",
+    "torque_loss",
+)
+# The run is looked at (fall, progress, interruption) this often in simulated time [s].
+_LOOK_PERIOD = 0.005
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """A finished run."""
+
+    log: Log
+    # Why the run ended early, or None; also in log.meta["outcome"].
+    failure: str | None
+    # Time the loop took, without building and recording [s].
+    wall_time: float
+
+
+def simulate(
+    scenario: Scenario,
+    *,
+    name: str = "scenario",
+    meshcat: Meshcat | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> SimulationResult:
+    """Simulates a scenario to its end, to a fall, or to an interruption (Ctrl-C); what was recorded is returned in any case.
+
+    Args:
+        name: what the scenario is called in the log.
+        meshcat: also draws and records the robot there.
+        progress: called with the simulated time [s] as the run goes on.
+
+    Raises:
+        InputError: see `build_station`.
+    """
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
+    sinks = {port: LogVectorOutput(station.GetOutputPort(port), builder, scenario.log.period) for port in _RECORDED}
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    robot_context = station.robot.plant.GetMyContextFromRoot(context)
+    height = _base_pose(station.robot, robot_context).translation()[2]
+    if meshcat is not None:
+        meshcat.StartRecording()
+
+    failure, start = None, clock.perf_counter()
+    try:
+        simulator.Initialize()
+        looks = int(np.ceil(scenario.duration / _LOOK_PERIOD - 1e-9))
+        for look in range(1, looks + 1):
+            simulator.AdvanceTo(min(look * _LOOK_PERIOD, scenario.duration))
+            failure = fall_reason(station.robot, robot_context, scenario.fall, height)
+            if failure is not None:
+                break
+            if progress is not None:
+                progress(context.get_time())
+    except KeyboardInterrupt:
+        failure = "interrupted"
+    except RuntimeError as error:
+        failure = f"the solver failed: {str(error).splitlines()[0]}"
+    wall_time = clock.perf_counter() - start
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+    if failure is not None:
+        failure = f"t = {context.get_time():.3f} s: {failure}"
+    return SimulationResult(_make_log(scenario, name, station, context, sinks, failure), failure, wall_time)
+
+
+def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_height: float) -> str | None:
+    """Why the robot counts as fallen, in words, or None.
+
+    Args:
+        context: the plant's.
+        initial_height: height of the base at the start [m].
+    """
+    if not np.isfinite(robot.plant.GetPositionsAndVelocities(context)).all():
+        return "the state is not finite any more"
+    if not robot.has_floating_base:
+        return None
+    X_WB = _base_pose(robot, context)
+    height = X_WB.translation()[2]
+    if height < criterion.height_ratio * initial_height:
+        return f"fell: the base is {height:.2f} m high, less than {criterion.height_ratio:g} of {initial_height:.2f} m"
+    tilt = np.arccos(np.clip(X_WB.rotation().matrix()[2, 2], -1, 1))
+    if tilt > criterion.tilt:
+        return f"fell: the base is tilted by {np.rad2deg(tilt):.0f} deg, more than {np.rad2deg(criterion.tilt):.0f} deg"
+    return None
+
+
+def _base_pose(robot: Robot, context: Context) -> RigidTransform:
+    return robot.plant.EvalBodyPoseInWorld(context, robot.base)
+
+
+def _make_log(
+    scenario: Scenario, name: str, station: Station, context: Context, sinks: dict[str, VectorLogSink], failure: str | None
+) -> Log:
+    robot, n = station.robot, len(station.robot.joint_names)
+    raw = {port: sink.FindLog(context).data().T for port, sink in sinks.items()}
+    time = sinks["plant_state"].FindLog(context).sample_times()
+    # The recorded times are sums of periods; the ticks they stand for are exact.
+    time = np.round(time / scenario.log.period) * scenario.log.period
+    channels = {
+        "time": time,
+        "joint/position": raw["measured_joint_state"][:, :n],
+        "joint/velocity": raw["measured_joint_state"][:, n:],
+        "joint/torque_command": raw["torque_command"],
+        "imu/linear_acceleration": raw["measured_imu"][:, :3],
+        "imu/angular_velocity": raw["measured_imu"][:, 3:],
+        **_split_pads(robot, raw["measured_pad_force"], ""),
+        **_reference_channels(station, time),
+        "truth/joint/friction_torque": raw["torque_loss"],
+        **_split_pads(robot, raw["true_pad_force"], "truth/"),
+        **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
+    }
+    meta = {
+        "joints": robot.joint_names,
+        "sides": robot.description.sides,
+        "frames": {
+            "base": robot.description.base,
+            "imu": robot.description.imu,
+            "soles": {side: leg.sole for side, leg in robot.description.legs.items()},
+        },
+        "period": scenario.log.period,
+        "source": "fbse_drake simulation",
+        "scenario": dump_scenario(scenario, name),
+        "outcome": {"fell": failure is not None, "reason": failure or "finished", "time": float(time[-1])},
+    }
+    return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
+
+
+def _split_pads(robot: Robot, pad_force: np.ndarray, prefix: str) -> dict[str, np.ndarray]:
+    counts = np.cumsum([len(leg.pads) for leg in robot.description.legs.values()])[:-1]
+    parts = np.split(pad_force.reshape(len(pad_force), -1, 3), counts, axis=1)
+    return {f"{prefix}foot/{side}/pad_force": part for side, part in zip(robot.description.sides, parts, strict=True)}
+
+
+def _reference_channels(station: Station, time: np.ndarray) -> dict[str, np.ndarray]:
+    reference = station.reference
+    rows = np.clip(np.searchsorted(reference.time, time + 1e-9) - 1, 0, len(reference.time) - 1)
+    channels = {
+        "reference/joint/position": reference.joint_position[rows],
+        "reference/joint/velocity": reference.joint_velocity[rows],
+        "reference/joint/feedforward_torque": reference.feedforward_torque[rows],
+    }
+    plan = reference.plan
+    if plan is not None:
+        channels["reference/com/position"] = plan.com.position[rows]
+        channels["reference/com/velocity"] = plan.com.velocity[rows]
+        channels["reference/zmp"] = plan.zmp[rows]
+        for side, foot in plan.feet.items():
+            channels[f"reference/foot/{side}/position"] = foot.position[rows]
+            channels[f"reference/foot/{side}/support"] = plan.support(side)[rows].astype(float)
+    return channels
+
+
+def _truth_channels(robot: Robot, state: np.ndarray, acceleration: np.ndarray, pad_force: np.ndarray) -> dict[str, np.ndarray]:
+    """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of the exact foot forces."""
+    plant, samples = robot.plant, len(state)
+    context = plant.CreateDefaultContext()
+    soles = {side: robot.sole(side) for side in robot.description.sides}
+    v = state[:, plant.num_positions() :]
+    truth = {
+        "truth/joint/position": state[:, robot.position_index],
+        "truth/joint/velocity": v[:, robot.velocity_index],
+        "truth/joint/acceleration": acceleration[:, robot.velocity_index],
+    }
+    names = ("base/position", "com/position", "com/velocity", *(f"foot/{side}/position" for side in soles))
+    truth |= {f"truth/{name}": np.empty((samples, 3)) for name in names}
+    truth["truth/base/orientation"] = np.empty((samples, 4))
+    zmp = np.zeros((samples, 2))
+    for k in range(samples):
+        plant.SetPositionsAndVelocities(context, state[k])
+        X_WB = _base_pose(robot, context)
+        truth["truth/base/position"][k] = X_WB.translation()
+        truth["truth/base/orientation"][k] = X_WB.rotation().ToQuaternion().wxyz()
+        truth["truth/com/position"][k] = plant.CalcCenterOfMassPositionInWorld(context)
+        truth["truth/com/velocity"][k] = plant.CalcCenterOfMassTranslationalVelocityInWorld(context)
+        for side, sole in soles.items():
+            truth[f"truth/foot/{side}/position"][k] = sole.CalcPoseInWorld(context).translation()
+    del zmp, pad_force
+    return truth

@@ -1,0 +1,147 @@
+"""The closed loop as a Drake diagram: robot, sensors, controller, reference."""
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain
+
+from fbse_drake.control.position_loop import PositionLoop
+from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
+from fbse_drake.errors import located
+from fbse_drake.robot.plant import Robot, make_robot
+from fbse_drake.scenario import Scenario
+from fbse_drake.sensors.encoders import Encoders
+from fbse_drake.sensors.foot_force import FootForceSensors
+from fbse_drake.sensors.imu import Imu
+from fbse_drake.walking.reference import Reference, ReferenceSource, make_reference
+
+
+class Station(Diagram):
+    """A scenario's closed loop; made by `build_station`.
+
+    .. pydrake_system::
+
+        name: Station
+        input_ports:
+        - friction_estimate
+        output_ports:
+        - measured_joint_state
+        - measured_imu
+        - measured_pad_force
+        - torque_command
+        - desired_state
+        - feedforward_torque
+        - plant_state
+        - generalized_acceleration
+        - true_pad_force
+        - torque_loss
+
+    Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration, ideal pad forces, torque
+    loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the command and may be left unconnected.
+    """
+
+    robot: Robot
+    model: Robot
+    reference: Reference
+
+    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None):
+        super().__init__()
+        builder = DiagramBuilder()
+        config = scenario.robot
+        with located("robot: "):
+            self.robot, scene_graph = make_robot(
+                config.description,
+                rotor_inertia=config.rotor_inertia,
+                fix_base=config.fix_base,
+                builder=builder,
+                config=scenario.plant,
+                ground=scenario.ground,
+            )
+        with located("model: "):
+            believed = scenario.believed
+            self.model, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, fix_base=believed.fix_base)
+        with located("reference: "):
+            ticks = round(scenario.duration / scenario.control.period)
+            self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)
+        robot, names = self.robot, self.robot.description
+        n, plant = len(robot.joint_names), self.robot.plant
+        _set_initial_state(robot, self.reference, scenario)
+
+        joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
+        builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
+
+        # Physical effects.
+        context = plant.CreateDefaultContext()
+        inertia = conservative_inertia(robot.joint_compliance(context))
+        resolved = [effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items()]
+        effects = builder.AddNamedSystem("effects", JointTorqueEffects(resolved, inertia, scenario.plant.time_step))
+        loss_to_force = builder.AddNamedSystem("torque_loss_to_force", MatrixGain(-robot.joint_force_selector))
+        builder.Connect(joint_state.get_output_port(), effects.get_input_port())
+        builder.Connect(effects.get_output_port(), loss_to_force.get_input_port())
+        builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
+
+        # Sensors.
+        encoders = builder.AddNamedSystem("encoders", Encoders(scenario.sensors.encoders, n, scenario.seed))
+        builder.Connect(joint_state.get_output_port(), encoders.get_input_port())
+        imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, scenario.seed))
+        for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
+            builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
+        foot_force = builder.AddNamedSystem(
+            "foot_force", FootForceSensors(scenario.sensors.foot_force, robot, scene_graph, scenario.seed)
+        )
+        for name in ("contact_results", "body_poses"):
+            builder.Connect(plant.GetOutputPort(name), foot_force.GetInputPort(name))
+
+        # Reference and controller.
+        source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))
+        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names))
+        command = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
+        builder.Connect(encoders.get_output_port(), controller.GetInputPort("estimated_state"))
+        builder.Connect(source.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))
+        if scenario.control.feedforward:
+            builder.Connect(source.GetOutputPort("feedforward_torque"), controller.GetInputPort("feedforward_torque"))
+        builder.Connect(controller.get_output_port(), command.get_input_port())
+        builder.Connect(command.get_output_port(), plant.get_actuation_input_port())
+        builder.ExportInput(controller.GetInputPort("friction_estimate"), "friction_estimate")
+
+        builder.ExportOutput(encoders.get_output_port(), "measured_joint_state")
+        builder.ExportOutput(imu.get_output_port(), "measured_imu")
+        builder.ExportOutput(foot_force.GetOutputPort("measured_pad_force"), "measured_pad_force")
+        builder.ExportOutput(controller.get_output_port(), "torque_command")
+        builder.ExportOutput(source.GetOutputPort("desired_state"), "desired_state")
+        builder.ExportOutput(source.GetOutputPort("feedforward_torque"), "feedforward_torque")
+        builder.ExportOutput(plant.get_state_output_port(), "plant_state")
+        builder.ExportOutput(plant.get_generalized_acceleration_output_port(), "generalized_acceleration")
+        builder.ExportOutput(foot_force.GetOutputPort("true_pad_force"), "true_pad_force")
+        builder.ExportOutput(effects.get_output_port(), "torque_loss")
+        if meshcat is not None:
+            parameters = MeshcatVisualizerParams(publish_period=1 / 32)
+            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+        builder.BuildInto(self)
+
+
+def build_station(scenario: Scenario, *, meshcat: Meshcat | None = None) -> Station:
+    """Builds the closed loop of a scenario.
+
+    Args:
+        meshcat: also draws the robot there.
+
+    Raises:
+        InputError: a part of the scenario that does not fit the robot, or a motion that it cannot make.
+    """
+    return Station(scenario, meshcat)
+
+
+def _set_initial_state(robot: Robot, reference: Reference, scenario: Scenario) -> None:
+    """Makes the plant's default state the start of the reference, standing where the ground carries the weight."""
+    plant = robot.plant
+    context = plant.CreateDefaultContext()
+    if robot.has_floating_base:
+        pads = sum(len(leg.pads) for leg in robot.description.legs.values())
+        weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
+        penetration = weight / (pads * scenario.ground.stiffness)
+        p_WB = reference.base.position[0] - [0.0, 0.0, penetration]
+        plant.SetPositions(context, robot.base_pose_positions(RigidTransform(p_WB)))
+    robot.set_joint_positions(context, reference.joint_position[0])
+    plant.SetDefaultPositions(plant.GetPositions(context))

@@ -1,0 +1,109 @@
+"""What a reference motion is before it becomes joint angles: CoM, feet, ZMP and support over time, in the world frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from fbse_drake.errors import InputError
+
+
+@dataclass(frozen=True)
+class PointMotion:
+    """A point's position, velocity and acceleration over time, each of shape (N, 3) [m, m/s, m/s^2]."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of time with the same feet on the ground."""
+
+    start: float
+    end: float
+    # Sides that stand.
+    support: tuple[str, ...]
+
+    @property
+    def is_single(self) -> bool:
+        return len(self.support) == 1
+
+
+@dataclass(frozen=True)
+class TaskPlan:
+    """A reference motion in task space; feet flat, trunk upright."""
+
+    time: np.ndarray
+    com: PointMotion
+    # Sole frame origins.
+    feet: dict[str, PointMotion]
+    # (N, 2) [m].
+    zmp: np.ndarray
+    phases: tuple[Phase, ...]
+    # Place in each sole frame where the ZMP rests when the foot carries all the load, (2,) [m].
+    rest_point: dict[str, np.ndarray]
+
+    def support(self, side: str) -> np.ndarray:
+        """Does the foot stand at each sample? Shape (N,), bool."""
+        standing = np.zeros(len(self.time), dtype=bool)
+        for phase in self.phases:
+            if side in phase.support:
+                standing |= (phase.start <= self.time) & (self.time <= phase.end)
+        return standing
+
+    def phase_at(self, time: float) -> tuple[int, Phase]:
+        """Number and phase of a time."""
+        for number, phase in enumerate(self.phases):
+            if time <= phase.end:
+                return number, phase
+        return len(self.phases) - 1, self.phases[-1]
+
+
+def smooth_step(s: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """Quintic from 0 to 1 over s in [0, 1] with zero velocity and acceleration at both ends; constant outside."""
+    inside = (0 < s) & (s < 1)
+    s = np.clip(s, 0, 1)
+    value = {
+        0: s**3 * (10 - 15 * s + 6 * s**2),
+        1: 30 * s**2 * (1 - s) ** 2,
+        2: 60 * s * (1 - s) * (1 - 2 * s),
+    }[derivative]
+    return value if derivative == 0 else np.where(inside, value, 0.0)
+
+
+def support_margin(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Distance from points to the edge of the convex hull of corners, positive inside.
+
+    Args:
+        point: (N, 2) [m]; corners: (K, 2) [m].
+
+    Returns:
+        Shape (N,) [m].
+    """
+    equations = ConvexHull(corners).equations
+    return -(point @ equations[:, :2].T + equations[:, 2]).max(axis=1)
+
+
+def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float) -> None:
+    """Refuses a plan whose ZMP comes closer than `margin` [m] to the edge of the support polygon.
+
+    Args:
+        foot_corners: places of the pads in each sole frame, (pads, 3) [m].
+
+    Raises:
+        InputError: names the phase, time and margin.
+    """
+    for number, phase in enumerate(plan.phases):
+        inside = (phase.start < plan.time) & (plan.time < phase.end)
+        if not inside.any():
+            continue
+        corners = [plan.feet[side].position[inside][0, :2] + foot_corners[side][:, :2] for side in phase.support]
+        distance = support_margin(plan.zmp[inside], np.concatenate(corners))
+        if distance.min() < margin:
+            time = plan.time[inside][distance.argmin()]
+            raise InputError(
+                f"phase {number} ({' and '.join(phase.support)} support), t = {time:.2f} s: the ZMP is {distance.min():.3f} m inside the "
+                f"support polygon, zmp_margin asks for {margin:.3f} m; shorten the step, lengthen the phase or lower zmp_margin"
+            )

@@ -1,0 +1,285 @@
+"""Reference motions for the joints: inverse kinematics, feed-forward torque, and the Drake source that plays them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from fbse_drake.errors import InputError
+from fbse_drake.robot.plant import Robot
+from fbse_drake.walking.leg_kinematics import LegKinematics, LegMotion, UnreachableError
+from fbse_drake.walking.plan import PointMotion, TaskPlan
+from fbse_drake.walking.stand import Squat, Sway, smooth_sine
+from fbse_drake.walking.walk import Walk
+
+# The base position is found to this [m].
+_COM_TOLERANCE = 1e-12
+_MAX_ITERATIONS = 100
+
+
+@dataclass(frozen=True)
+class JointSines:
+    """Every joint swings about a posture on its own: q = posture + amplitude sin(2 pi frequency t + phase), from rest to rest.
+
+    For a robot on a gantry (`robot.fix_base`); the feet are free.
+    """
+
+    # By joint: posture [rad], amplitude [rad], frequency [Hz], phase [rad].
+    posture: dict[str, float] = field(default_factory=dict)
+    amplitude: dict[str, float] = field(default_factory=dict)
+    frequency: dict[str, float] = field(default_factory=lambda: {"all": 0.5})
+    phase: dict[str, float] = field(default_factory=dict)
+    # Time in which the motion swells and dies out [s].
+    ramp: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.ramp <= 0:
+            raise InputError(f"ramp: expected a number > 0, found {self.ramp:g}")
+
+
+ReferenceConfig = Walk | Squat | Sway | JointSines
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A reference motion sampled at `time`, N samples; joint quantities of shape (N, n) in the description's joint order."""
+
+    time: np.ndarray
+    joint_position: np.ndarray
+    joint_velocity: np.ndarray
+    joint_acceleration: np.ndarray
+    # What the model needs to follow the reference [Nm].
+    feedforward_torque: np.ndarray
+    base: PointMotion
+    # None for motions that are not planned in task space.
+    plan: TaskPlan | None
+
+
+def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> Reference:
+    """Plans a motion for a robot.
+
+    Args:
+        config: the motion.
+        robot: the model (not what it will be played on): kinematics, masses and inverse dynamics.
+        time: increasing sample times (N,) [s].
+
+    Raises:
+        InputError: a step out of reach, the ZMP too near the edge, a joint beyond its limits, an unknown joint.
+    """
+    if isinstance(config, JointSines):
+        return _joint_sines(config, robot, time)
+    if not robot.has_floating_base:
+        raise InputError(f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines")
+    legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
+    lateral = {side: float(np.sign(leg.offsets[0, 1])) for side, leg in legs.items()}
+    corners = {side: leg.p_FoPad for side, leg in robot.description.legs.items()}
+    gravity = robot.plant.gravity_field().gravity_vector()
+    plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
+    joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
+    _check_limits(robot, plan, joint_motion.position)
+    torque = _feedforward(robot, plan, joint_motion, base, motions)
+    return Reference(time, joint_motion.position, joint_motion.velocity, joint_motion.acceleration, torque, base, plan)
+
+
+def _inverse_kinematics(
+    robot: Robot, legs: dict[str, LegKinematics], plan: TaskPlan
+) -> tuple[PointMotion, PointMotion, dict[str, LegMotion]]:
+    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk upright."""
+    plant, samples = robot.plant, len(plan.time)
+    context = plant.CreateDefaultContext()
+    total_mass = plant.CalcTotalMass(context)
+    plant.SetPositions(context, robot.base_pose_positions(RigidTransform()))
+    robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
+    # The legs' first moment is known in closed form; what is left belongs to the base.
+    rest = {side: leg.forward(np.zeros((1, 6))).moment[0] for side, leg in legs.items()}
+    base_moment = total_mass * plant.CalcCenterOfMassPositionInWorld(context) - sum(rest.values())
+
+    level = np.broadcast_to(np.eye(3), (samples, 3, 3))
+    p_WB = plan.com.position.copy()
+    for _ in range(_MAX_ITERATIONS):
+        q = {}
+        for side, leg in legs.items():
+            try:
+                q[side] = leg.inverse(level, plan.feet[side].position - p_WB)
+            except UnreachableError as error:
+                raise InputError(_unreachable(plan, side, error)) from None
+        com = p_WB + (base_moment + sum(leg.forward(q[side]).moment for side, leg in legs.items())) / total_mass
+        correction = plan.com.position - com
+        p_WB = p_WB + correction
+        if np.abs(correction).max() < _COM_TOLERANCE:
+            break
+    else:
+        raise InputError(f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change com_height")
+
+    # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m.
+    still = {side: leg.forward(q[side]) for side, leg in legs.items()}
+    gain = {side: m.J_moment @ np.linalg.inv(m.J)[:, :, 3:] / total_mass for side, m in still.items()}
+    lever = np.eye(3) - sum(gain.values())
+
+    def solve(com: np.ndarray, feet: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        right = com - sum(np.einsum("nij,nj->ni", gain[side], feet[side]) for side in legs)
+        base = np.linalg.solve(lever, right[:, :, None])[:, :, 0]
+        return base, {side: feet[side] - base for side in legs}
+
+    v_WB, relative = solve(plan.com.velocity, {side: plan.feet[side].velocity for side in legs})
+    v = {side: _solve_leg(still[side].J, np.zeros((samples, 3)), relative[side]) for side in legs}
+    motions = {side: leg.forward(q[side], v[side]) for side, leg in legs.items()}
+    # The same with accelerations; what the joint rates alone cause is taken off first.
+    foot_bias, com_bias = {}, np.zeros((samples, 3))
+    for side, motion in motions.items():
+        solved = _solve_leg(motion.J, motion.Jdot_v[:, :3], motion.Jdot_v[:, 3:])
+        foot_bias[side] = solved
+        com_bias += (motion.Jdot_v_moment - np.einsum("nij,nj->ni", motion.J_moment, solved)) / total_mass
+    a_WB, relative = solve(plan.com.acceleration - com_bias, {side: plan.feet[side].acceleration for side in legs})
+    a = {side: _solve_leg(motions[side].J, np.zeros((samples, 3)), relative[side]) - foot_bias[side] for side in legs}
+
+    joints = PointMotion(*(np.hstack([values[side] for side in legs]) for values in (q, v, a)))
+    return joints, PointMotion(p_WB, v_WB, a_WB), motions
+
+
+def _solve_leg(J: np.ndarray, angular: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(J, np.concatenate([angular, linear], axis=1)[:, :, None])[:, :, 0]
+
+
+def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
+    time = plan.time[error.index]
+    number, phase = plan.phase_at(time)
+    step = (number + 1) // 2
+    where = f"step {step}" if step else "the starting posture"
+    return f"{where} ({side} leg, t = {time:.2f} s) is out of reach: {error}; shorten step_length or change com_height"
+
+
+def _check_limits(robot: Robot, plan: TaskPlan, q: np.ndarray) -> None:
+    lower = robot.plant.GetPositionLowerLimits()[robot.position_index]
+    upper = robot.plant.GetPositionUpperLimits()[robot.position_index]
+    excess = np.maximum(lower - q, q - upper)
+    if excess.max() > 0:
+        sample, joint = np.unravel_index(excess.argmax(), excess.shape)
+        number, _ = plan.phase_at(plan.time[sample])
+        raise InputError(
+            f"step {(number + 1) // 2} (t = {plan.time[sample]:.2f} s) needs {robot.joint_names[joint]} at {q[sample, joint]:.3f} rad, "
+            f"its limits are {lower[joint]:.3f} to {upper[joint]:.3f} rad"
+        )
+
+
+def _feedforward(
+    robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointMotion, motions: dict[str, LegMotion]
+) -> np.ndarray:
+    """Joint torques that let the model follow the reference, feet loaded so that the ZMP is where inverse dynamics has it.
+
+    Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot, the place
+    of the ZMP on the line between the feet's centres of pressure, which move sideways together so that the ZMP comes out exactly.
+    """
+    plant, samples = robot.plant, len(plan.time)
+    context = plant.CreateDefaultContext()
+    forces = MultibodyForces(plant)
+    positions = np.tile(robot.base_pose_positions(RigidTransform()), (samples, 1))
+    positions[:, robot.base.floating_positions_start() + 4 :][:, :3] = base.position
+    positions[:, robot.position_index] = joints.position
+    start = robot.base.floating_velocities_start_in_v()
+    rates, accelerations = np.zeros((samples, plant.num_velocities())), np.zeros((samples, plant.num_velocities()))
+    for target, linear, joint in ((rates, base.velocity, joints.velocity), (accelerations, base.acceleration, joints.acceleration)):
+        target[:, start + 3 : start + 6] = linear
+        target[:, robot.velocity_index] = joint
+    generalized = np.empty((samples, plant.num_velocities()))
+    for k in range(samples):
+        plant.SetPositions(context, positions[k])
+        plant.SetVelocities(context, rates[k])
+        plant.CalcForceElementsContribution(context, forces)
+        generalized[k] = plant.CalcInverseDynamics(context, accelerations[k], forces)
+
+    # Total contact wrench: moment about the base origin and force, world axes.
+    moment, force = generalized[:, start : start + 3], generalized[:, start + 3 : start + 6]
+    # Its ZMP: where the horizontal moment vanishes on the ground.
+    zmp = base.position[:, :2] + (
+        np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2]
+    ) / force[:, 2:]
+    weights, cops = share_load(plan, zmp)
+    spin = moment[:, 2] - (
+        (zmp[:, 0] - base.position[:, 0]) * force[:, 1] - (zmp[:, 1] - base.position[:, 1]) * force[:, 0]
+    )
+    torque = generalized[:, robot.velocity_index].copy()
+    for k, (side, motion) in enumerate(motions.items()):
+        F = weights[side][:, None] * force
+        arm = np.hstack([cops[side], np.zeros((samples, 1))]) - plan.feet[side].position
+        M = np.cross(arm, F) + np.stack([0 * spin, 0 * spin, weights[side] * spin], axis=1)
+        torque[:, 6 * k : 6 * k + 6] -= np.einsum("nji,nj->ni", motion.J, np.concatenate([M, F], axis=1))
+    return torque
+
+
+def share_load(plan: TaskPlan, zmp: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Load share and centre of pressure of each foot.
+
+    The share follows the planned ZMP along the line between the points where it rests in each foot (`plan.rest_point`); the centres
+    of pressure are those points, moved together so that their weighted mean is `zmp`.
+
+    Args:
+        zmp: the ZMP to be produced, (N, 2) [m].
+
+    Returns:
+        Shares in [0, 1] that sum to 1, each (N,); centres of pressure in the world, each (N, 2) [m].
+    """
+    first, second = plan.feet
+    anchor = {side: plan.feet[side].position[:, :2] + plan.rest_point[side] for side in plan.feet}
+    between = anchor[first] - anchor[second]
+    place = np.einsum("ni,ni->n", plan.zmp - anchor[second], between) / np.einsum("ni,ni->n", between, between)
+    share = np.where(plan.support(first), np.where(plan.support(second), np.clip(place, 0.0, 1.0), 1.0), 0.0)
+    shares = {first: share, second: 1.0 - share}
+    offset = zmp - sum(shares[side][:, None] * anchor[side] for side in plan.feet)
+    return shares, {side: anchor[side] + offset for side in plan.feet}
+
+
+def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Reference:
+    if robot.has_floating_base:
+        raise InputError("JointSines needs a robot with a fixed base (robot.fix_base: true)")
+    names = robot.description
+    posture, amplitude, frequency, phase = (
+        names.per_joint(getattr(config, key), key=key, default=0.0) for key in ("posture", "amplitude", "frequency", "phase")
+    )
+    motion = [np.empty((len(time), len(posture))) for _ in range(3)]
+    for joint in range(len(posture)):
+        for order, values in enumerate(smooth_sine(time, frequency[joint], config.ramp, float(time[-1]), phase[joint])):
+            motion[order][:, joint] = amplitude[joint] * values + (posture[joint] if order == 0 else 0.0)
+    plant = robot.plant
+    context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
+    torque = np.empty_like(motion[0])
+    rates, accelerations = np.zeros(plant.num_velocities()), np.zeros(plant.num_velocities())
+    for k in range(len(time)):
+        rates[robot.velocity_index], accelerations[robot.velocity_index] = motion[1][k], motion[2][k]
+        robot.set_joint_positions(context, motion[0][k])
+        plant.SetVelocities(context, rates)
+        plant.CalcForceElementsContribution(context, forces)
+        torque[k] = plant.CalcInverseDynamics(context, accelerations, forces)[robot.velocity_index]
+    still = np.zeros((len(time), 3))
+    X_WB = robot.base.EvalPoseInWorld(context)
+    return Reference(time, *motion, torque, PointMotion(still + X_WB.translation(), still, still), None)
+
+
+class ReferenceSource(Diagram):
+    """Plays a reference.
+
+    .. pydrake_system::
+
+        name: ReferenceSource
+        output_ports:
+        - desired_state
+        - feedforward_torque
+
+    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s]; `feedforward_torque` has shape (n,) [Nm].
+    Both are exact at the reference's sample times; before its start and after its end the robot is to stand still.
+    """
+
+    def __init__(self, reference: Reference):
+        super().__init__()
+        builder = DiagramBuilder()
+        position = PiecewisePolynomial.CubicHermite(reference.time, reference.joint_position.T, reference.joint_velocity.T)
+        torque = PiecewisePolynomial.FirstOrderHold(reference.time, reference.feedforward_torque.T)
+        desired_state = builder.AddNamedSystem("desired_state", TrajectorySource(position, output_derivative_order=1))
+        feedforward = builder.AddNamedSystem("feedforward_torque", TrajectorySource(torque))
+        builder.ExportOutput(desired_state.get_output_port(), "desired_state")
+        builder.ExportOutput(feedforward.get_output_port(), "feedforward_torque")
+        builder.BuildInto(self)

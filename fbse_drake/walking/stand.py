@@ -1,0 +1,85 @@
+"""Motions with both feet on the ground: squatting and swaying."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fbse_drake.errors import InputError
+from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
+
+
+def smooth_sine(time: np.ndarray, frequency: float, ramp: float, duration: float, phase: float = 0.0) -> list[np.ndarray]:
+    """A sine that swells from rest over `ramp` [s] and dies out before `duration` [s]; with its first two derivatives."""
+    rise = [smooth_step(time / ramp, k) / ramp**k for k in range(3)]
+    fall = [(-1.0) ** k * smooth_step((duration - time) / ramp, k) / ramp**k for k in range(3)]
+    envelope = [
+        rise[0] * fall[0],
+        rise[1] * fall[0] + rise[0] * fall[1],
+        rise[2] * fall[0] + 2 * rise[1] * fall[1] + rise[0] * fall[2],
+    ]
+    w = 2 * np.pi * frequency
+    sine = [np.sin(w * time + phase), w * np.cos(w * time + phase), -(w**2) * np.sin(w * time + phase)]
+    return [
+        envelope[0] * sine[0],
+        envelope[1] * sine[0] + envelope[0] * sine[1],
+        envelope[2] * sine[0] + 2 * envelope[1] * sine[1] + envelope[0] * sine[2],
+    ]
+
+
+@dataclass(frozen=True)
+class _Stand:
+    """Both feet stand side by side."""
+
+    # Amplitude of the CoM's motion [m], its frequency [Hz], and the time in which it swells and dies out [s].
+    amplitude: float = 0.03
+    frequency: float = 0.4
+    ramp: float = 2.0
+    # Height of the centre of mass above the ground at rest [m].
+    com_height: float = 0.66
+    # Distance between the soles' centres [m].
+    foot_spacing: float = 0.20
+    # Where the CoM stands ahead of the sole frames [m].
+    zmp_forward: float = 0.025
+    # Smallest distance of the planned ZMP to the edge of the support polygon [m].
+    zmp_margin: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in ("frequency", "ramp", "com_height", "foot_spacing"):
+            if getattr(self, name) <= 0:
+                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+
+    def _plan(
+        self, axis: int, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float
+    ) -> TaskPlan:
+        com = [np.zeros((len(time), 3)) for _ in range(3)]
+        com[0][:, 2] = self.com_height
+        for order, values in enumerate(smooth_sine(time, self.frequency, self.ramp, float(time[-1]))):
+            com[order][:, axis] += self.amplitude * values
+        still = np.zeros((len(time), 3))
+        feet = {
+            side: PointMotion(still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still) for side, sign in lateral.items()
+        }
+        # A point mass: the ZMP is where the line along (acceleration - gravity) meets the ground.
+        zmp = com[0][:, :2] - com[2][:, :2] * (com[0][:, 2] / (gravity + com[2][:, 2]))[:, None]
+        rest_point = {side: np.array([self.zmp_forward, 0.0]) for side in lateral}
+        plan = TaskPlan(time, PointMotion(*com), feet, zmp, (Phase(0.0, float(time[-1]), tuple(lateral)),), rest_point)
+        check_zmp(plan, foot_corners, self.zmp_margin)
+        return plan
+
+
+@dataclass(frozen=True)
+class Squat(_Stand):
+    """The CoM moves up and down."""
+
+    def plan(self, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float) -> TaskPlan:
+        """See `Walk.plan`."""
+        return self._plan(2, time, lateral, foot_corners, gravity)
+
+
+@dataclass(frozen=True)
+class Sway(_Stand):
+    """The CoM moves to the left and right."""
+
+    def plan(self, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float) -> TaskPlan:
+        """See `Walk.plan`."""
+        return self._plan(1, time, lateral, foot_corners, gravity)
