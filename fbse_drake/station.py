@@ -82,20 +82,18 @@ class Station(Diagram):
         builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
 
         # Sensors.
-        encoders = builder.AddNamedSystem("encoders", Encoders(scenario.sensors.encoders, n, scenario.seed))
+        draw = (scenario.seed, scenario.duration)
+        encoders = builder.AddNamedSystem("encoders", Encoders(scenario.sensors.encoders, n, *draw))
         builder.Connect(joint_state.get_output_port(), encoders.get_input_port())
-        imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, scenario.seed))
+        imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, *draw))
         for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
             builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
-        foot_force = builder.AddNamedSystem(
-            "foot_force", FootForceSensors(scenario.sensors.foot_force, robot, scene_graph, scenario.seed)
-        )
-        for name in ("contact_results", "body_poses"):
-            builder.Connect(plant.GetOutputPort(name), foot_force.GetInputPort(name))
+        foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, *draw))
+        builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
 
         # Reference and controller.
         source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))
-        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names))
+        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names, scenario.plant.time_step))
         command = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
         builder.Connect(encoders.get_output_port(), controller.GetInputPort("estimated_state"))
         builder.Connect(source.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))

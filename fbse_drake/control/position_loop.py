@@ -69,8 +69,13 @@ class PositionLoop(LeafSystem):
     unconnected and count as zero. At a tick the command is that of the tick's own inputs. Discrete state: the command being held.
     """
 
-    def __init__(self, config: PositionLoopConfig, names: RobotDescription):
-        """Raises InputError for an unknown joint or one without a gain."""
+    def __init__(self, config: PositionLoopConfig, names: RobotDescription, time_step: float):
+        """Args:
+            time_step: the plant's step [s]; if it is the control period, the command never has to be held.
+
+        Raises:
+            InputError: an unknown joint, or one without a gain.
+        """
         super().__init__()
         n = len(names.joint_names)
         self._n, self._period = n, config.period
@@ -84,7 +89,8 @@ class PositionLoop(LeafSystem):
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._hold)
+        if time_step < config.period:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._hold)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         if not is_tick(context.get_time(), self._period):

@@ -1,16 +1,12 @@
 """Joint friction."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Parameter
-
-
-def _sech2(x: np.ndarray) -> np.ndarray:
-    return 1.0 - np.tanh(x) ** 2
 
 
 @dataclass(frozen=True)
@@ -41,15 +37,11 @@ class StribeckFriction(JointTorqueEffect):
     gamma6: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        w, p = motion.velocity, nonlinear
-        return np.tanh(p["gamma2"] * w) - np.tanh(p["gamma3"] * w), np.tanh(p["gamma5"] * w), w
-
-    @staticmethod
-    def basis_slope(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        w, p = motion.velocity, nonlinear
-        stribeck = p["gamma2"] * _sech2(p["gamma2"] * w) - p["gamma3"] * _sech2(p["gamma3"] * w)
-        return stribeck, p["gamma5"] * _sech2(p["gamma5"] * w), np.ones_like(w)
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+        # Rows: gamma2, gamma3, gamma5.
+        tanh = np.tanh(nonlinear * motion.velocity)
+        slope = nonlinear * (1.0 - tanh * tanh)
+        return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
 
 
 @dataclass(frozen=True)
@@ -70,11 +62,7 @@ class CoulombViscousFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=lambda: {"all": 0.01})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        w = motion.velocity
-        return np.tanh(w / nonlinear["transition"]), w
-
-    @staticmethod
-    def basis_slope(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        w, transition = motion.velocity, nonlinear["transition"]
-        return _sech2(w / transition) / transition, np.ones_like(w)
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+        (transition,) = nonlinear
+        tanh = np.tanh(motion.velocity / transition)
+        return (tanh, motion.velocity), ((1.0 - tanh * tanh) / transition, 1.0)

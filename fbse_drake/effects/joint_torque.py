@@ -7,9 +7,8 @@ An effect is a torque loss u in `tau_command = u + tau_link` (paper eq. 34), pos
 so that the same lines simulate it, predict it over a whole log and give the regressor to identify it.
 """
 
-import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -45,7 +44,7 @@ class JointTorqueEffect(ABC):
     """Base of the joint torque effects: a frozen dataclass with one field per parameter, each a value by joint
     (see `RobotDescription.per_joint`); a joint that is not named has the value 0 for linear parameters.
 
-    A subclass gives the class variables below and the two basis functions.
+    A subclass gives the class variables below and the basis.
     """
 
     # One sentence each: what it is, what it looks like in data, which experiment shows it.
@@ -56,13 +55,15 @@ class JointTorqueEffect(ABC):
 
     @staticmethod
     @abstractmethod
-    def basis(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> Sequence[np.ndarray]:
-        """Torque per unit of each linear parameter, in the order of `parameters`; each of shape (..., n)."""
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+        """Torque per unit of each linear parameter, and its derivative with respect to the joint velocity.
 
-    @staticmethod
-    @abstractmethod
-    def basis_slope(motion: JointMotion, nonlinear: Mapping[str, np.ndarray]) -> Sequence[np.ndarray]:
-        """Derivative of `basis` with respect to the joint velocity."""
+        Args:
+            nonlinear: values of the nonlinear parameters in the order of `parameters`, shape (parameters, ..., n).
+
+        Returns:
+            Two sequences in the order of the linear parameters, items of shape (..., n).
+        """
 
     def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedEffect":
         """This effect with its values as arrays in joint order.
@@ -70,39 +71,45 @@ class JointTorqueEffect(ABC):
         Raises:
             InputError: unknown joint, a value out of bounds, or a nonlinear parameter without a value.
         """
-        linear, nonlinear = [], {}
+        linear, nonlinear = [], []
         for name, parameter in self.parameters.items():
             default = 0.0 if parameter.linear else None
             values = names.per_joint(getattr(self, name), key=f"{key}.{name}".lstrip("."), default=default)
             low, high = parameter.bounds
             if not np.all((low <= values) & (values <= high)):
                 raise InputError(f"{key}.{name}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}")
-            if parameter.linear:
-                linear.append(values)
-            else:
-                nonlinear[name] = values
-        return ResolvedEffect(type(self), linear, nonlinear)
+            (linear if parameter.linear else nonlinear).append(values)
+        return ResolvedEffect(type(self), np.array(linear), np.array(nonlinear).reshape(-1, len(names.joint_names)))
 
 
 @dataclass(frozen=True)
 class ResolvedEffect:
-    """A joint torque effect with values per joint, arrays of shape (n,)."""
+    """A joint torque effect with values per joint."""
 
     effect: type[JointTorqueEffect]
-    linear: list[np.ndarray]
-    nonlinear: dict[str, np.ndarray]
+    # In the order of the effect's `parameters`; each of shape (parameters, n).
+    linear: np.ndarray
+    nonlinear: np.ndarray
 
-    def torque(self, motion: JointMotion) -> np.ndarray:
-        """Torque loss u [Nm], shape (..., n)."""
-        return sum(t * b for t, b in zip(self.linear, self.effect.basis(motion, self.nonlinear), strict=True))
+    def torque_and_slope(self, motion: JointMotion) -> tuple[np.ndarray, np.ndarray]:
+        """Torque loss u [Nm] and its derivative with respect to the joint velocity [Nm s/rad], each of shape (..., n)."""
+        nonlinear = self.nonlinear
+        if motion.velocity.ndim > 1:
+            # (parameters, n) -> (parameters, 1, ..., n), to go with the leading axes of the motion.
+            nonlinear = np.expand_dims(nonlinear, tuple(range(1, motion.velocity.ndim)))
+        basis, slopes = self.effect.basis(motion, nonlinear)
+        torque, slope = self.linear[0] * basis[0], self.linear[0] * slopes[0]
+        for theta, b, db in zip(self.linear[1:], basis[1:], slopes[1:], strict=True):
+            torque, slope = torque + theta * b, slope + theta * db
+        return torque, slope
 
-    def slope(self, motion: JointMotion) -> np.ndarray:
-        """Derivative of the torque loss with respect to the joint velocity [Nm s/rad], shape (..., n)."""
-        return sum(t * b for t, b in zip(self.linear, self.effect.basis_slope(motion, self.nonlinear), strict=True))
 
-
-def check_parameters(effect: type[JointTorqueEffect]) -> None:
-    """Raises TypeError where the fields of an effect and its `parameters` differ."""
-    fields = [field.name for field in dataclasses.fields(effect)]
-    if fields != list(effect.parameters):
-        raise TypeError(f"{effect.__name__}: fields {fields} and parameters {list(effect.parameters)} must be the same")
+def total_torque_and_slope(effects: Sequence[ResolvedEffect], motion: JointMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Torque loss of several effects together [Nm] and its slope [Nm s/rad], each of shape (..., n)."""
+    if not effects:
+        return np.zeros_like(motion.velocity), np.zeros_like(motion.velocity)
+    torque, slope = effects[0].torque_and_slope(motion)
+    for effect in effects[1:]:
+        more_torque, more_slope = effect.torque_and_slope(motion)
+        torque, slope = torque + more_torque, slope + more_slope
+    return torque, slope

@@ -5,53 +5,42 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from fbse_drake.effects.joint_torque import JointMotion, ResolvedEffect
+from fbse_drake.effects.joint_torque import JointMotion, ResolvedEffect, total_torque_and_slope
 
-# A step's velocity is found to this [rad/s]; the torque is that of exactly the velocity found.
-_VELOCITY_TOLERANCE = 1e-7
+# Newton's method stops when its step is this small [rad/s]; what is left is far below the change of velocity in one plant step.
+_LAST_STEP = 1e-3
 _MAX_ITERATIONS = 60
 
 
-def total_torque(effects: Sequence[ResolvedEffect], velocity: np.ndarray) -> np.ndarray:
-    """Torque loss of several effects together [Nm], same shape as the joint velocity [rad/s]."""
-    motion = JointMotion(velocity)
-    return sum((effect.torque(motion) for effect in effects), np.zeros_like(velocity))
-
-
-def implicit_velocity(
+def implicit_torque(
     effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray
 ) -> np.ndarray:
-    """Solves v + mobility * u(v) = free_velocity for each joint by itself.
+    """Torque u(v) of the velocity v that solves v + mobility * u(v) = free_velocity, for each joint by itself.
 
-    This is one step of implicit Euler: `free_velocity` is what the joint would have at the end of the step without the effects,
+    This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
     `mobility` the step over the joint's inertia. The left side must grow with v, which friction does unless its negative
-    (Stribeck) slope times the mobility exceeds 1. Newton's method inside a shrinking bracket.
+    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far, bisection.
 
     Args:
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
 
     Returns:
-        The velocity at the end of the step, shape (n,).
+        Shape (n,) [Nm].
     """
-    end = free_velocity - mobility * total_torque(effects, np.zeros_like(guess))
-    low, high = np.minimum(0.0, end), np.maximum(0.0, end)
-    v = np.minimum(np.maximum(guess, low), high)
+    v, low, high = guess, -np.inf, np.inf
     for _ in range(_MAX_ITERATIONS):
-        motion = JointMotion(v)
-        excess, slope = v - free_velocity, 1.0
-        for effect in effects:
-            excess = excess + mobility * effect.torque(motion)
-            slope = slope + mobility * effect.slope(motion)
+        torque, slope = total_torque_and_slope(effects, JointMotion(v))
+        excess = v + mobility * torque - free_velocity
+        step = excess / (1.0 + mobility * slope)
+        if step @ step < _LAST_STEP**2:
+            break
         above = excess > 0
         high, low = np.where(above, v, high), np.where(above, low, v)
-        step = -excess / slope
-        if np.abs(step).max() < _VELOCITY_TOLERANCE:
-            break
-        v = v + step
+        v = v - step
         outside = (v < low) | (v > high)
         if outside.any():
             v = np.where(outside, (low + high) / 2, v)
-    return v
+    return torque - slope * step
 
 
 class JointTorqueEffects(LeafSystem):
@@ -76,7 +65,7 @@ class JointTorqueEffects(LeafSystem):
         - torque_loss
 
     `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `torque_loss` is u [Nm], shape (n,), that acts from the tick on.
-    Discrete state: previous velocity and previous torque loss.
+    Discrete state: the last velocity, the last torque loss, and the one expected next, (3n,).
     """
 
     def __init__(self, effects: Sequence[ResolvedEffect], inertia: np.ndarray, time_step: float):
@@ -90,8 +79,8 @@ class JointTorqueEffects(LeafSystem):
         self._effects = list(effects)
         self._mobility = time_step / inertia
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
-        # Before the first tick there is no previous velocity.
-        self._state = self.DeclareDiscreteState(np.concatenate([np.full(n, np.nan), np.zeros(n)]))
+        # Before the first tick there is no last velocity (NaN).
+        self._state = self.DeclareDiscreteState(np.concatenate([np.full(n, np.nan), np.zeros(2 * n)]))
         self.torque_loss = self.DeclareVectorOutputPort(
             "torque_loss", n, self._calc_torque_loss, {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
         )
@@ -99,19 +88,27 @@ class JointTorqueEffects(LeafSystem):
 
     def _calc_torque_loss(self, context: Context, output: BasicVector) -> None:
         if not self._effects:
+            output.SetFromVector(np.zeros(len(self._mobility)))
             return
-        v = self._joint_state.Eval(context)[len(self._mobility) :]
-        previous = context.get_discrete_state(self._state).value()
-        v_before, u_before = np.split(previous, 2)
-        if np.isnan(v_before[0]):
-            v_before, u_before = v, total_torque(self._effects, v)
-        predicted = 2 * v - v_before
-        v_next = implicit_velocity(self._effects, predicted + self._mobility * u_before, self._mobility, predicted)
-        output.SetFromVector(total_torque(self._effects, v_next))
+        n, mobility = len(self._mobility), self._mobility
+        v = self._joint_state.Eval(context)[n:]
+        memory = context.get_discrete_state(self._state).value()
+        v_before, u_before, u_expected = memory[:n], memory[n : 2 * n], memory[2 * n :]
+        if v_before[0] != v_before[0]:
+            v_before = v
+            u_before = u_expected = total_torque_and_slope(self._effects, JointMotion(v))[0]
+        free_velocity = v + (v - v_before) + mobility * u_before
+        guess = free_velocity - mobility * u_expected
+        output.SetFromVector(implicit_torque(self._effects, free_velocity, mobility, guess))
 
     def _remember(self, context: Context, state: State) -> None:
-        v = self._joint_state.Eval(context)[len(self._mobility) :]
-        state.get_mutable_discrete_state(self._state).set_value(np.concatenate([v, self.torque_loss.Eval(context)]))
+        n = len(self._mobility)
+        u = self.torque_loss.Eval(context)
+        memory = state.get_mutable_discrete_state(self._state).get_mutable_value()
+        # Expected next: that the torque goes on changing as it did.
+        memory[2 * n :] = 2 * u - memory[n : 2 * n]
+        memory[n : 2 * n] = u
+        memory[:n] = self._joint_state.Eval(context)[n:]
 
 
 def conservative_inertia(compliance: np.ndarray) -> np.ndarray:

@@ -19,18 +19,8 @@ class Leg:
     foot: str
     # Frame: z up, origin on the ground when the foot is flat.
     sole: str
-    # Collision geometry of the foot -> place of its 3-axis force sensor in the sole frame [m].
-    pads: dict[str, list[float]]
-
-    def __post_init__(self) -> None:
-        for name, position in self.pads.items():
-            if len(position) != 3:
-                raise InputError(f"pads.{name}: expected three coordinates [m], found {position}")
-
-    @property
-    def p_FoPad(self) -> np.ndarray:
-        """Places of the pads in the sole frame F, shape (pads, 3) [m]."""
-        return np.array(list(self.pads.values()))
+    # Fixed joints that hold the foot's pads: 3-axis force sensors, parallel to the sole frame.
+    pads: list[str]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import AddContactMaterial, Box, GeometryId, ProximityProperties, Role, SceneGraph
+from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -58,6 +58,15 @@ class Robot:
 
     def sole(self, side: str) -> Frame:
         return self.plant.GetFrameByName(self.description.legs[side].sole)
+
+    def pad_positions(self, side: str) -> np.ndarray:
+        """Places of the foot's force sensors in the sole frame F, shape (pads, 3) [m]."""
+        return np.array([X_FP.translation() for X_FP in self._pad_poses(side)])
+
+    def _pad_poses(self, side: str) -> list[RigidTransform]:
+        context = self.plant.CreateDefaultContext()
+        joints = [self.plant.GetJointByName(name) for name in self.description.legs[side].pads]
+        return [joint.frame_on_child().CalcPose(context, self.sole(side)) for joint in joints]
 
     @cached_property
     def position_index(self) -> np.ndarray:
@@ -147,26 +156,12 @@ def make_robot(
     if ground is not None:
         _add_ground(plant, ground)
     plant.Finalize()
-    return Robot(plant, names), scene_graph
-
-
-def pad_geometries(robot: Robot, scene_graph: SceneGraph) -> dict[str, list[GeometryId]]:
-    """Collision geometries of each foot's force sensor pads, in the description's order.
-
-    Raises:
-        InputError: the foot has no such collision geometry.
-    """
-    inspector = scene_graph.model_inspector()
-    found = {}
-    for side, leg in robot.description.legs.items():
-        body = robot.plant.GetBodyByName(leg.foot)
-        frame = robot.plant.GetBodyFrameIdOrThrow(body.index())
-        ids = {inspector.GetName(i).split("::")[-1]: i for i in inspector.GetGeometries(frame, Role.kProximity)}
-        for name in leg.pads:
-            if name not in ids:
-                raise InputError(f"legs.{side}.pads.{name}: {leg.foot} has no such collision geometry (there are: {', '.join(ids)})")
-        found[side] = [ids[name] for name in leg.pads]
-    return found
+    robot = Robot(plant, names)
+    for side in names.sides:
+        for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
+            if not X_FP.rotation().IsNearlyIdentity(1e-9):
+                raise InputError(f"{path}: legs.{side}.pads: {pad} is not parallel to {names.legs[side].sole}")
+    return robot, scene_graph
 
 
 def _check_names(plant: MultibodyPlant, names: RobotDescription, path: Path) -> None:
@@ -182,6 +177,8 @@ def _check_names(plant: MultibodyPlant, names: RobotDescription, path: Path) -> 
             check(f"legs.{side}.joints", joint, joint in actuated, "actuated joint")
         check(f"legs.{side}.foot", leg.foot, plant.HasBodyNamed(leg.foot), "body")
         check(f"legs.{side}.sole", leg.sole, plant.HasFrameNamed(leg.sole), "frame")
+        for pad in leg.pads:
+            check(f"legs.{side}.pads", pad, plant.HasJointNamed(pad), "joint")
 
 
 def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import InputError
-from fbse_drake.sensors.noise import white_noise
+from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,52 @@ class EncoderConfig:
             raise InputError(f"period: expected a number > 0, found {self.period:g}")
 
 
-def read_encoder(angle: np.ndarray, noise: np.ndarray | float, resolution: float) -> np.ndarray:
-    """Angle as the encoder gives it [rad]."""
-    angle = angle + noise
-    return angle if resolution == 0 else resolution * np.round(angle / resolution)
+def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:
+    """Angle in whole counts [rad]; a resolution of 0 leaves it as it is."""
+    return angle if resolution == 0 else resolution * np.rint(angle / resolution)
 
 
-class Encoders(LeafSystem):
-    """Measures joint positions and velocities.
+class EncoderReadings(LeafSystem):
+    """Counts of the encoders and the velocities had from them.
+
+    .. pydrake_system::
+
+        name: EncoderReadings
+        input_ports:
+        - joint_state
+        output_ports:
+        - measured_joint_state
+
+    Both are [positions, velocities], shape (2n,) [rad, rad/s]. The output is the reading of the present tick (it is meant to be
+    sampled at the encoders' ticks). Discrete state: the reading of the last tick, for a differenced velocity.
+    """
+
+    def __init__(self, config: EncoderConfig, joints: int):
+        super().__init__()
+        self._config, self._n = config, joints
+        self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * joints)
+        # Before the first tick there is no last reading (NaN).
+        self._last = self.DeclareDiscreteState(np.full(joints, np.nan))
+        sources = {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
+        self.measured_joint_state = self.DeclareVectorOutputPort("measured_joint_state", 2 * joints, self._calc, sources)
+        if config.velocity == "differenced":
+            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._remember)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        config, n = self._config, self._n
+        state, measured = self._joint_state.Eval(context), output.get_mutable_value()
+        position, velocity = quantize(state[:n], config.resolution), state[n:]
+        if config.velocity == "differenced":
+            last = context.get_discrete_state(self._last).value()
+            velocity = np.zeros(n) if np.isnan(last[0]) else (position - last) / config.period
+        measured[:n], measured[n:] = position, velocity
+
+    def _remember(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._last).set_value(self.measured_joint_state.Eval(context)[: self._n])
+
+
+class Encoders(Diagram):
+    """Measures joint positions and velocities: noise, then `EncoderReadings`, whose ports it has.
 
     .. pydrake_system::
 
@@ -50,36 +89,21 @@ class Encoders(LeafSystem):
         - joint_state
         output_ports:
         - measured_joint_state
-
-    Both are [positions, velocities], shape (2n,) [rad, rad/s]. The output is the reading of the present tick (it is meant to be
-    sampled at the encoder's ticks). Discrete state: the reading of the last tick, for a differenced velocity.
     """
 
-    def __init__(self, config: EncoderConfig, joints: int, seed: int):
+    def __init__(self, config: EncoderConfig, joints: int, seed: int, duration: float):
+        """Args:
+        duration: noise is drawn for this time [s].
+        """
         super().__init__()
-        self._config, self._n, self._seed = config, joints, seed
-        self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * joints)
-        # Before the first tick there is no earlier reading.
-        self._previous = self.DeclareDiscreteState(np.full(joints, np.nan))
-        sources = {self.input_port_ticket(self._joint_state.get_index()), self.time_ticket(), self.xd_ticket()}
-        self.measured_joint_state = self.DeclareVectorOutputPort("measured_joint_state", 2 * joints, self._calc, sources)
-        if config.velocity == "differenced":
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._remember)
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        config, n = self._config, self._n
-        state = self._joint_state.Eval(context)
-        position, velocity = state[:n], state[n:]
-        if config.noise > 0 or config.velocity_noise > 0:
-            noise = white_noise(self._seed, "encoders", 2 * n, context.get_time(), config.period)
-            position = read_encoder(position, config.noise * noise[:n], config.resolution)
-            velocity = velocity + config.velocity_noise * noise[n:]
-        else:
-            position = read_encoder(position, 0.0, config.resolution)
-        if config.velocity == "differenced":
-            previous = context.get_discrete_state(self._previous).value()
-            velocity = np.zeros(n) if np.isnan(previous[0]) else (position - previous) / config.period
-        output.SetFromVector(np.concatenate([position, velocity]))
-
-    def _remember(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._previous).set_value(self.measured_joint_state.Eval(context)[: self._n])
+        builder = DiagramBuilder()
+        scale = np.repeat([config.noise, config.velocity_noise], joints)
+        noise = scale * white_noise(seed, "encoders", ticks_until(duration, config.period), 2 * joints)
+        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        noisy = builder.AddNamedSystem("noisy", Adder(2, 2 * joints))
+        readings = builder.AddNamedSystem("readings", EncoderReadings(config, joints))
+        builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
+        builder.Connect(noisy.get_output_port(), readings.get_input_port())
+        builder.ExportInput(noisy.get_input_port(0), "joint_state")
+        builder.ExportOutput(readings.get_output_port(), "measured_joint_state")
+        builder.BuildInto(self)

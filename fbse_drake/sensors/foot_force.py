@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.geometry import GeometryId, SceneGraph
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import ContactResults
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.multibody.math import SpatialForce
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import Adder, Saturation
 
 from fbse_drake.errors import InputError
-from fbse_drake.robot.plant import Robot, pad_geometries
-from fbse_drake.sensors.noise import white_noise
+from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 
 @dataclass(frozen=True)
@@ -33,60 +32,66 @@ class FootForceConfig:
                 raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
 
 
-class FootForceSensors(LeafSystem):
-    """Measures the force of the ground on each pad, in the axes of its sole frame.
+class PadForces(LeafSystem):
+    """Picks the force of the ground on each pad, in the axes of its sole frame: what the pad's fixed joint transmits.
+
+    .. pydrake_system::
+
+        name: PadForces
+        input_ports:
+        - reaction_forces
+        output_ports:
+        - pad_force
+
+    `pad_force` holds three components [N] pad by pad, side by side, in the description's order.
+    """
+
+    def __init__(self, robot: Robot):
+        super().__init__()
+        pads = [pad for leg in robot.description.legs.values() for pad in leg.pads]
+        self._joints = [int(robot.plant.GetJointByName(pad).index()) for pad in pads]
+        self._reaction_forces = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce.Zero()]))
+        sources = {self.input_port_ticket(self._reaction_forces.get_index())}
+        self.DeclareVectorOutputPort("pad_force", 3 * len(pads), self._calc, sources)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        reactions = self._reaction_forces.Eval(context)
+        # A joint's reaction acts on the pad, against the ground's force.
+        output.SetFromVector(-np.array([reactions[joint].translational() for joint in self._joints]).ravel())
+
+
+class FootForceSensors(Diagram):
+    """Measures the force of the ground on each pad.
 
     .. pydrake_system::
 
         name: FootForceSensors
         input_ports:
-        - contact_results
-        - body_poses
+        - reaction_forces
         output_ports:
         - true_pad_force
         - measured_pad_force
 
-    Both outputs hold, side by side and pad by pad in the description's order, three components [N]. The force is that of the plant's
-    last step, turned by the foot's present attitude.
+    Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's attitude at the start of that step.
     """
 
-    def __init__(self, config: FootForceConfig, robot: Robot, scene_graph: SceneGraph, seed: int):
+    def __init__(self, config: FootForceConfig, robot: Robot, seed: int, duration: float):
+        """Args:
+        duration: noise is drawn for this time [s].
+        """
         super().__init__()
-        self._config, self._seed = config, seed
-        plant = robot.plant
-        pads = pad_geometries(robot, scene_graph)
-        self._row: dict[GeometryId, int] = {pad: i for i, pad in enumerate(p for side in pads.values() for p in side)}
-        self._feet, row = [], 0
-        for side, leg in robot.description.legs.items():
-            R_FootF = robot.sole(side).GetFixedRotationMatrixInBodyFrame().matrix()
-            self._feet.append((int(plant.GetBodyByName(leg.foot).index()), R_FootF, slice(row, row + len(pads[side]))))
-            row += len(pads[side])
-        self._size = 3 * row
-        self._contact_results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        self._true = self.DeclareVectorOutputPort("true_pad_force", self._size, self._calc_true, {self.all_input_ports_ticket()})
-        sources = {self.all_input_ports_ticket(), self.time_ticket()}
-        self.DeclareVectorOutputPort("measured_pad_force", self._size, self._calc_measured, sources)
-
-    def _calc_true(self, context: Context, output: BasicVector) -> None:
-        results = self._contact_results.Eval(context)
-        force_W = np.zeros((len(self._row), 3))
-        for i in range(results.num_point_pair_contacts()):
-            info = results.point_pair_contact_info(i)
-            pair = info.point_pair()
-            # The contact force is the one on body B.
-            if pair.id_B in self._row:
-                force_W[self._row[pair.id_B]] += info.contact_force()
-            elif pair.id_A in self._row:
-                force_W[self._row[pair.id_A]] -= info.contact_force()
-        poses = self._body_poses.Eval(context)
-        for body, R_FootF, rows in self._feet:
-            force_W[rows] = force_W[rows] @ poses[body].rotation().matrix() @ R_FootF
-        output.SetFromVector(force_W.ravel())
-
-    def _calc_measured(self, context: Context, output: BasicVector) -> None:
-        force = self._true.Eval(context)
-        if self._config.noise > 0:
-            noise = white_noise(self._seed, "foot_force", self._size, context.get_time(), self._config.period)
-            force = force + self._config.noise * noise
-        output.SetFromVector(np.minimum(np.maximum(force, -self._config.range), self._config.range))
+        builder = DiagramBuilder()
+        true = builder.AddNamedSystem("true", PadForces(robot))
+        size = true.get_output_port().size()
+        noise = config.noise * white_noise(seed, "foot force", ticks_until(duration, config.period), size)
+        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        noisy = builder.AddNamedSystem("noisy", Adder(2, size))
+        limit = np.full(size, config.range)
+        measured = builder.AddNamedSystem("measured", Saturation(-limit, limit))
+        builder.Connect(true.get_output_port(), noisy.get_input_port(0))
+        builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
+        builder.Connect(noisy.get_output_port(), measured.get_input_port())
+        builder.ExportInput(true.get_input_port(), "reaction_forces")
+        builder.ExportOutput(true.get_output_port(), "true_pad_force")
+        builder.ExportOutput(measured.get_output_port(), "measured_pad_force")
+        builder.BuildInto(self)

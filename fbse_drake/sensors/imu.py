@@ -3,12 +3,13 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import Adder, Multiplexer
 from pydrake.systems.sensors import Accelerometer, Gyroscope
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
-from fbse_drake.sensors.noise import white_noise
+from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 
 @dataclass(frozen=True)
@@ -38,46 +39,18 @@ class ImuConfig:
             raise InputError(f"period: expected a number > 0, found {self.period:g}")
 
 
-class ImuErrors(LeafSystem):
-    """Adds bias and noise to ideal IMU signals in the IMU frame I.
-
-    .. pydrake_system::
-
-        name: ImuErrors
-        input_ports:
-        - specific_force
-        - angular_velocity
-        output_ports:
-        - measured_imu
-
-    `measured_imu` is [specific force (3) [m/s^2], angular velocity (3) [rad/s]]. Discrete state: the bias, (6,).
-    """
-
-    def __init__(self, config: ImuConfig, seed: int):
-        super().__init__()
-        self._config, self._seed = config, seed
-        self._noise = np.repeat([config.acceleration_noise, config.angular_velocity_noise], 3)
-        self._walk = np.repeat([config.acceleration_bias_walk, config.angular_velocity_bias_walk], 3) * np.sqrt(config.period)
-        self._specific_force = self.DeclareVectorInputPort("specific_force", 3)
-        self._angular_velocity = self.DeclareVectorInputPort("angular_velocity", 3)
-        self._bias = self.DeclareDiscreteState(np.concatenate([config.acceleration_bias, config.angular_velocity_bias]))
-        sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
-        self.DeclareVectorOutputPort("measured_imu", 6, self._calc, sources)
-        if self._walk.any():
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._walk_bias)
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        ideal = np.concatenate([self._specific_force.Eval(context), self._angular_velocity.Eval(context)])
-        noise = white_noise(self._seed, "imu", 6, context.get_time(), self._config.period)
-        output.SetFromVector(ideal + context.get_discrete_state(self._bias).value() + self._noise * noise)
-
-    def _walk_bias(self, context: Context, state: State) -> None:
-        noise = white_noise(self._seed, "imu_bias", 6, context.get_time(), self._config.period)
-        state.get_mutable_discrete_state(self._bias).set_value(context.get_discrete_state(self._bias).value() + self._walk * noise)
+def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:
+    """What is added to the ideal signals at each tick, shape (ticks, 6) [m/s^2, rad/s]: bias, its random walk, white noise."""
+    ticks = ticks_until(duration, config.period)
+    noise = np.repeat([config.acceleration_noise, config.angular_velocity_noise], 3)
+    walk = np.repeat([config.acceleration_bias_walk, config.angular_velocity_bias_walk], 3) * np.sqrt(config.period)
+    drift = np.cumsum(white_noise(seed, "imu bias", ticks, 6), axis=0)
+    bias = np.concatenate([config.acceleration_bias, config.angular_velocity_bias])
+    return bias + walk * drift + noise * white_noise(seed, "imu", ticks, 6)
 
 
 class Imu(Diagram):
-    """IMU at the robot's IMU frame: Drake's ideal accelerometer and gyroscope, and their errors.
+    """IMU at the robot's IMU frame I: Drake's ideal accelerometer and gyroscope, plus errors.
 
     .. pydrake_system::
 
@@ -89,22 +62,30 @@ class Imu(Diagram):
         output_ports:
         - measured_imu
 
-    The acceleration is that of the plant's last step, from its velocity before to its velocity after.
+    `measured_imu` is [specific force (3) [m/s^2], angular velocity (3) [rad/s]] in the IMU frame. The acceleration is that of the plant's
+    last step, from its velocity before to its velocity after.
     """
 
-    def __init__(self, config: ImuConfig, robot: Robot, seed: int):
+    def __init__(self, config: ImuConfig, robot: Robot, seed: int, duration: float):
+        """Args:
+        duration: errors are drawn for this time [s].
+        """
         super().__init__()
         builder = DiagramBuilder()
         body, X_BI = robot.imu.body(), robot.imu.GetFixedPoseInBodyFrame()
         gravity = robot.plant.gravity_field().gravity_vector()
         accelerometer = builder.AddNamedSystem("accelerometer", Accelerometer(body, X_BI, gravity))
         gyroscope = builder.AddNamedSystem("gyroscope", Gyroscope(body, X_BI))
-        errors = builder.AddNamedSystem("errors", ImuErrors(config, seed))
-        builder.Connect(accelerometer.get_output_port(), errors.GetInputPort("specific_force"))
-        builder.Connect(gyroscope.get_output_port(), errors.GetInputPort("angular_velocity"))
+        ideal = builder.AddNamedSystem("ideal", Multiplexer([3, 3]))
+        errors = builder.AddNamedSystem("errors", held_signal(imu_errors(config, seed, duration), config.period))
+        measured = builder.AddNamedSystem("measured", Adder(2, 6))
+        builder.Connect(accelerometer.get_output_port(), ideal.get_input_port(0))
+        builder.Connect(gyroscope.get_output_port(), ideal.get_input_port(1))
+        builder.Connect(ideal.get_output_port(), measured.get_input_port(0))
+        builder.Connect(errors.get_output_port(), measured.get_input_port(1))
         for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
             port = builder.ExportInput(accelerometer.GetInputPort(name), name)
             if name != "body_spatial_accelerations":
                 builder.ConnectInput(port, gyroscope.GetInputPort(name))
-        builder.ExportOutput(errors.get_output_port(), "measured_imu")
+        builder.ExportOutput(measured.get_output_port(), "measured_imu")
         builder.BuildInto(self)

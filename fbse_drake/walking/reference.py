@@ -76,7 +76,7 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         raise InputError(f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines")
     legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
     lateral = {side: float(np.sign(leg.offsets[0, 1])) for side, leg in legs.items()}
-    corners = {side: leg.p_FoPad for side, leg in robot.description.legs.items()}
+    corners = {side: robot.pad_positions(side) for side in legs}
     gravity = robot.plant.gravity_field().gravity_vector()
     plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
     joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
