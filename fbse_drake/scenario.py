@@ -33,8 +33,8 @@ class RobotConfig:
 
     # Name or path of a robot description (models/*.yaml).
     description: str = "biped"
-    # Welds the base to the world where the model file has it (a gantry).
-    fix_base: bool = False
+    # Hangs the base in a gantry at this height [m], upright, instead of letting it float.
+    gantry_height: float | None = None
     # Reflected rotor inertia by joint [kg m^2].
     rotor_inertia: dict[str, float] = field(default_factory=dict)
     # Physical effects, each under a name of your choice.
@@ -126,7 +126,7 @@ class Scenario:
         """The model, also where the scenario leaves it out."""
         if self.model is not None:
             return self.model
-        return RobotConfig(self.robot.description, self.robot.fix_base, self.robot.rotor_inertia)
+        return RobotConfig(self.robot.description, self.robot.gantry_height, self.robot.rotor_inertia)
 
 
 def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> Scenario:

@@ -53,14 +53,16 @@ class Station(Diagram):
             self.robot, scene_graph = make_robot(
                 config.description,
                 rotor_inertia=config.rotor_inertia,
-                fix_base=config.fix_base,
+                gantry_height=config.gantry_height,
                 builder=builder,
                 config=scenario.plant,
                 ground=scenario.ground,
             )
         with located("model: "):
             believed = scenario.believed
-            self.model, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, fix_base=believed.fix_base)
+            self.model, _ = make_robot(
+                believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height
+            )
         with located("reference: "):
             ticks = round(scenario.duration / scenario.control.period)
             self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)

@@ -25,7 +25,7 @@ _MAX_ITERATIONS = 100
 class JointSines:
     """Every joint swings about a posture on its own: q = posture + amplitude sin(2 pi frequency t + phase), from rest to rest.
 
-    For a robot on a gantry (`robot.fix_base`); the feet are free.
+    For a robot on a gantry (`robot.gantry_height`); the feet are free.
     """
 
     # By joint: posture [rad], amplitude [rad], frequency [Hz], phase [rad].
@@ -235,7 +235,7 @@ def share_load(plan: TaskPlan, zmp: np.ndarray) -> tuple[dict[str, np.ndarray], 
 
 def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Reference:
     if robot.has_floating_base:
-        raise InputError("JointSines needs a robot with a fixed base (robot.fix_base: true)")
+        raise InputError("JointSines needs a robot with a fixed base (robot.gantry_height)")
     names = robot.description
     posture, amplitude, frequency, phase = (
         names.per_joint(getattr(config, key), key=key, default=0.0) for key in ("posture", "amplitude", "frequency", "phase")
