@@ -5,7 +5,6 @@ then; commanded torque and friction torque of the step that begins then.
 """
 
 import json
-import os
 import re
 import zipfile
 import zlib
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fbse_drake.errors import InputError, located
+from fbse_drake.files import write_atomically
 
 FORMAT_VERSION = 1
 
@@ -114,15 +114,13 @@ class Log(Mapping[str, np.ndarray]):
 
     def save(self, path: str | Path) -> None:
         """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""
-        path = Path(path)
         meta = {"format_version": FORMAT_VERSION, **self.meta, "units": {name: self.unit(name) for name in self.channels}}
-        partial = path.with_name(f".{path.name}.part")
-        try:
-            with open(partial, "wb") as file:
+
+        def write(partial: Path) -> None:
+            with partial.open("wb") as file:
                 np.savez_compressed(file, meta=np.array(json.dumps(meta)), **self.channels)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+
+        write_atomically(Path(path), write)
 
     @classmethod
     def load(cls, path: str | Path) -> "Log":

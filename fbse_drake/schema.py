@@ -5,6 +5,7 @@ Its typed loader assigns to attributes, which frozen dataclasses refuse, so the 
 """
 
 import collections.abc
+import contextlib
 import dataclasses
 import difflib
 import math
@@ -99,10 +100,8 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
 
 def _scalar(schema: type, value: Any, file: str, key: str) -> Any:
     if schema is float and isinstance(value, str):
-        try:
+        with contextlib.suppress(ValueError):
             value = float(value)  # YAML 1.1 reads 1e6 as a text
-        except ValueError:
-            pass
     matches = isinstance(value, schema) or (schema is float and isinstance(value, int))
     if not matches or (isinstance(value, bool) and schema is not bool):
         raise InputError(f"{file}{key}: expected {_SCALARS[schema]}, found {_describe(value)}")
@@ -161,9 +160,7 @@ def _default_of(schema: Any, content: collections.abc.Mapping, file: str, key: s
     """An object with the schema's defaults, or _MISSING where some field has none (all of those must then be given)."""
     if not dataclasses.is_dataclass(schema):
         return schema()
-    required = [
-        f.name for f in dataclasses.fields(schema) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    ]
+    required = [f.name for f in dataclasses.fields(schema) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING]
     missing = [name for name in required if name not in content]
     if missing:
         raise InputError(f"{file}{key or 'top level'}: the key {missing[0]} is missing")

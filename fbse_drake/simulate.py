@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog
 
+from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import FallConfig, Scenario, dump_scenario
@@ -186,28 +187,46 @@ def _reference_channels(station: Station, time: np.ndarray) -> dict[str, np.ndar
 
 
 def _truth_channels(robot: Robot, state: np.ndarray, acceleration: np.ndarray, pad_force: np.ndarray) -> dict[str, np.ndarray]:
-    """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of the exact foot forces."""
-    plant, samples = robot.plant, len(state)
-    context = plant.CreateDefaultContext()
-    soles = {side: robot.sole(side) for side in robot.description.sides}
+    """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of the exact foot forces.
+
+    Accelerations are the plant's own, over the step that ends at the row's time; base quantities are those of the base frame's origin,
+    in world axes; orientation is a quaternion [w, x, y, z] from base to world.
+    """
+    plant, samples, context = robot.plant, len(state), robot.plant.CreateDefaultContext()
     v = state[:, plant.num_positions() :]
     truth = {
-        "truth/joint/position": state[:, robot.position_index],
-        "truth/joint/velocity": v[:, robot.velocity_index],
-        "truth/joint/acceleration": acceleration[:, robot.velocity_index],
+        "joint/position": state[:, robot.position_index],
+        "joint/velocity": v[:, robot.velocity_index],
+        "joint/acceleration": acceleration[:, robot.velocity_index],
     }
-    names = ("base/position", "com/position", "com/velocity", *(f"foot/{side}/position" for side in soles))
-    truth |= {f"truth/{name}": np.empty((samples, 3)) for name in names}
-    truth["truth/base/orientation"] = np.empty((samples, 4))
-    zmp = np.zeros((samples, 2))
+    spatial = np.zeros((2, samples, 6))
+    if robot.has_floating_base:
+        start = robot.base.floating_velocities_start_in_v()
+        spatial = np.array([v[:, start : start + 6], acceleration[:, start : start + 6]])
+    for name, values in zip(("velocity", "acceleration"), spatial, strict=True):
+        truth[f"base/angular_{name}"], truth[f"base/{name}"] = values[:, :3], values[:, 3:]
+
+    soles = {side: robot.sole(side) for side in robot.description.sides}
+    pads = {side: robot.pad_positions(side) for side in soles}
+    for name in ("base/position", "com/position", "com/velocity", *(f"foot/{side}/position" for side in soles)):
+        truth[name] = np.empty((samples, 3))
+    truth["base/orientation"] = np.empty((samples, 4))
+    pad_force_F = pad_force.reshape(samples, -1, 3)
+    pad_force_W, pad_position_W = np.empty_like(pad_force_F), np.empty_like(pad_force_F)
     for k in range(samples):
         plant.SetPositionsAndVelocities(context, state[k])
         X_WB = _base_pose(robot, context)
-        truth["truth/base/position"][k] = X_WB.translation()
-        truth["truth/base/orientation"][k] = X_WB.rotation().ToQuaternion().wxyz()
-        truth["truth/com/position"][k] = plant.CalcCenterOfMassPositionInWorld(context)
-        truth["truth/com/velocity"][k] = plant.CalcCenterOfMassTranslationalVelocityInWorld(context)
+        truth["base/position"][k] = X_WB.translation()
+        truth["base/orientation"][k] = X_WB.rotation().ToQuaternion().wxyz()
+        truth["com/position"][k] = plant.CalcCenterOfMassPositionInWorld(context)
+        truth["com/velocity"][k] = plant.CalcCenterOfMassTranslationalVelocityInWorld(context)
+        row = 0
         for side, sole in soles.items():
-            truth[f"truth/foot/{side}/position"][k] = sole.CalcPoseInWorld(context).translation()
-    del zmp, pad_force
-    return truth
+            X_WF = sole.CalcPoseInWorld(context)
+            rows, R_FW = slice(row, row + len(pads[side])), X_WF.rotation().matrix().T
+            truth[f"foot/{side}/position"][k] = X_WF.translation()
+            pad_force_W[k, rows] = pad_force_F[k, rows] @ R_FW
+            pad_position_W[k, rows] = X_WF.translation() + pads[side] @ R_FW
+            row = rows.stop
+    truth["zmp"] = zero_moment_point(pad_force_W, pad_position_W)
+    return {f"truth/{name}": values for name, values in truth.items()}

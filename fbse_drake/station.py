@@ -60,9 +60,7 @@ class Station(Diagram):
             )
         with located("model: "):
             believed = scenario.believed
-            self.model, _ = make_robot(
-                believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height
-            )
+            self.model, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
         with located("reference: "):
             ticks = round(scenario.duration / scenario.control.period)
             self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)

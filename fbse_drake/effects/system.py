@@ -12,9 +12,7 @@ _LAST_STEP = 1e-3
 _MAX_ITERATIONS = 60
 
 
-def implicit_torque(
-    effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray
-) -> np.ndarray:
+def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Torque u(v) of the velocity v that solves v + mobility * u(v) = free_velocity, for each joint by itself.
 
     This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,

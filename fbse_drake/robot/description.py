@@ -38,9 +38,7 @@ class RobotDescription:
     def __post_init__(self) -> None:
         for side, leg in self.legs.items():
             if len(leg.joints) != len(self.leg_joints):
-                raise InputError(
-                    f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}"
-                )
+                raise InputError(f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}")
 
     @property
     def joint_names(self) -> list[str]:

@@ -107,6 +107,30 @@ class Robot:
         positions[self.position_index] = q
         self.plant.SetPositions(context, positions)
 
+    def set_state(
+        self,
+        context: Context,
+        q: np.ndarray,
+        v: np.ndarray,
+        X_WB: RigidTransform | None = None,
+        V_WB: np.ndarray | None = None,
+    ) -> None:
+        """Sets the whole state of the plant.
+
+        Args:
+            q, v: joint positions [rad] and velocities [rad/s], shape (n,).
+            X_WB: pose of a floating base.
+            V_WB: its spatial velocity [angular, linear] in world axes, shape (6,) [rad/s, m/s]; at rest by default.
+        """
+        velocities = np.zeros(self.plant.num_velocities())
+        velocities[self.velocity_index] = v
+        if X_WB is not None:
+            self.plant.SetFloatingBaseBodyPoseInWorldFrame(context, self.base, X_WB)
+            start = self.base.floating_velocities_start_in_v()
+            velocities[start : start + 6] = 0.0 if V_WB is None else V_WB
+        self.set_joint_positions(context, q)
+        self.plant.SetVelocities(context, velocities)
+
     def joint_compliance(self, context: Context) -> np.ndarray:
         """Joint accelerations per joint torque of the free robot: the joints' block of the inverse mass matrix,
         shape (n, n) [1/(kg m^2)]. Contact with the ground can only make it smaller."""
@@ -194,5 +218,3 @@ def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
     )
     plant.RegisterCollisionGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", properties)
     plant.RegisterVisualGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", np.array([0.86, 0.88, 0.9, 1.0]))
-
-

@@ -147,7 +147,7 @@ def _solve_leg(J: np.ndarray, angular: np.ndarray, linear: np.ndarray) -> np.nda
 
 def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
     time = plan.time[error.index]
-    number, phase = plan.phase_at(time)
+    number, _ = plan.phase_at(time)
     step = (number + 1) // 2
     where = f"step {step}" if step else "the starting posture"
     return f"{where} ({side} leg, t = {time:.2f} s) is out of reach: {error}; shorten step_length or change com_height"
@@ -166,9 +166,7 @@ def _check_limits(robot: Robot, plan: TaskPlan, q: np.ndarray) -> None:
         )
 
 
-def _feedforward(
-    robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointMotion, motions: dict[str, LegMotion]
-) -> np.ndarray:
+def _feedforward(robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointMotion, motions: dict[str, LegMotion]) -> np.ndarray:
     """Joint torques that let the model follow the reference, feet loaded so that the ZMP is where inverse dynamics has it.
 
     Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot, the place
@@ -195,13 +193,9 @@ def _feedforward(
     # Total contact wrench: moment about the base origin and force, world axes.
     moment, force = generalized[:, start : start + 3], generalized[:, start + 3 : start + 6]
     # Its ZMP: where the horizontal moment vanishes on the ground.
-    zmp = base.position[:, :2] + (
-        np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2]
-    ) / force[:, 2:]
+    zmp = base.position[:, :2] + (np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2]) / force[:, 2:]
     weights, cops = share_load(plan, zmp)
-    spin = moment[:, 2] - (
-        (zmp[:, 0] - base.position[:, 0]) * force[:, 1] - (zmp[:, 1] - base.position[:, 1]) * force[:, 0]
-    )
+    spin = moment[:, 2] - ((zmp[:, 0] - base.position[:, 0]) * force[:, 1] - (zmp[:, 1] - base.position[:, 1]) * force[:, 0])
     torque = generalized[:, robot.velocity_index].copy()
     for k, (side, motion) in enumerate(motions.items()):
         F = weights[side][:, None] * force

@@ -57,7 +57,8 @@ class _Stand:
             com[order][:, axis] += self.amplitude * values
         still = np.zeros((len(time), 3))
         feet = {
-            side: PointMotion(still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still) for side, sign in lateral.items()
+            side: PointMotion(still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still)
+            for side, sign in lateral.items()
         }
         # A point mass: the ZMP is where the line along (acceleration - gravity) meets the ground.
         zmp = com[0][:, :2] - com[2][:, :2] * (com[0][:, 2] / (gravity + com[2][:, 2]))[:, None]

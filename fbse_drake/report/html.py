@@ -1,0 +1,112 @@
+"""Reports: one HTML file that holds everything it shows, to be mailed, archived and printed.
+
+A report is data (`Report`, made of `Section`s); `write_report` puts it into `templates/report.html.j2`.
+"""
+
+import base64
+import io
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+from matplotlib.figure import Figure
+
+_DPI = 130
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts and numbers under a header; numbers are shown by `number`."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str | float, ...], ...]
+
+
+@dataclass(frozen=True)
+class FigureBlock:
+    """A picture with its title and one or two sentences on what to see."""
+
+    title: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True)
+class Details:
+    """Long preformatted text, folded away behind its title."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of a report; shows its text, tables, figures and details in this order."""
+
+    title: str
+    text: str = ""
+    tables: tuple[Table, ...] = ()
+    figures: tuple[FigureBlock, ...] = ()
+    details: tuple[Details, ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a report says."""
+
+    title: str
+    # Colours the outcome.
+    passed: bool
+    # The result in one sentence.
+    outcome: str
+    sections: tuple[Section, ...]
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for reading, with this many significant digits and no exponent; `n/a` for NaN."""
+    if math.isnan(value):
+        return "n/a"
+    if value == 0 or math.isinf(value):
+        return f"{value:g}"
+    rounded = float(f"{value:.{digits - 1}e}")
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
+
+
+def numeric_table(header: Sequence[str], rows: Sequence[tuple[str | float, ...]]) -> tuple[Table, ...]:
+    """The table of these rows without those whose numbers are all NaN; no table at all if none is left."""
+    kept = tuple(row for row in rows if not all(math.isnan(cell) for cell in row if not isinstance(cell, str)))
+    return (Table(tuple(header), kept),) if kept else ()
+
+
+def render_report(report: Report) -> str:
+    """The report as HTML text that refers to nothing outside itself."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("fbse_drake.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = number
+    environment.filters["png"] = _png_uri
+    return environment.get_template("report.html.j2").render(report=report)
+
+
+def write_report(path: str | Path, report: Report) -> None:
+    """Writes the report as one HTML file, to a temporary name first."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        partial.write_text(render_report(report), encoding="utf-8")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _png_uri(figure: Figure) -> str:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=_DPI)
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
