@@ -46,9 +46,12 @@ def load_tree(path: Path) -> dict[str, Any]:
 
 
 def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
-    """`tree` with the values of `override` on top; a mapping with another tag replaces, others merge key by key."""
+    """`tree` with the values of `override` on top: a mapping with another tag replaces, others merge key by key, null removes."""
     merged = dict(tree)
     for key, value in override.items():
+        if value is None:
+            merged.pop(key, None)
+            continue
         old = merged.get(key)
         same_kind = isinstance(old, dict) and isinstance(value, dict) and value.get("_tag", old.get("_tag")) == old.get("_tag")
         merged[key] = merge(old, value) if same_kind else value

@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedEffect, total_torque_and_slope
 
 # Newton's method stops when its step is this small [rad/s]; what is left is far below the change of velocity in one plant step.
-_LAST_STEP = 1e-3
+_LAST_STEP = 3e-4
 _MAX_ITERATIONS = 60
 
 
@@ -17,7 +17,7 @@ def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray
 
     This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
     `mobility` the step over the joint's inertia. The left side must grow with v, which friction does unless its negative
-    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far, bisection.
+    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far or its steps do not halve, bisection.
 
     Args:
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
@@ -25,7 +25,7 @@ def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray
     Returns:
         Shape (n,) [Nm].
     """
-    v, low, high = guess, -np.inf, np.inf
+    v, low, high, last_step = guess, -np.inf, np.inf, np.inf
     for _ in range(_MAX_ITERATIONS):
         torque, slope = total_torque_and_slope(effects, JointMotion(v))
         excess = v + mobility * torque - free_velocity
@@ -34,10 +34,10 @@ def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray
             break
         above = excess > 0
         high, low = np.where(above, v, high), np.where(above, low, v)
-        v = v - step
-        outside = (v < low) | (v > high)
-        if outside.any():
-            v = np.where(outside, (low + high) / 2, v)
+        newton, middle = v - step, (low + high) / 2
+        astray = (newton < low) | (newton > high) | (np.abs(step) > 0.5 * np.abs(last_step))
+        v = np.where(astray & np.isfinite(middle), middle, newton)
+        last_step = step
     return torque - slope * step
 
 

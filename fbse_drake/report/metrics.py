@@ -61,22 +61,23 @@ def com_rse_mean(log: Log) -> dict[str, float]:
 def stance_creep(log: Log) -> dict[str, list[float]]:
     """How far each foot's sole moves over the ground in each stance [m], by side.
 
-    A stance is a stretch of time in which the plan has the foot on the ground and it carries at least 5 % of the feet's mean load.
+    A stance is one stretch of time in which the plan has the foot on the ground; it counts from when the foot takes up 5 % of the
+    feet's mean load to when it falls below, around the time of its largest load. (A foot that carries next to nothing may slide.)
     """
-    creep: dict[str, list[float]] = {}
     load = {side: log[f"truth/foot/{side}/pad_force"][:, :, 2].sum(axis=1) for side in log.sides}
-    weight = np.mean(sum(load.values()))
+    threshold = _STANDING_SHARE * np.mean(sum(load.values()))
+    creep: dict[str, list[float]] = {side: [] for side in log.sides}
     for side in log.sides:
-        creep[side] = []
         if f"reference/foot/{side}/support" not in log.channels:
             continue
-        standing = (log[f"reference/foot/{side}/support"] > 0) & (load[side] > _STANDING_SHARE * weight)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(int)))
-        position = log[f"truth/foot/{side}/position"][:, :2]
-        for start, end in edges.reshape(-1, 2):
-            # Shorter contacts are bounces of a landing foot.
-            if log.time[end - 1] - log.time[start] > 0.1:
-                creep[side].append(float(np.linalg.norm(position[start:end] - position[start], axis=1).max()))
+        planned = np.concatenate([[0.0], log[f"reference/foot/{side}/support"], [0.0]])
+        for start, end in np.flatnonzero(np.diff(planned)).reshape(-1, 2):
+            peak = start + int(load[side][start:end].argmax())
+            light = np.flatnonzero(load[side] < threshold)
+            first = max(start, light[light < peak].max(initial=-1) + 1)
+            last = min(end, light[light > peak].min(initial=len(log.time)))
+            position = log[f"truth/foot/{side}/position"][first:last, :2]
+            creep[side].append(float(np.linalg.norm(position - position[0], axis=1).max()))
     return creep
 
 

@@ -1,0 +1,34 @@
+# make walk   installs into .venv, simulates the paper's walk and says where its report is
+# make test   installs into .venv, checks the style and runs the tests
+PYTHON ?= python3
+VENV := .venv
+INSTALLED := $(VENV)/.installed
+
+.PHONY: walk test lint format bench clean
+
+walk: $(INSTALLED)
+	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
+
+test: lint
+	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto
+
+lint: $(INSTALLED)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+format: $(INSTALLED)
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+bench: $(INSTALLED)
+	$(VENV)/bin/python -m benchmarks.closed_loop
+
+# Installs again when the package's needs change.
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --upgrade pip
+	$(VENV)/bin/pip install --quiet --editable ".[dev]" --constraint constraints.txt
+	touch $@
+
+clean:
+	rm -rf $(VENV) out

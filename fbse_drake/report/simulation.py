@@ -1,0 +1,81 @@
+"""The report of a simulated run."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fbse_drake.log import Log
+from fbse_drake.report.figures import simulation_figures
+from fbse_drake.report.html import Details, Report, Section, Table, number, numeric_table, write_report
+
+
+def write_simulation_report(
+    path: str | Path,
+    log: Log,
+    metrics: Mapping[str, Any],
+    *,
+    name: str,
+    outlines: Mapping[str, np.ndarray] | None = None,
+    pads: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Writes the report of a simulated run as one HTML file.
+
+    Args:
+        metrics: contents of metrics.json, see `simulation_metrics`.
+        name: what the scenario is called.
+        outlines, pads: soles of the robot's feet, see `figures.footprints`.
+    """
+    figures = {topic: tuple(blocks) for topic, blocks in simulation_figures(log, outlines=outlines, pads=pads).items()}
+    sections = [
+        Section("Summary", tables=_key_figures(metrics)),
+        Section("Motion", figures=figures["walk"]),
+        Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
+        Section("Foot forces", figures=figures["forces"]),
+        Section("Friction", tables=_friction_table(metrics), figures=figures["friction"]),
+        Section("Sensors", figures=figures["sensors"]),
+        Section("Scenario", "The scenario as it was run, with all its defaults.", details=(Details("YAML", log.meta["scenario"]),)),
+    ]
+    shown = tuple(section for section in sections if section.tables or section.figures or section.details)
+    write_report(path, Report(name, not metrics["fell"], _outcome(metrics), shown))
+
+
+def _outcome(metrics: Mapping[str, Any]) -> str:
+    if metrics["fell"]:
+        return f"The run ended early at {metrics['outcome']}."
+    return f"The run finished after {number(metrics['simulated_time'])} s."
+
+
+def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
+    tracking = metrics["joint_tracking_rms"]
+    worst = max(tracking, key=tracking.get)
+    rows = [
+        ("Simulated time", metrics["simulated_time"], "s"),
+        ("Wall time", metrics["wall_time"], "s"),
+        ("Simulated time per wall time", metrics["real_time_factor"], "1"),
+        ("Joint tracking error, RMS, mean of the joints", 1e3 * float(np.mean(list(tracking.values()))), "mrad"),
+        (f"Joint tracking error, RMS, worst joint ({_words(worst)})", 1e3 * tracking[worst], "mrad"),
+        *((f"CoM error in {axis}, mean", 1e3 * value, "mm") for axis, value in metrics["com_rse_mean"].items()),
+        *((f"Creep of the {side} foot in a stance, largest", 1e3 * value, "mm") for side, value in metrics["stance_creep_max"].items()),
+        *((f"Estimated {angle}, RMS error", value, "deg") for angle, value in metrics["attitude_rmse_deg"].items()),
+        *((f"Estimated base velocity in {axis}, RMS error", value, "m/s") for axis, value in metrics["base_velocity_rmse"].items()),
+        *((f"Controller tick, {statistic}", value, "µs") for statistic, value in metrics["tick_us"].items()),
+    ]
+    return numeric_table(("", "Value", "Unit"), rows)
+
+
+def _tracking_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
+    rows = [(_words(joint), 1e3 * value) for joint, value in metrics["joint_tracking_rms"].items()]
+    return numeric_table(("Joint", "Tracking error, RMS [mrad]"), rows)
+
+
+def _friction_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
+    """Errors of the estimated friction, per joint and phase of its leg."""
+    kinds = [metrics[kind][phase] for phase in ("stance", "swing") for kind in ("friction_rmse", "friction_nrmse")]
+    rows = [(_words(joint), *(values[joint] for values in kinds)) for joint in metrics["joint_tracking_rms"]]
+    return numeric_table(("Joint", "Stance, RMSE [Nm]", "Stance, NRMSE [1]", "Swing, RMSE [Nm]", "Swing, NRMSE [1]"), rows)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

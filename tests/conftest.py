@@ -1,0 +1,29 @@
+"""Runs that several tests look at, made once per session."""
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+
+from fbse_drake import Log, Scenario, load_scenario, simulate
+from fbse_drake.scenario import SensorsConfig
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Log]:
+    """Simulates a shipped scenario, cached: run("squat", "duration=2", noise=False)."""
+    logs: dict[tuple, Log] = {}
+
+    def simulated(name: str, *overrides: str, noise: bool = True) -> Log:
+        key = (name, overrides, noise)
+        if key not in logs:
+            logs[key] = simulate(scenario(name, *overrides, noise=noise), name=name).log
+        return logs[key]
+
+    return simulated
+
+
+def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:
+    """A shipped scenario, without sensor errors if so wished."""
+    result = load_scenario(name, overrides=overrides)
+    return result if noise else dataclasses.replace(result, sensors=SensorsConfig())

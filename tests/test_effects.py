@@ -1,0 +1,182 @@
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, MatrixGain, Multiplexer
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedEffect
+from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia, implicit_torque
+from fbse_drake.errors import InputError
+from fbse_drake.robot.description import load_description
+from fbse_drake.robot.plant import make_robot
+
+NAMES, _ = load_description("biped")
+TABLE_1 = StribeckFriction(gamma1={"all": 0.7}, gamma4={"all": 0.6}, gamma6={"all": 0.9})
+# Coulomb 40 Nm with a slope of 5000 Nm s/rad at rest.
+HARMONIC_DRIVE = CoulombViscousFriction(coulomb={"all": 40.0}, viscous={"all": 20.0}, transition={"all": 40.0 / 4980.0})
+
+
+def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedEffect:
+    whole = effect.resolve(NAMES)
+    return ResolvedEffect(type(effect), whole.linear[:, :joints], whole.nonlinear[:, :joints])
+
+
+def test_equation_56_at_table_1():
+    w = np.full(12, 0.02)
+    by_hand = 0.7 * (np.tanh(100 * 0.02) - np.tanh(10 * 0.02)) + 0.6 * np.tanh(100 * 0.02) + 0.9 * 0.02
+    np.testing.assert_allclose(resolved(TABLE_1).torque_and_slope(JointMotion(w))[0], by_hand, rtol=1e-12)
+
+
+@pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
+def test_slope_is_the_derivative(effect: JointTorqueEffect):
+    w, h = np.linspace(-0.3, 0.3, 12), 1e-6
+    law = resolved(effect)
+    difference = (law.torque_and_slope(JointMotion(w + h))[0] - law.torque_and_slope(JointMotion(w - h))[0]) / (2 * h)
+    np.testing.assert_allclose(law.torque_and_slope(JointMotion(w))[1], difference, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
+def test_friction_always_dissipates(effect: JointTorqueEffect):
+    w = np.concatenate([-np.logspace(-8, 2, 200), np.logspace(-8, 2, 200)])[:, None] * np.ones(12)
+    assert np.all(resolved(effect).torque_and_slope(JointMotion(w))[0] * w > 0)
+    assert np.all(resolved(effect).torque_and_slope(JointMotion(0 * w))[0] == 0)
+
+
+@pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
+def test_a_whole_log_at_once_equals_row_by_row(effect: JointTorqueEffect):
+    w = np.random.default_rng(0).normal(size=(50, 12))
+    law = resolved(effect)
+    rows = [law.torque_and_slope(JointMotion(row))[0] for row in w]
+    np.testing.assert_array_equal(law.torque_and_slope(JointMotion(w))[0], rows)
+
+
+@pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
+def test_linear_parameters_are_recovered_from_the_basis(effect: JointTorqueEffect):
+    """The basis that simulates is the regressor that identifies."""
+    law = resolved(effect)
+    w = np.random.default_rng(1).normal(scale=0.2, size=(400, 12))
+    torque = law.torque_and_slope(JointMotion(w))[0]
+    basis, _ = law.effect.basis(JointMotion(w), law.nonlinear[:, None, :])
+    theta, *_ = np.linalg.lstsq(np.stack([b[:, 3] for b in basis], axis=1), torque[:, 3], rcond=None)
+    np.testing.assert_allclose(theta, law.linear[:, 3], rtol=1e-9)
+
+
+@pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
+def test_implicit_torque_solves_its_equation(effect: JointTorqueEffect):
+    generator = np.random.default_rng(2)
+    law, mobility = resolved(effect, 1), np.array([1e-3 / 0.05])
+
+    def torque_at(v: float) -> float:
+        return float(law.torque_and_slope(JointMotion(np.array([v])))[0][0])
+
+    largest = torque_at(10.0)
+    for _ in range(300):
+        free = generator.normal(scale=10 ** generator.uniform(-4, 1), size=1)
+        exact = brentq(lambda v, free=free: v + mobility[0] * torque_at(v) - free[0], -abs(free[0]), abs(free[0]), xtol=1e-14)
+        torque = implicit_torque([law], free, mobility, generator.normal(size=1))
+        assert torque[0] == pytest.approx(torque_at(exact), abs=1e-3 * largest)
+        assert torque[0] * exact >= 0
+
+
+class Flywheel:
+    """A wheel on a revolute joint with friction, a constant torque, and nothing else."""
+
+    def __init__(self, effect: JointTorqueEffect, inertia: float, time_step: float, drive: float, believed: float = 1.0):
+        builder = DiagramBuilder()
+        self.plant = builder.AddSystem(MultibodyPlant(time_step))
+        body = self.plant.AddRigidBody("wheel", SpatialInertia.SolidBoxWithMass(6.0 * inertia, 1.0, 1.0, 1.0))
+        self.plant.AddJoint(RevoluteJoint("axis", self.plant.world_frame(), body.body_frame(), [0, 0, 1]))
+        self.plant.Finalize()
+        effects = builder.AddSystem(JointTorqueEffects([resolved(effect, 1)], np.array([believed * inertia]), time_step))
+        total = builder.AddSystem(MatrixGain(np.array([[1.0, -1.0]])))
+        source = builder.AddSystem(ConstantVectorSource([drive]))
+        torques = builder.AddSystem(Multiplexer(2))
+        builder.Connect(self.plant.get_state_output_port(), effects.get_input_port())
+        builder.Connect(source.get_output_port(), torques.get_input_port(0))
+        builder.Connect(effects.get_output_port(), torques.get_input_port(1))
+        builder.Connect(torques.get_output_port(), total.get_input_port())
+        builder.Connect(total.get_output_port(), self.plant.get_applied_generalized_force_input_port())
+        self.state = LogVectorOutput(self.plant.get_state_output_port(), builder, time_step)
+        self.loss = LogVectorOutput(effects.get_output_port(), builder, time_step)
+        self.diagram = builder.Build()
+
+    def run(self, speed: float, duration: float) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity and torque loss over time from a start speed."""
+        simulator = Simulator(self.diagram)
+        context = simulator.get_mutable_context()
+        self.plant.SetVelocities(self.plant.GetMyMutableContextFromRoot(context), [speed])
+        simulator.AdvanceTo(duration)
+        return self.state.FindLog(context).data()[1], self.loss.FindLog(context).data()[0]
+
+
+def exact_velocity(effect: JointTorqueEffect, inertia: float, drive: float, speed: float, duration: float) -> float:
+    """Final velocity of the flywheel from scipy's stiff integrator."""
+    law = resolved(effect, 1)
+    solution = solve_ivp(
+        lambda _, v: (drive - law.torque_and_slope(JointMotion(v))[0]) / inertia,
+        (0, duration),
+        [speed],
+        method="Radau",
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    return float(solution.y[0, -1])
+
+
+@pytest.mark.parametrize(("effect", "inertia", "drive", "speed"), [(TABLE_1, 0.1, 0.8, 0.5), (HARMONIC_DRIVE, 0.05, 60.0, 3.0)])
+def test_moving_joint_converges_under_step_halving(effect: JointTorqueEffect, inertia: float, drive: float, speed: float):
+    truth = exact_velocity(effect, inertia, drive, speed, 0.02)
+    errors = [abs(Flywheel(effect, inertia, h, drive).run(speed, 0.02)[0][-1] - truth) for h in (1e-3, 5e-4, 2.5e-4)]
+    assert errors[1] < 0.65 * errors[0]
+    assert errors[2] < 0.65 * errors[1]
+    assert errors[2] < 0.01 * speed
+
+
+@pytest.mark.parametrize("time_step", [2e-3, 1e-3, 5e-4])
+@pytest.mark.parametrize("believed", [1.0, 0.3])
+def test_stiff_joint_comes_to_rest_without_ringing(time_step: float, believed: float):
+    """Slope times step over inertia is 100 at 1 ms; an explicit torque would throw the joint about."""
+    velocity, loss = Flywheel(HARMONIC_DRIVE, 0.05, time_step, drive=30.0, believed=believed).run(2.0, 0.4)
+    law = resolved(HARMONIC_DRIVE, 1)
+    settled = velocity[-20:]
+    assert np.ptp(settled) < 1e-6
+    assert law.torque_and_slope(JointMotion(settled[-1:]))[0][0] == pytest.approx(30.0, rel=1e-3)
+    assert loss[-1] == pytest.approx(30.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("time_step", [1e-3, 5e-4])
+def test_stiff_joint_at_rest_stays_at_rest(time_step: float):
+    velocity, loss = Flywheel(HARMONIC_DRIVE, 0.05, time_step, drive=0.0).run(0.0, 0.1)
+    assert np.all(velocity == 0)
+    assert np.all(loss == 0)
+
+
+def test_explicit_friction_would_ring():
+    """The negative case: the same joint with the torque of its present velocity does not come to rest."""
+    law, v = resolved(HARMONIC_DRIVE, 1), np.array([2.0])
+    for _ in range(400):
+        v = v - 1e-3 / 0.05 * law.torque_and_slope(JointMotion(v))[0]
+    assert abs(v[0]) > 0.3
+
+
+def test_conservative_inertia_keeps_coupled_joints_stable():
+    robot, _ = make_robot("biped")
+    context = robot.plant.CreateDefaultContext()
+    generator = np.random.default_rng(5)
+    inertia = conservative_inertia(robot.joint_compliance(context))
+    for _ in range(20):
+        robot.set_joint_positions(context, np.tile([0, 0, -0.4, 0.8, -0.4, 0], 2) + generator.uniform(-0.3, 0.3, size=12))
+        eigenvalues = np.linalg.eigvals(np.diag(inertia) @ robot.joint_compliance(context))
+        assert np.all((eigenvalues.real > 0) & (eigenvalues.real < 4 / 3))
+
+
+def test_unknown_joint_and_bad_value_are_refused():
+    with pytest.raises(InputError, match=r"gamma1\.hip_yw: unknown joint \(allowed: all, hip_yaw"):
+        StribeckFriction(gamma1={"hip_yw": 1.0}).resolve(NAMES)
+    with pytest.raises(InputError, match=r"gamma4: expected values in \[0, inf\] Nm"):
+        StribeckFriction(gamma4={"all": -1.0}).resolve(NAMES, key="f")

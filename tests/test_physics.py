@@ -1,0 +1,194 @@
+"""What a simulated robot must do because it is a physical one."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import scenario
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from fbse_drake import Log, build_station
+from fbse_drake.report.metrics import stance_creep
+from fbse_drake.robot.plant import make_robot
+
+GRAVITY = 9.81
+Run = Callable[..., Log]
+
+
+def load(log: Log) -> np.ndarray:
+    return sum(log[f"foot/{side}/pad_force"][:, :, 2].sum(axis=1) for side in log.sides)
+
+
+def test_standing_feet_carry_the_weight(run: Run):
+    log = run("squat", "duration=2", "reference.amplitude=0", noise=False)
+    np.testing.assert_allclose(load(log)[500:], 87.0 * GRAVITY, rtol=1e-3)
+
+
+def test_zmp_of_slow_sway_is_the_planned_one(run: Run):
+    log = run("sway", noise=False)
+    assert np.abs(log["truth/zmp"] - log["reference/zmp"])[200:].max() < 0.01
+    assert np.ptp(log["truth/zmp"][:, 1]) > 0.08
+
+
+@pytest.mark.parametrize("name", ["squat", "paper_walk", "leg_swing_gantry"])
+def test_imu_is_the_twice_differentiated_motion_minus_gravity(run: Run, name: str):
+    log = run(name, "duration=2", noise=False)
+    h = log.meta["period"]
+    R_WB = Rotation.from_quat(log["truth/base/orientation"], scalar_first=True)
+    p_WI = log["truth/base/position"] + R_WB.apply([0.01, -0.01, 0.02])
+    # Second difference over the two last steps, as the plant's own acceleration.
+    acceleration = (p_WI[2:] - 2 * p_WI[1:-1] + p_WI[:-2]) / h**2
+    specific_force = R_WB[2:].inv().apply(acceleration + [0, 0, GRAVITY])
+    measured = log["imu/linear_acceleration"][2:]
+    np.testing.assert_allclose(np.sqrt(np.mean((measured - specific_force) ** 2, axis=0)), 0, atol=0.01)
+    rate = (R_WB[:-1].inv() * R_WB[1:]).as_rotvec() / h
+    np.testing.assert_allclose(log["imu/angular_velocity"][1:], rate, atol=1e-4)
+
+
+def test_pad_forces_are_the_contact_forces():
+    station = build_station(scenario("paper_walk", "duration=1", noise=False))
+    plant, simulator = station.robot.plant, Simulator(station)
+    context = simulator.get_context()
+    plant_context = plant.GetMyContextFromRoot(context)
+    pads = [pad for leg in station.robot.description.legs.values() for pad in leg.pads]
+    bodies = [plant.GetJointByName(pad).child_body().index() for pad in pads]
+    for time in (0.05, 0.3, 0.7):
+        simulator.AdvanceTo(time)
+        results = plant.get_contact_results_output_port().Eval(plant_context)
+        contact_force = np.zeros((len(pads), 3))
+        for i in range(results.num_point_pair_contacts()):
+            info = results.point_pair_contact_info(i)
+            contact_force[bodies.index(info.bodyA_index())] -= info.contact_force()
+        measured = station.GetOutputPort("measured_pad_force").Eval(context).reshape(-1, 3)
+        assert np.count_nonzero(contact_force[:, 2]) == (8 if time < 0.5 else 4)
+        # Sole frames are level to a milliradian, world forces are up to 250 N.
+        np.testing.assert_allclose(measured[:, 2], contact_force[:, 2], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(measured, axis=1), np.linalg.norm(contact_force, axis=1), rtol=1e-9)
+
+
+def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
+    log = run("squat", "robot.effects.joint_friction=null", "reference.frequency=0.15", noise=False)
+    assert np.all(log["truth/joint/friction_torque"] == 0)
+    feedforward = log["reference/joint/feedforward_torque"]
+    added = log["joint/torque_command"] - feedforward
+    assert np.linalg.norm(added[1000:]) < 0.02 * np.linalg.norm(feedforward[1000:])
+
+
+def tumbling_energy_drift(time_step: float) -> float:
+    """Largest change of the total energy of a freely falling robot with moving joints, relative to its kinetic energy."""
+    builder = DiagramBuilder()
+    robot, _ = make_robot("biped", builder=builder, config=MultibodyPlantConfig(time_step=time_step))
+    plant, simulator = robot.plant, Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    posture = np.tile([0.0, 0.0, -0.4, 0.8, -0.4, 0.0], 2)
+    robot.set_state(context, posture, np.linspace(-1, 1, 12), RigidTransform([0, 0, 2.0]), np.array([1.0, 2.0, 0.5, 0.3, 0.0, 1.0]))
+
+    def energy() -> float:
+        return plant.CalcKineticEnergy(context) + plant.CalcPotentialEnergy(context)
+
+    start, kinetic = energy(), plant.CalcKineticEnergy(context)
+    drift = 0.0
+    for k in range(1, 11):
+        simulator.AdvanceTo(0.02 * k)
+        drift = max(drift, abs(energy() - start))
+    return drift / kinetic
+
+
+def test_falling_robot_conserves_energy():
+    coarse, fine = tumbling_energy_drift(1e-3), tumbling_energy_drift(5e-4)
+    assert coarse < 0.02
+    assert fine == pytest.approx(coarse / 2, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["paper_walk", "hrp2_friction_walk", "leg_swing_gantry"])
+def test_friction_takes_energy_out_of_every_joint(run: Run, name: str):
+    log = run(name, "duration=3", noise=False)
+    # The torque of a step acts while the joint moves on to its next velocity.
+    power = log["truth/joint/friction_torque"][:-1] * log["truth/joint/velocity"][1:]
+    assert np.all(power.sum(axis=0) > 0)
+    assert -power[power < 0].sum() < 1e-3 * power[power > 0].sum()
+
+
+def closure(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """What is left of the equation of motion in each step: on the joints against the injected friction, and on the base.
+
+    Uses logged channels, true accelerations over the same step and Drake's model, nothing of the simulation.
+    """
+    config = scenario(name).robot
+    robot, _ = make_robot(config.description, rotor_inertia=config.rotor_inertia, gantry_height=config.gantry_height)
+    plant, context, world = robot.plant, robot.plant.CreateDefaultContext(), robot.plant.world_frame()
+    forces, floating = MultibodyForces(robot.plant), robot.has_floating_base
+    joint_error, base_error = [], []
+    for k in range(1, len(log.time)):
+        before = k - 1
+        X_WB = V_WB = None
+        if floating:
+            X_WB = RigidTransform(Quaternion(log["truth/base/orientation"][before]), log["truth/base/position"][before])
+            V_WB = np.concatenate([log["truth/base/angular_velocity"][before], log["truth/base/velocity"][before]])
+        robot.set_state(context, log["joint/position"][before], log["joint/velocity"][before], X_WB, V_WB)
+        acceleration = np.zeros(plant.num_velocities())
+        acceleration[robot.velocity_index] = log["truth/joint/acceleration"][k]
+        if floating:
+            acceleration[:6] = np.concatenate([log["truth/base/angular_acceleration"][k], log["truth/base/acceleration"][k]])
+        plant.CalcForceElementsContribution(context, forces)
+        needed = plant.CalcInverseDynamics(context, acceleration, forces)
+        for side in log.sides:
+            sole = robot.sole(side)
+            R_WF = sole.CalcPoseInWorld(context).rotation().matrix()
+            pads = robot.pad_positions(side).T
+            J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, sole, pads, world, world)
+            needed -= J.T @ (log[f"foot/{side}/pad_force"][k] @ R_WF.T).ravel()
+        link_torque = needed[robot.velocity_index]
+        joint_error.append(log["joint/torque_command"][before] - link_torque - log["truth/joint/friction_torque"][before])
+        base_error.append(needed[:6] if floating else np.zeros(6))
+    return np.abs(joint_error), np.abs(base_error)
+
+
+def test_closure_without_contact(run: Run):
+    joint_error, _ = closure(run("leg_swing_gantry", "duration=3", noise=False), "leg_swing_gantry")
+    assert joint_error.max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["squat", "paper_walk", "hrp2_friction_walk"])
+def test_closure_with_contact(run: Run, name: str):
+    """The model returns the friction as exactly as Drake's contact solver closes the six unactuated equations.
+
+    The solver stops at a relative tolerance of 1e-6 of the momentum; what it leaves over shows in the base rows, where nothing else is.
+    """
+    joint_error, base_error = (error.max(axis=1) for error in closure(run(name, "duration=3", noise=False), name))
+    assert np.median(joint_error) < 1e-5
+    assert joint_error.max() < 5e-3
+    solved = base_error < 1e-7
+    assert solved.mean() > 0.1
+    assert joint_error[solved].max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize(("name", "largest_error"), [("paper_walk", 2e-3), ("hrp2_friction_walk", 3.5e-3)])
+def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
+    log = run(name, f"seed={seed}")
+    assert not log.meta["outcome"]["fell"]
+    assert log.time[-1] == pytest.approx(11.5)
+    error = log["reference/joint/position"] - log["truth/joint/position"]
+    assert np.sqrt(np.mean(error**2, axis=0)).max() < largest_error
+    creep = stance_creep(log)
+    assert [len(stances) for stances in creep.values()] == [4, 5]
+    assert max(max(stances) for stances in creep.values()) < 0.5e-3
+    # Seven single supports: seven times one foot carries everything.
+    unloaded = np.stack([log[f"truth/foot/{side}/pad_force"][:, :, 2].sum(axis=1) < 1.0 for side in log.sides], axis=1)[1:]
+    assert not unloaded.all(axis=1).any()
+    lifted = np.stack([log[f"truth/foot/{side}/position"][:, 2] > 0.02 for side in log.sides], axis=1).astype(int)
+    assert np.maximum(np.diff(lifted, axis=0), 0).sum() == 7
+
+
+@pytest.mark.parametrize("name", ["paper_walk", "hrp2_friction_walk"])
+def test_com_converges_under_step_halving(run: Run, name: str):
+    coarse, fine = run(name, noise=False), run(name, "plant.time_step=0.0005", noise=False)
+    np.testing.assert_allclose(fine.time, coarse.time, atol=1e-12)
+    assert np.abs(coarse["truth/com/position"] - fine["truth/com/position"]).max() < 1e-3
