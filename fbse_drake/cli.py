@@ -109,7 +109,7 @@ def _start_meshcat(console: Console) -> Meshcat:
 def _progress(console: Console, title: str, duration: float) -> Iterator[Callable[[float], None]]:
     """A bar over simulated time; its value is the function to call with it."""
     columns = (TextColumn(title), BarColumn(), TextColumn("{task.completed:.1f} of {task.total:.1f} s"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=duration)
         yield lambda time: bar.update(task, completed=time)
 

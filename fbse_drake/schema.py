@@ -1,6 +1,6 @@
 """Typed YAML: builds frozen dataclasses from a document, with errors that name the file, the key and what is allowed.
 
-The document is parsed and written by `pydrake.common.yaml` (tags choose between alternatives: `reference: !Squat {...}`).
+The document is parsed by `pydrake.common.yaml` (tags choose between alternatives: `reference: !Squat {...}`).
 Its typed loader assigns to attributes, which frozen dataclasses refuse, so the last step, tree to dataclass, is done here.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydrake.common.yaml import yaml_dump, yaml_dump_typed, yaml_load_file
+from pydrake.common.yaml import yaml_load_file
 
 from fbse_drake.errors import InputError
 
@@ -72,14 +72,47 @@ def build(schema: type[T], tree: Any, *, file: str, key: str = "", default: T | 
     return _build(schema, tree, default, f"{file}: ", key)
 
 
-def dump(value: Any, *, child_name: str | None = None) -> str:
-    """YAML text of a dataclass; `build(load)` of it gives an equal object."""
-    return yaml_dump_typed(value, child_name=child_name)
+def dump(value: Any, *, child_name: str) -> str:
+    """YAML text of a dataclass as the child of a document; `build` of it gives an equal object.
+
+    Drake's own `yaml_dump_typed` leaves out the tag of the first alternative, which would tie a file to the order of alternatives.
+    """
+    return yaml.dump({child_name: _tree(type(value), value)}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
 
 
-def dump_tree(tree: dict[str, Any]) -> str:
-    """YAML text of a tree as `load_tree` gives it."""
-    return yaml_dump(tree)
+class _Tagged(dict):
+    """A mapping with a YAML tag."""
+
+    def __init__(self, tag: str, content: dict[str, Any]):
+        super().__init__(content)
+        self.tag = tag
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes tags, and no anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        return True
+
+
+_Dumper.add_representer(_Tagged, lambda dumper, value: dumper.represent_mapping(value.tag, value))
+
+
+def _tree(schema: Any, value: Any) -> Any:
+    """The plain tree of a value: what is None is left out, alternatives are tagged."""
+    origin, args = typing.get_origin(schema), typing.get_args(schema)
+    if origin in (typing.Union, types.UnionType):
+        tree = _tree(type(value), value)
+        optional = len(args) == 2 and type(None) in args
+        return tree if optional else _Tagged(f"!{type(value).__name__}", tree)
+    if origin is list:
+        return [_tree(args[0], item) for item in value]
+    if origin is dict:
+        return {key: _tree(args[1], item) for key, item in value.items()}
+    if schema in _SCALARS:
+        return value
+    fields = {name: (kind, getattr(value, name)) for name, kind in _fields(schema).items()}
+    return {name: _tree(kind, item) for name, (kind, item) in fields.items() if item is not None}
 
 
 def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
@@ -172,7 +205,8 @@ def _default_of(schema: Any, content: collections.abc.Mapping, file: str, key: s
 
 def _fields(schema: Any) -> dict[str, Any]:
     if dataclasses.is_dataclass(schema):
-        return typing.get_type_hints(schema)
+        hints = typing.get_type_hints(schema)
+        return {field.name: hints[field.name] for field in dataclasses.fields(schema)}
     return {field.name: field.type for field in schema.__fields__}
 
 

@@ -77,7 +77,7 @@ def simulate(
     if meshcat is not None:
         meshcat.StartRecording()
 
-    failure, start = None, clock.perf_counter()
+    failure, fell, start = None, False, clock.perf_counter()
     try:
         simulator.Initialize()
         looks = int(np.ceil(scenario.duration / _LOOK_PERIOD - 1e-9))
@@ -85,12 +85,14 @@ def simulate(
             simulator.AdvanceTo(min(look * _LOOK_PERIOD, scenario.duration))
             failure = fall_reason(station.robot, robot_context, scenario.fall, height)
             if failure is not None:
+                fell = True
                 break
             if progress is not None:
                 progress(context.get_time())
     except KeyboardInterrupt:
         failure = "interrupted"
     except RuntimeError as error:
+        fell = True
         failure = f"the solver failed: {str(error).splitlines()[0]}"
     wall_time = clock.perf_counter() - start
     if meshcat is not None:
@@ -98,7 +100,7 @@ def simulate(
         meshcat.PublishRecording()
     if failure is not None:
         failure = f"t = {context.get_time():.3f} s: {failure}"
-    return SimulationResult(_make_log(scenario, name, station, sink.FindLog(context), failure), failure, wall_time)
+    return SimulationResult(_make_log(scenario, name, station, sink.FindLog(context), failure, fell), failure, wall_time)
 
 
 def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_height: float) -> str | None:
@@ -126,7 +128,7 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
     return robot.plant.EvalBodyPoseInWorld(context, robot.base)
 
 
-def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None) -> Log:
+def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
     robot, n = station.robot, len(station.robot.joint_names)
     ends = np.cumsum([station.GetOutputPort(port).size() for port in _RECORDED])[:-1]
     raw = dict(zip(_RECORDED, np.split(record.data().T, ends, axis=1), strict=True))
@@ -153,10 +155,12 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
             "imu": robot.description.imu,
             "soles": {side: leg.sole for side, leg in robot.description.legs.items()},
         },
+        # Places of the force sensors in each sole frame [m].
+        "pads": {side: robot.pad_positions(side).tolist() for side in robot.description.sides},
         "period": scenario.log.period,
         "source": "fbse_drake simulation",
         "scenario": dump_scenario(scenario, name),
-        "outcome": {"fell": failure is not None, "reason": failure or "finished", "time": float(time[-1])},
+        "outcome": {"finished": failure is None, "fell": fell, "reason": failure or "finished", "time": float(time[-1])},
     }
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 

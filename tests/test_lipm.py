@@ -13,8 +13,9 @@ def random_zmp(seed: int) -> PPoly:
     breaks = np.cumsum(np.concatenate([[0.0], generator.uniform(0.3, 1.2, size=6)]))
     c = generator.normal(scale=0.1, size=(5, 6, 2))
     for piece in range(5):
-        c[-1, piece + 1] = np.polyval(c[:, piece, 0], breaks[piece + 1] - breaks[piece]), np.polyval(
-            c[:, piece, 1], breaks[piece + 1] - breaks[piece]
+        c[-1, piece + 1] = (
+            np.polyval(c[:, piece, 0], breaks[piece + 1] - breaks[piece]),
+            np.polyval(c[:, piece, 1], breaks[piece + 1] - breaks[piece]),
         )
     return PPoly(c, breaks)
 

@@ -86,9 +86,7 @@ def test_com_of_the_reference_posture_is_the_planned_com(robot: Robot, walk: Ref
         V_WB = np.concatenate([np.zeros(3), walk.base.velocity[k]])
         robot.set_state(context, walk.joint_position[k], walk.joint_velocity[k], RigidTransform(walk.base.position[k]), V_WB)
         np.testing.assert_allclose(robot.plant.CalcCenterOfMassPositionInWorld(context), walk.plan.com.position[k], atol=1e-10)
-        np.testing.assert_allclose(
-            robot.plant.CalcCenterOfMassTranslationalVelocityInWorld(context), walk.plan.com.velocity[k], atol=1e-10
-        )
+        np.testing.assert_allclose(robot.plant.CalcCenterOfMassTranslationalVelocityInWorld(context), walk.plan.com.velocity[k], atol=1e-10)
         for side, foot in walk.plan.feet.items():
             pose = robot.sole(side).CalcPoseInWorld(context)
             np.testing.assert_allclose(pose.translation(), foot.position[k], atol=1e-10)

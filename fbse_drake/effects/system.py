@@ -17,7 +17,8 @@ def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray
 
     This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
     `mobility` the step over the joint's inertia. The left side must grow with v, which friction does unless its negative
-    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far or its steps do not halve, bisection.
+    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so
+    far or its steps do not halve, bisection.
 
     Args:
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].

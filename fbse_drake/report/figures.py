@@ -76,12 +76,13 @@ def simulation_figures(
     planned_feet = _has_feet(log, "reference/foot/{}/support") and _has_feet(log, "reference/foot/{}/position")
     loaded_feet = _has_feet(log, "foot/{}/pad_force") and not _hangs(log)
     friction_known = "truth/joint/friction_torque" in log
+    supports = ", ".join(f"{Phase(0, 0, (side,)).label} support by the {side} leg alone" for side in log.sides)
     catalogue: list[tuple[str, str, str, bool, Callable[[], Figure]]] = [
         (
             "walk",
             "Footprints",
             "View from above: each foothold, the path of the zero-moment point (ZMP) and that of the centre of mass (CoM). "
-            "The ZMP has to stay inside the feet that stand.",
+            "The ZMP has to stay inside the polygon around the feet that stand.",
             planned_feet,
             lambda: footprints(log, outlines=outlines, pads=pads),
         ),
@@ -95,7 +96,7 @@ def simulation_figures(
         (
             "walk",
             "Feet",
-            "Origins of the soles, true and planned. DS is double support; LS and RS are single support on the left and on the right leg.",
+            f"Origins of the soles, true and planned. DS is double support, {supports}.",
             _has_feet(log, "truth/foot/{}/position"),
             lambda: feet(log),
         ),
@@ -109,14 +110,15 @@ def simulation_figures(
         (
             "joints",
             "Joint tracking errors",
-            "Reference minus joint angle. Both joints of a row share one scale, so the legs can be compared.",
+            "Reference minus joint angle. The joints of a row share one scale, so the legs can be compared.",
             "reference/joint/position" in log,
             lambda: joint_errors(log),
         ),
         (
             "joints",
             "Joint torques",
-            "Commanded torque and the planned feed-forward torque; what lies between the two is what the model of the plan does not know.",
+            "Commanded torque and the feed-forward torque of the plan. What lies between the two is friction and whatever else the plan "
+            "leaves out.",
             True,
             lambda: torques(log),
         ),
@@ -277,7 +279,7 @@ def foot_forces(log: Log) -> Figure:
     total = np.sum([force[side][:, 2] for side in log.sides], axis=0)
     weight = total.mean()
     _plot(vertical, log, total, color=_TRUE, linewidth=0.8, alpha=0.6, label="all feet")
-    for side, width in zip(log.sides, np.linspace(2.2, 1, len(log.sides)), strict=True):
+    for side, width in zip(log.sides, np.linspace(1.8, 1, len(log.sides)), strict=True):
         _plot(vertical, log, force[side][:, 2], color=_side_color(log, side), linewidth=width, label=f"{side} foot")
         loaded = force[side][:, 2] > _LOADED_SHARE * weight
         used = np.full(len(total), np.nan)

@@ -6,13 +6,14 @@ A report is data (`Report`, made of `Section`s); `write_report` puts it into `te
 import base64
 import io
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
 from matplotlib.figure import Figure
+
+from fbse_drake.files import write_text
 
 _DPI = 130
 
@@ -97,13 +98,7 @@ def render_report(report: Report) -> str:
 
 def write_report(path: str | Path, report: Report) -> None:
     """Writes the report as one HTML file, to a temporary name first."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        partial.write_text(render_report(report), encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_text(Path(path), render_report(report))
 
 
 def _png_uri(figure: Figure) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from fbse_drake.log import Log
 from fbse_drake.report.figures import simulation_figures
@@ -17,16 +18,16 @@ def write_simulation_report(
     metrics: Mapping[str, Any],
     *,
     name: str,
-    outlines: Mapping[str, np.ndarray] | None = None,
-    pads: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Writes the report of a simulated run as one HTML file.
 
     Args:
         metrics: contents of metrics.json, see `simulation_metrics`.
         name: what the scenario is called.
-        outlines, pads: soles of the robot's feet, see `figures.footprints`.
     """
+    pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items()}
+    # A sole reaches at least as far as its pads.
+    outlines = {side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()}
     figures = {topic: tuple(blocks) for topic, blocks in simulation_figures(log, outlines=outlines, pads=pads).items()}
     sections = [
         Section("Summary", tables=_key_figures(metrics)),
@@ -42,7 +43,7 @@ def write_simulation_report(
 
 
 def _outcome(metrics: Mapping[str, Any]) -> str:
-    if metrics["fell"]:
+    if metrics["outcome"] != "finished":
         return f"The run ended early at {metrics['outcome']}."
     return f"The run finished after {number(metrics['simulated_time'])} s."
 

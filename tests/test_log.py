@@ -1,0 +1,125 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import scenario
+
+from fbse_drake import InputError, Log, simulate
+
+META = {"joints": ["a", "b"], "period": 0.01}
+
+
+def channels(samples: int = 5) -> dict[str, np.ndarray]:
+    return {
+        "time": np.arange(samples) * 0.01,
+        "joint/position": np.ones((samples, 2)),
+        "joint/torque_command": np.zeros((samples, 2)),
+    }
+
+
+def test_round_trip(tmp_path: Path):
+    log = Log(channels() | {"foot/left/pad_force": np.ones((5, 4, 3)), "truth/base/velocity": np.zeros((5, 3))}, META)
+    log.save(tmp_path / "log.npz")
+    again = Log.load(tmp_path / "log.npz")
+    assert again.meta == log.meta
+    assert list(again) == list(log)
+    for name in log:
+        np.testing.assert_array_equal(again[name], log[name])
+    assert again.unit("foot/left/pad_force") == "N"
+    assert again.unit("truth/joint/friction_torque") == "Nm"
+    assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint/position": None}, r"channel joint/position is missing"),
+        ({"joint/position": np.ones((5, 3))}, r"channel joint/position: expected shape 5 x 2, found 5 x 3"),
+        ({"joint/velocity": np.ones((4, 2))}, r"channel joint/velocity: expected shape 5 x 2, found 4 x 2"),
+        ({"joint/velocity": np.full((5, 2), np.nan)}, r"channel joint/velocity: not a finite number in row 0"),
+        ({"time": np.array([0.0, 0.01, 0.01, 0.02, 0.03])}, r"channel time: does not increase at row 2"),
+        ({"elbow/position": np.ones(5)}, r"channel elbow/position: not a channel of a log"),
+    ],
+)
+def test_impossible_logs_are_refused(change: dict, message: str):
+    content = {name: values for name, values in (channels() | change).items() if values is not None}
+    with pytest.raises(InputError, match=message):
+        Log(content, META)
+
+
+def test_unknown_channel_names_the_known_ones():
+    with pytest.raises(KeyError, match="no channel imu/angular_velocity in this log"):
+        Log(channels(), META)["imu/angular_velocity"]
+
+
+@pytest.mark.parametrize("kept", [0, 10, 200, 0.5, 0.99])
+def test_truncated_file_gets_one_line(tmp_path: Path, kept: float):
+    path = tmp_path / "log.npz"
+    Log(channels(200), META).save(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
+    with pytest.raises(InputError, match=r"log\.npz: .*not a log") as error:
+        Log.load(path)
+    assert "\n" not in str(error.value)
+
+
+def test_foreign_files_get_one_line(tmp_path: Path):
+    np.savez(tmp_path / "foreign.npz", x=np.ones(3))
+    with pytest.raises(InputError, match="not a log file: it has no meta"):
+        Log.load(tmp_path / "foreign.npz")
+    np.savez(tmp_path / "pickled.npz", x=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match=r"pickled\.npz"):
+        Log.load(tmp_path / "pickled.npz")
+    np.savez(tmp_path / "newer.npz", meta=np.array(json.dumps({"format_version": 99})), **channels())
+    with pytest.raises(InputError, match="log format version 99, this program reads 1"):
+        Log.load(tmp_path / "newer.npz")
+    with pytest.raises(InputError, match=r"absent\.npz: No such file"):
+        Log.load(tmp_path / "absent.npz")
+    (tmp_path / "text.npz").write_text("time,position\n0,1\n")
+    with pytest.raises(InputError, match=r"text\.npz: .*not a log"):
+        Log.load(tmp_path / "text.npz")
+
+
+def test_same_scenario_and_seed_give_the_same_bytes(tmp_path: Path):
+    for name in ("first", "second"):
+        simulate(scenario("paper_walk", "duration=0.8"), name="paper_walk").log.save(tmp_path / f"{name}.npz")
+    assert (tmp_path / "first.npz").read_bytes() == (tmp_path / "second.npz").read_bytes()
+
+
+def test_another_seed_changes_the_noise_and_nothing_else_at_first(run: Callable[..., Log]):
+    one, other = run("squat", "duration=0.3"), run("squat", "duration=0.3", "seed=1")
+    assert not np.array_equal(one["imu/linear_acceleration"], other["imu/linear_acceleration"])
+    np.testing.assert_array_equal(one["truth/joint/position"][0], other["truth/joint/position"][0])
+    np.testing.assert_array_equal(one["reference/joint/position"], other["reference/joint/position"])
+
+
+def test_noise_levels_are_the_scenarios(run: Callable[..., Log]):
+    noisy, exact = run("leg_swing_gantry", "duration=3"), run("leg_swing_gantry", "duration=3", noise=False)
+    gyro = noisy["imu/angular_velocity"] - exact["imu/angular_velocity"]
+    assert gyro.std() == pytest.approx(1e-3, rel=0.05)
+    pads = noisy["foot/left/pad_force"] - noisy["truth/foot/left/pad_force"]
+    assert pads.std() == pytest.approx(0.5, rel=0.05)
+    angle = noisy["joint/position"] - noisy["truth/joint/position"]
+    assert np.abs(angle).max() <= 0.5 * 4.8e-5 + 1e-12
+    assert angle.std() == pytest.approx(4.8e-5 / np.sqrt(12), rel=0.1)
+
+
+def test_log_follows_the_contract(run: Callable[..., Log]):
+    log = run("squat", "duration=0.3")
+    samples = 301
+    shapes = {
+        "time": (samples,),
+        "joint/position": (samples, 12),
+        "joint/velocity": (samples, 12),
+        "joint/torque_command": (samples, 12),
+        "imu/linear_acceleration": (samples, 3),
+        "imu/angular_velocity": (samples, 3),
+        "foot/left/pad_force": (samples, 4, 3),
+        "foot/right/pad_force": (samples, 4, 3),
+    }
+    assert {name: log[name].shape for name in shapes} == shapes
+    assert all(values.dtype == np.float64 for values in log.values())
+    assert log.joints[:2] == ["left_hip_yaw", "left_hip_roll"]
+    np.testing.assert_array_equal(log.time, np.arange(samples) * 0.001)

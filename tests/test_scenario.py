@@ -1,0 +1,121 @@
+from pathlib import Path
+
+import pytest
+from conftest import scenario
+
+from fbse_drake import InputError, Scenario, build_station, load_scenario, resources
+from fbse_drake.effects.friction import StribeckFriction
+from fbse_drake.scenario import RobotConfig, dump_scenario
+from fbse_drake.walking.stand import Squat
+
+SHIPPED = sorted(path.stem for path in resources.folder("scenarios").glob("*.yaml"))
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_scenario_loads_and_builds(name: str):
+    build_station(scenario(name))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_scenario_survives_being_written_and_read(name: str, tmp_path: Path):
+    original = load_scenario(name, overrides=["seed=7"])
+    again = load_scenario(written(tmp_path, dump_scenario(original, name)), name)
+    assert dump_scenario(again, name) == dump_scenario(original, name)
+    assert again.reference == original.reference
+    assert again.robot == original.robot
+
+
+def test_a_named_child_is_chosen(tmp_path: Path):
+    path = written(tmp_path, "a: {seed: 1}\nb: {seed: 2}\nmine: {seed: 3}\n")
+    assert load_scenario(path, "b").seed == 2
+    assert load_scenario(path).seed == 3
+    with pytest.raises(InputError, match=r"no scenario called c \(there are: a, b, mine\)"):
+        load_scenario(path, "c")
+
+
+def test_overrides_go_on_top():
+    result = load_scenario("paper_walk", overrides=["reference.step_length=0.05", "control.kp.hip_roll=2500", "log.period=2e-3"])
+    assert result.reference.step_length == 0.05
+    assert result.reference.single_supports == 7
+    assert result.control.kp["hip_roll"] == 2500.0
+    assert result.control.kp["hip_yaw"] == 6000.0
+    assert result.log.period == 0.002
+
+
+def test_an_override_can_choose_another_reference():
+    result = load_scenario("paper_walk", overrides=["reference=!Squat {amplitude: 0.01}"])
+    assert result.reference == Squat(amplitude=0.01)
+
+
+def test_an_override_can_take_an_effect_away():
+    assert isinstance(load_scenario("paper_walk").robot.effects["joint_friction"], StribeckFriction)
+    assert load_scenario("paper_walk", overrides=["robot.effects.joint_friction=null"]).robot.effects == {}
+
+
+def test_the_model_is_the_robot_without_its_effects():
+    robot = load_scenario("hrp2_friction_walk").robot
+    believed = load_scenario("hrp2_friction_walk").believed
+    assert believed == RobotConfig(robot.description, robot.gantry_height, robot.rotor_inertia)
+    assert believed.effects == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mine: {sed: 1}", r"mine\.yaml: mine: sed: unknown key, did you mean seed\? \(allowed: title, seed,"),
+        ("mine: {reference: !Walk {step_lenght: 1}}", r"reference\.step_lenght: unknown key, did you mean step_length\?"),
+        ("mine: {reference: !Hop {}}", r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, found the tag !Hop"),
+        ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
+        ("mine: {duration: .nan}", r"duration: expected a number, found NaN"),
+        ("mine: {duration: -1}", r"duration: expected a number > 0, found -1"),
+        ("mine: {seed: 1.5}", r"seed: expected a whole number, found 1\.5"),
+        ("mine: {seed: true}", r"seed: expected a whole number, found True"),
+        ("mine: {control: 3}", r"control: expected a mapping, found 3"),
+        ("mine: {control: {kp: {hip_yw: 1}}}", r"control\.kp\.hip_yw: unknown joint \(allowed: all, hip_yaw"),
+        ("mine: {control: {kd: {all: -1}}}", r"control\.kd\.all: expected a number >= 0, found -1"),
+        ("mine: {control: {period: 0.0015}}", r"control\.period: expected a whole multiple of plant\.time_step"),
+        ("mine: {plant: {time_step: 0}}", r"plant\.time_step: expected a number > 0"),
+        ("mine: {plant: {time_stp: 0}}", r"plant\.time_stp: unknown key, did you mean time_step\?"),
+        ("mine: {robot: {description: nobody}}", r"nobody: no such file, and no such name in models/ \(there are: biped"),
+        ("mine: {robot: {rotor_inertia: {knee: 1}}}", r"robot\.rotor_inertia\.knee: unknown joint"),
+        ("mine: {robot: {effects: {f: {gamma1: {all: 1}}}}}", r"robot\.effects\.f: expected one of !StribeckFriction"),
+        ("mine: {robot: {effects: {f: !StribeckFriction {gamma4: {all: -1}}}}}", r"robot\.effects\.f\.gamma4: expected values in"),
+        ("mine: {sensors: {imu: {acceleration_bias: 1}}}", r"sensors\.imu\.acceleration_bias: expected a list, found 1"),
+        ("mine: [1, 2]", r"expected a mapping, found a list"),
+        ("- 1", r"mine\.yaml: expected a mapping of keys to values, found a list"),
+        ("mine: {a: [}", r"mine\.yaml:1: not valid YAML"),
+    ],
+)
+def test_bad_input_gets_one_line_with_file_and_key(tmp_path: Path, text: str, message: str):
+    with pytest.raises(InputError, match=message) as error:
+        load_scenario(written(tmp_path, text))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("seed", r"--set seed: expected KEY=VALUE"),
+        ("=3", r"--set =3: expected KEY=VALUE"),
+        ("seed={", r"--set seed=\{: .* is not valid YAML"),
+        ("control.kp.hip=1", r"control\.kp\.hip: unknown joint"),
+    ],
+)
+def test_bad_override_gets_one_line(override: str, message: str):
+    with pytest.raises(InputError, match=message):
+        load_scenario("squat", overrides=[override])
+
+
+def test_missing_file_lists_what_there_is():
+    with pytest.raises(InputError, match=r"paper_wolk: no such file, and no such name in scenarios/ \(there are: .*paper_walk"):
+        load_scenario("paper_wolk")
+
+
+def test_defaults_are_a_whole_scenario():
+    assert Scenario().duration == 11.5
