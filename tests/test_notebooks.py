@@ -1,0 +1,84 @@
+"""The notebooks: they run from top to bottom, and what is stored in them is fit to be read."""
+
+import os
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+from ipykernel.kernelspec import get_kernel_dict
+from jupyter_client import AsyncKernelManager
+from jupyter_client.kernelspec import KernelSpec
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+class ThisInterpretersKernel(AsyncKernelManager):
+    """Starts kernels with the interpreter that runs the tests, whatever else the machine calls python3."""
+
+    @property
+    def kernel_spec(self) -> KernelSpec:
+        return KernelSpec(**get_kernel_dict())
+
+
+def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
+    """Runs all cells in `folder`; fails with the error of the first cell that raises.
+
+    Args:
+        settings: an empty folder instead of the user's own IPython settings.
+    """
+    client = NotebookClient(
+        notebook,
+        timeout=300,
+        kernel_name="python3",
+        kernel_manager_class=ThisInterpretersKernel,
+        resources={"metadata": {"path": str(folder)}},
+    )
+    try:
+        client.execute(env={**os.environ, "MPLBACKEND": "Agg", "IPYTHONDIR": str(settings)})
+    except CellExecutionError as error:
+        pytest.fail(str(error), pytrace=False)
+
+
+def errors(notebook: nbformat.NotebookNode) -> list[str]:
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return [f"{output.ename}: {output.evalue}" for output in outputs if output.output_type == "error"]
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@each_notebook
+def test_runs(path, tmp_path):
+    notebook = nbformat.read(path, as_version=4)
+    run(notebook, path.parent, tmp_path)
+    assert errors(notebook) == []
+
+
+@each_notebook
+def test_stored_content(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert errors(notebook) == []
+    assert [cell.id for cell in notebook.cells if "pydrake.all" in cell.source] == []
+    assert path.stat().st_size < 1.5e6
+
+
+def test_kernel_is_this_interpreter(tmp_path):
+    source = "import os, sys\nprint(sys.prefix, os.getcwd(), sep='\\n')"
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    run(notebook, tmp_path, tmp_path)
+    assert notebook.cells[0].outputs[0].text.splitlines() == [sys.prefix, str(tmp_path.resolve())]
+
+
+def test_error_of_a_cell_is_reported(tmp_path):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
+    with pytest.raises(pytest.fail.Exception, match="ZeroDivisionError"):
+        run(notebook, tmp_path, tmp_path)
+    assert errors(notebook) == ["ZeroDivisionError: division by zero"]
