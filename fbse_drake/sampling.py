@@ -1,8 +1,9 @@
 """Clock ticks of sampled systems.
 
 Drake's discrete plant with sampled output ports steps in an *unrestricted* update, which comes before all *discrete* updates of the same
-time. A discrete update of another system would therefore see the plant's state of the next tick. All systems here that remember
-something from tick to tick do so in unrestricted updates, which see the same state as the plant's own.
+time. So a discrete update of another system sees the plant's state of the next tick, an unrestricted one that of the present tick.
+Systems here that remember something from tick to tick do so in unrestricted updates; the exception, `JointTorqueEffects`, makes
+use of the order.
 """
 
 

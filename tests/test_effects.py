@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedEffect
-from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia, implicit_torque
+from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia, solve_implicit_step
 from fbse_drake.errors import InputError
 from fbse_drake.robot.description import load_description
 from fbse_drake.robot.plant import make_robot
@@ -67,7 +67,7 @@ def test_linear_parameters_are_recovered_from_the_basis(effect: JointTorqueEffec
 
 
 @pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
-def test_implicit_torque_solves_its_equation(effect: JointTorqueEffect):
+def test_implicit_step_solves_its_equation(effect: JointTorqueEffect):
     generator = np.random.default_rng(2)
     law, mobility = resolved(effect, 1), np.array([1e-3 / 0.05])
 
@@ -78,7 +78,7 @@ def test_implicit_torque_solves_its_equation(effect: JointTorqueEffect):
     for _ in range(300):
         free = generator.normal(scale=10 ** generator.uniform(-4, 1), size=1)
         exact = brentq(lambda v, free=free: v + mobility[0] * torque_at(v) - free[0], -abs(free[0]), abs(free[0]), xtol=1e-14)
-        torque = implicit_torque([law], free, mobility, generator.normal(size=1))
+        torque = solve_implicit_step([law], free, mobility, generator.normal(size=1)).torque
         assert torque[0] == pytest.approx(torque_at(exact), abs=1e-3 * largest)
         assert torque[0] * exact >= 0
 

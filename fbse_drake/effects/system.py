@@ -1,36 +1,48 @@
 """Joint torque effects in a diagram, stable at any slope."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedEffect, total_torque_and_slope
 
-# Newton's method stops when its step is this small [rad/s]; what is left is far below the change of velocity in one plant step.
+# Newton's method stops at a step of this size [rad/s]; its last step is still taken. A plant step changes velocities by far more.
 _LAST_STEP = 3e-4
 _MAX_ITERATIONS = 60
 
 
-def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Torque u(v) of the velocity v that solves v + mobility * u(v) = free_velocity, for each joint by itself.
+@dataclass(frozen=True)
+class ImplicitStep:
+    """Solution of `solve_implicit_step`, arrays of shape (n,)."""
+
+    # Velocity at the end of the step [rad/s] and the torque loss of that velocity [Nm].
+    velocity: np.ndarray
+    torque: np.ndarray
+    # Derivative of the velocity with respect to the free velocity [1].
+    gain: np.ndarray
+
+
+def solve_implicit_step(
+    effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray
+) -> ImplicitStep:
+    """Solves v + mobility * u(v) = free_velocity, for each joint by itself.
 
     This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
     `mobility` the step over the joint's inertia. The left side must grow with v, which friction does unless its negative
-    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so
-    far or its steps do not halve, bisection.
+    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far or its steps do not halve,
+    bisection.
 
     Args:
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
-
-    Returns:
-        Shape (n,) [Nm].
     """
     v, low, high, last_step = guess, -np.inf, np.inf, np.inf
     for _ in range(_MAX_ITERATIONS):
         torque, slope = total_torque_and_slope(effects, JointMotion(v))
+        gain = 1.0 / (1.0 + mobility * slope)
         excess = v + mobility * torque - free_velocity
-        step = excess / (1.0 + mobility * slope)
+        step = excess * gain
         if step @ step < _LAST_STEP**2:
             break
         above = excess > 0
@@ -39,7 +51,7 @@ def implicit_torque(effects: Sequence[ResolvedEffect], free_velocity: np.ndarray
         astray = (newton < low) | (newton > high) | (np.abs(step) > 0.5 * np.abs(last_step))
         v = np.where(astray & np.isfinite(middle), middle, newton)
         last_step = step
-    return torque - slope * step
+    return ImplicitStep(v - step, torque - slope * step, gain)
 
 
 class JointTorqueEffects(LeafSystem):
@@ -53,7 +65,8 @@ class JointTorqueEffects(LeafSystem):
 
     and u[k] = u(v_hat[k+1]) with v_hat + h/I u(v_hat) equal to that. Where I is the joint's inertia this is implicit Euler exactly;
     linear analysis for an inertia wrong by the factor r gives poles inside the unit circle for every slope if 0 < r < 4/3, so I is
-    chosen on the small side (`conservative_inertia`). In the limit of small steps u[k] = u(v[k]).
+    chosen on the small side (`conservative_inertia`). In the limit of small steps u[k] = u(v[k]). A sudden change of the motor's torque is
+    felt one tick late.
 
     .. pydrake_system::
 
@@ -64,7 +77,8 @@ class JointTorqueEffects(LeafSystem):
         - torque_loss
 
     `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `torque_loss` is u [Nm], shape (n,), that acts from the tick on.
-    Discrete state: the last velocity, the last torque loss, and the one expected next, (3n,).
+    Discrete state: the torque loss, (n,), and for the next tick the velocity and the free, final velocity and gain of the step, (4, n).
+    The state of a tick is made in a discrete update, which sees the velocities of that tick (see `fbse_drake.sampling`).
     """
 
     def __init__(self, effects: Sequence[ResolvedEffect], inertia: np.ndarray, time_step: float):
@@ -78,42 +92,38 @@ class JointTorqueEffects(LeafSystem):
         self._effects = list(effects)
         self._mobility = time_step / inertia
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
-        # Before the first tick there is no last velocity (NaN).
-        self._state = self.DeclareDiscreteState(np.concatenate([np.full(n, np.nan), np.zeros(2 * n)]))
-        self.torque_loss = self.DeclareVectorOutputPort(
-            "torque_loss", n, self._calc_torque_loss, {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
-        )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
+        self._torque = self.DeclareDiscreteState(n)
+        self._memory = self.DeclareDiscreteState(4 * n)
+        self.DeclareStateOutputPort("torque_loss", self._torque)
+        if effects:
+            self.DeclareInitializationDiscreteUpdateEvent(self._start)
+            self.DeclarePeriodicDiscreteUpdateEvent(time_step, 0.0, self._step)
 
-    def _calc_torque_loss(self, context: Context, output: BasicVector) -> None:
-        if not self._effects:
-            output.SetFromVector(np.zeros(len(self._mobility)))
-            return
-        n, mobility = len(self._mobility), self._mobility
-        v = self._joint_state.Eval(context)[n:]
-        memory = context.get_discrete_state(self._state).value()
-        v_before, u_before, u_expected = memory[:n], memory[n : 2 * n], memory[2 * n :]
-        if v_before[0] != v_before[0]:
-            v_before = v
-            u_before = u_expected = total_torque_and_slope(self._effects, JointMotion(v))[0]
-        free_velocity = v + (v - v_before) + mobility * u_before
-        guess = free_velocity - mobility * u_expected
-        output.SetFromVector(implicit_torque(self._effects, free_velocity, mobility, guess))
+    def _start(self, context: Context, state: DiscreteValues) -> None:
+        v = self._joint_state.Eval(context)[len(self._mobility) :]
+        torque, slope = total_torque_and_slope(self._effects, JointMotion(v))
+        state.set_value(self._torque, torque)
+        # As if the joint had been moving on like this.
+        state.set_value(self._memory, np.concatenate([v, v + self._mobility * torque, v, 1.0 / (1.0 + self._mobility * slope)]))
 
-    def _remember(self, context: Context, state: State) -> None:
+    def _step(self, context: Context, state: DiscreteValues) -> None:
         n = len(self._mobility)
-        u = self.torque_loss.Eval(context)
-        memory = state.get_mutable_discrete_state(self._state).get_mutable_value()
-        # Expected next: that the torque goes on changing as it did.
-        memory[2 * n :] = 2 * u - memory[n : 2 * n]
-        memory[n : 2 * n] = u
-        memory[:n] = self._joint_state.Eval(context)[n:]
+        v = self._joint_state.Eval(context)[n:]
+        memory = state.get_mutable_value(self._memory)
+        last_v, last_free, last_end, last_gain = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n], memory[3 * n :]
+        free_velocity = v + (v - last_v) + self._mobility * state.get_value(self._torque)
+        guess = last_end + last_gain * (free_velocity - last_free)
+        solution = solve_implicit_step(self._effects, free_velocity, self._mobility, guess)
+        state.set_value(self._torque, solution.torque)
+        last_v[:], last_free[:], last_end[:], last_gain[:] = v, free_velocity, solution.velocity, solution.gain
 
 
 def conservative_inertia(compliance: np.ndarray) -> np.ndarray:
     """Inertia per joint that keeps `JointTorqueEffects` stable for coupled joints, shape (n,) [kg m^2].
 
-    With J = diag(inertia) the eigenvalues of J W stay below 1 (Gershgorin) for the compliance W, shape (n, n), see
-    `Robot.joint_compliance`; half of that leaves room for other postures.
+    The inertia of each joint alone, 1 / W[j, j], scaled by one factor so that the eigenvalues of diag(inertia) W stay below 0.75 for the
+    compliance W, shape (n, n), see `Robot.joint_compliance`; what is left to 4/3 is for other postures.
     """
-    return 0.5 / np.abs(compliance).sum(axis=1)
+    alone = 1.0 / np.diag(compliance)
+    correlation = compliance * np.sqrt(np.outer(alone, alone))
+    return 0.75 * alone / np.linalg.eigvalsh(correlation)[-1]
