@@ -89,11 +89,12 @@ class PositionLoop(LeafSystem):
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
-        if time_step < config.period:
+        self._holds = time_step < config.period
+        if self._holds:
             self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._hold)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        if not is_tick(context.get_time(), self._period):
+        if self._holds and not is_tick(context.get_time(), self._period):
             output.SetFromVector(context.get_discrete_state(self._held).value())
             return
         error = self._desired_state.Eval(context) - self._estimated_state.Eval(context)
