@@ -59,8 +59,8 @@ class Log(Mapping[str, np.ndarray]):
     """
 
     channels: dict[str, np.ndarray]
-    # "joints": names in column order; "sides"; "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "scenario": YAML
-    # text; "outcome".
+    # "joints": names in column order; "sides"; "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
+    # "scenario": YAML text; "outcome".
     meta: dict[str, Any]
 
     def __post_init__(self) -> None:

@@ -159,6 +159,7 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "pads": {side: robot.pad_positions(side).tolist() for side in robot.description.sides},
         "period": scenario.log.period,
         "source": "fbse_drake simulation",
+        "title": scenario.title,
         "scenario": dump_scenario(scenario, name),
         "outcome": {"finished": failure is None, "fell": fell, "reason": failure or "finished", "time": float(time[-1])},
     }

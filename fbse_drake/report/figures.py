@@ -5,7 +5,6 @@ planned. Nothing here touches pyplot or matplotlib's global settings.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
+from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.report.html import FigureBlock
 from fbse_drake.report.metrics import com_rse
+from fbse_drake.walking.plan import Phase
 
 _SIDE_COLORS = ("#2979b5", "#d65f1a", "#2f8f6b", "#8457a8")
 _PLANNED = "#555b62"
@@ -36,20 +37,6 @@ _FRICTION_SPAN = 0.1  # [Nm]
 _VELOCITY_SPAN = 0.01  # [rad/s]
 # The direction of a foot's force means little below this share of the feet's mean load.
 _LOADED_SHARE = 0.05
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A stretch of time [s] in which the plan stands on the same feet."""
-
-    start: float
-    end: float
-    support: tuple[str, ...]
-
-    @property
-    def label(self) -> str:
-        """`DS` for double support, else the supporting leg's initial and S, as `LS`; empty without support."""
-        return "DS" if len(self.support) > 1 else "".join(f"{side[0].upper()}S" for side in self.support)
 
 
 def support_phases(log: Log) -> list[Phase]:
@@ -402,15 +389,10 @@ def _footholds(log: Log, side: str, channel: str) -> Iterable[np.ndarray]:
 
 
 def _measured_zmp(log: Log, pads: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Centre of the measured vertical pad forces on the ground, (N, 2) [m]; NaN where the feet carry next to nothing."""
-    load, moment = np.zeros(len(log.time)), np.zeros((len(log.time), 2))
-    for side in log.sides:
-        vertical = log[f"foot/{side}/pad_force"][:, :, 2]
-        load += vertical.sum(axis=1)
-        place = log[f"truth/foot/{side}/position"][:, None, :2] + pads[side][:, :2]
-        moment += np.einsum("kp,kpi->ki", vertical, place)
-    load[load < _LOADED_SHARE * load.mean()] = np.nan
-    return moment / load[:, None]
+    """ZMP of the measured pad forces, (N, 2) [m]; soles taken as level."""
+    force = np.concatenate([log[f"foot/{side}/pad_force"] for side in log.sides], axis=1)
+    place = np.concatenate([log[f"truth/foot/{side}/position"][:, None] + pads[side] for side in log.sides], axis=1)
+    return zero_moment_point(force, place)
 
 
 def _stride(log: Log) -> slice:

@@ -30,7 +30,7 @@ def write_simulation_report(
     outlines = {side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()}
     figures = {topic: tuple(blocks) for topic, blocks in simulation_figures(log, outlines=outlines, pads=pads).items()}
     sections = [
-        Section("Summary", tables=_key_figures(metrics)),
+        Section("Summary", log.meta.get("title", ""), tables=_key_figures(metrics)),
         Section("Motion", figures=figures["walk"]),
         Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
         Section("Foot forces", figures=figures["forces"]),

@@ -19,7 +19,7 @@ class PointMotion:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of time with the same feet on the ground."""
+    """A stretch of time [s] with the same feet on the ground."""
 
     start: float
     end: float
@@ -29,6 +29,11 @@ class Phase:
     @property
     def is_single(self) -> bool:
         return len(self.support) == 1
+
+    @property
+    def label(self) -> str:
+        """`DS` for double support, else the supporting leg's initial and S, as `LS`; empty without support."""
+        return "DS" if len(self.support) > 1 else "".join(f"{side[0].upper()}S" for side in self.support)
 
 
 @dataclass(frozen=True)
