@@ -60,7 +60,9 @@ def _parser() -> argparse.ArgumentParser:
         "--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help="changes a value, as in seed=3; repeatable"
     )
     run.add_argument("--meshcat", action="store_true", help="show the run in a browser; also writes meshcat.html")
-    run.add_argument("--out", metavar="DIR", type=Path, help="where the results go (default: out/<name of the scenario>)")
+    run.add_argument(
+        "--out", metavar="DIR", type=Path, help="where the results go (default: out/ and the name of the scenario or of its file)"
+    )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.set_defaults(run=_simulate)
     return parser
@@ -68,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _simulate(options: argparse.Namespace) -> int:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
-    out = _output_folder(options.out or Path("out") / name)
+    out = _output_folder(options.out or Path("out") / (options.name or Path(options.scenario).stem))
     console = Console(quiet=options.quiet)
     meshcat = _start_meshcat(console) if options.meshcat else None
     with located(f"{options.scenario}: "), _progress(console, f"simulating {name}", scenario.duration) as progress:

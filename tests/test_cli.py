@@ -105,3 +105,10 @@ def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
     if names:
         assert names == ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
         assert Log.load(tmp_path / "out/log.npz").meta["outcome"]["reason"].endswith("interrupted")
+
+
+def test_a_copied_scenario_does_not_overwrite_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text("squat: {duration: 0.05, reference: !Squat {}}\n")
+    assert main(["simulate", "mine.yaml", "--quiet"]) == DONE
+    assert (tmp_path / "out/mine/log.npz").is_file()
