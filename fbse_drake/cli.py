@@ -103,6 +103,8 @@ def _output_folder(path: Path) -> Path:
 
 def _start_meshcat(console: Console) -> Meshcat:
     meshcat = StartMeshcat()
+    # From the right front, near enough for a robot.
+    meshcat.SetCameraPose([2.2, -2.2, 1.3], [0.2, 0.0, 0.5])
     console.print(f"Watch the run at {meshcat.web_url()}", highlight=False)
     return meshcat
 

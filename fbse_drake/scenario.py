@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 from pydrake.common.yaml import yaml_load
-from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake import resources, schema
 from fbse_drake.control.position_loop import PositionLoopConfig
@@ -107,10 +108,17 @@ class Scenario:
             raise InputError(f"duration: expected a number > 0, found {self.duration:g}")
         if self.seed < 0:
             raise InputError(f"seed: expected a whole number >= 0, found {self.seed}")
-        if self.plant.time_step <= 0:
-            raise InputError(f"plant.time_step: expected a number > 0, found {self.plant.time_step:g}")
+        for key in ("time_step", "stiction_tolerance", "penetration_allowance"):
+            if getattr(self.plant, key) <= 0:
+                raise InputError(f"plant.{key}: expected a number > 0, found {getattr(self.plant, key):g}")
+        try:
+            AddMultibodyPlant(self.plant, DiagramBuilder())
+        except RuntimeError as error:
+            raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:
             raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
+        if self.duration < self.control.period:
+            raise InputError(f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}")
         periods = {
             "control.period": self.control.period,
             "log.period": self.log.period,

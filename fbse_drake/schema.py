@@ -141,8 +141,8 @@ def _scalar(schema: type, value: Any, file: str, key: str) -> Any:
     matches = isinstance(value, schema) or (schema is float and isinstance(value, int))
     if not matches or (isinstance(value, bool) and schema is not bool):
         raise InputError(f"{file}{key}: expected {_SCALARS[schema]}, found {_describe(value)}")
-    if schema is float and math.isnan(value):
-        raise InputError(f"{file}{key}: expected a number, found NaN")
+    if schema is float and not math.isfinite(value):
+        raise InputError(f"{file}{key}: expected a finite number, found {value}")
     return schema(value)
 
 

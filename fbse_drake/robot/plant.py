@@ -29,9 +29,11 @@ class Ground:
     dissipation: float = 100.0
 
     def __post_init__(self) -> None:
-        for name in ("friction", "stiffness", "dissipation"):
+        if self.stiffness <= 0:
+            raise InputError(f"stiffness: expected a number > 0, found {self.stiffness:g}")
+        for name in ("friction", "dissipation"):
             if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name)}")
+                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,10 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
     corners = {side: robot.pad_positions(side) for side in legs}
     gravity = robot.plant.gravity_field().gravity_vector()
     plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
-    joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
+    try:
+        joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
+    except np.linalg.LinAlgError:
+        raise InputError("a leg is stretched out straight, where its joint velocities are not defined; lower com_height") from None
     _check_limits(robot, plan, joint_motion.position)
     torque = _feedforward(robot, plan, joint_motion, base, motions)
     return Reference(time, joint_motion.position, joint_motion.velocity, joint_motion.acceleration, torque, base, plan)
