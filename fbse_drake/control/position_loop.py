@@ -70,7 +70,9 @@ class PositionLoop(LeafSystem):
     """
 
     def __init__(self, config: PositionLoopConfig, names: RobotDescription, time_step: float):
-        """Args:
+        """Declares ports, state and, where the command must be held, the update.
+
+        Args:
             time_step: the plant's step [s]; if it is the control period, the command never has to be held.
 
         Raises:

@@ -82,10 +82,12 @@ class JointTorqueEffects(LeafSystem):
     """
 
     def __init__(self, effects: Sequence[ResolvedEffect], inertia: np.ndarray, time_step: float):
-        """Args:
-        effects: what acts.
-        inertia: effective inertia of each joint, or less, shape (n,) [kg m^2].
-        time_step: the plant's step [s].
+        """Declares ports, state and updates.
+
+        Args:
+            effects: what acts.
+            inertia: effective inertia of each joint, or less, shape (n,) [kg m^2].
+            time_step: the plant's step [s].
         """
         super().__init__()
         n = len(inertia)

@@ -92,8 +92,11 @@ class Encoders(Diagram):
     """
 
     def __init__(self, config: EncoderConfig, joints: int, seed: int, duration: float):
-        """Args:
-        duration: noise is drawn for this time [s].
+        """Puts the encoders together.
+
+        Args:
+            seed: of the errors.
+            duration: noise is drawn for this time [s].
         """
         super().__init__()
         builder = DiagramBuilder()

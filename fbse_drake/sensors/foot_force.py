@@ -76,8 +76,11 @@ class FootForceSensors(Diagram):
     """
 
     def __init__(self, config: FootForceConfig, robot: Robot, seed: int, duration: float):
-        """Args:
-        duration: noise is drawn for this time [s].
+        """Puts the sensors together.
+
+        Args:
+            seed: of the errors.
+            duration: noise is drawn for this time [s].
         """
         super().__init__()
         builder = DiagramBuilder()

@@ -67,8 +67,11 @@ class Imu(Diagram):
     """
 
     def __init__(self, config: ImuConfig, robot: Robot, seed: int, duration: float):
-        """Args:
-        duration: errors are drawn for this time [s].
+        """Puts the IMU together.
+
+        Args:
+            seed: of the errors.
+            duration: errors are drawn for this time [s].
         """
         super().__init__()
         builder = DiagramBuilder()

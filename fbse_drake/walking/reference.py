@@ -83,7 +83,7 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
     except np.linalg.LinAlgError:
         raise InputError("a leg is stretched out straight, where its joint velocities are not defined; lower com_height") from None
-    _check_limits(robot, plan, joint_motion.position)
+    _check_limits(robot, time, joint_motion.position, plan)
     torque = _feedforward(robot, plan, joint_motion, base, motions)
     return Reference(time, joint_motion.position, joint_motion.velocity, joint_motion.acceleration, torque, base, plan)
 
@@ -156,15 +156,15 @@ def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
     return f"{where} ({side} leg, t = {time:.2f} s) is out of reach: {error}; shorten step_length or change com_height"
 
 
-def _check_limits(robot: Robot, plan: TaskPlan, q: np.ndarray) -> None:
+def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan | None) -> None:
     lower = robot.plant.GetPositionLowerLimits()[robot.position_index]
     upper = robot.plant.GetPositionUpperLimits()[robot.position_index]
     excess = np.maximum(lower - q, q - upper)
     if excess.max() > 0:
         sample, joint = np.unravel_index(excess.argmax(), excess.shape)
-        number, _ = plan.phase_at(plan.time[sample])
+        step = f"step {(plan.phase_at(time[sample])[0] + 1) // 2}, " if plan is not None else ""
         raise InputError(
-            f"step {(number + 1) // 2} (t = {plan.time[sample]:.2f} s) needs {robot.joint_names[joint]} at {q[sample, joint]:.3f} rad, "
+            f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at {q[sample, joint]:.3f} rad, "
             f"its limits are {lower[joint]:.3f} to {upper[joint]:.3f} rad"
         )
 
@@ -251,6 +251,7 @@ def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Referenc
         plant.SetVelocities(context, rates)
         plant.CalcForceElementsContribution(context, forces)
         torque[k] = plant.CalcInverseDynamics(context, accelerations, forces)[robot.velocity_index]
+    _check_limits(robot, time, motion[0], None)
     still = np.zeros((len(time), 3))
     X_WB = robot.base.EvalPoseInWorld(context)
     return Reference(time, *motion, torque, PointMotion(still + X_WB.translation(), still, still), None)
