@@ -77,9 +77,10 @@ def simulate(
     if meshcat is not None:
         meshcat.StartRecording()
 
+    # From here on there is something to record.
+    simulator.Initialize()
     failure, fell, start = None, False, clock.perf_counter()
     try:
-        simulator.Initialize()
         looks = int(np.ceil(scenario.duration / _LOOK_PERIOD - 1e-9))
         for look in range(1, looks + 1):
             simulator.AdvanceTo(min(look * _LOOK_PERIOD, scenario.duration))
@@ -131,9 +132,11 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
 def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
     robot, n = station.robot, len(station.robot.joint_names)
     ends = np.cumsum([station.GetOutputPort(port).size() for port in _RECORDED])[:-1]
-    raw = dict(zip(_RECORDED, np.split(record.data().T, ends, axis=1), strict=True))
+    # A run that diverges may end in rows that are not numbers.
+    rows = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
+    raw = dict(zip(_RECORDED, np.split(record.data().T[rows], ends, axis=1), strict=True))
     # The recorded times are sums of periods; the ticks they stand for are exact.
-    time = np.round(record.sample_times() / scenario.log.period) * scenario.log.period
+    time = np.round(record.sample_times()[rows] / scenario.log.period) * scenario.log.period
     channels = {
         "time": time,
         "joint/position": raw["measured_joint_state"][:, :n],

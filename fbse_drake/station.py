@@ -8,7 +8,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
-from fbse_drake.errors import located
+from fbse_drake.errors import InputError, located
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.scenario import Scenario
 from fbse_drake.sensors.encoders import Encoders
@@ -61,6 +61,8 @@ class Station(Diagram):
         with located("model: "):
             believed = scenario.believed
             self.model, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
+            if self.model.joint_names != self.robot.joint_names:
+                raise InputError(f"expected the robot's joints {self.robot.joint_names}, found {self.model.joint_names}")
         with located("reference: "):
             ticks = round(scenario.duration / scenario.control.period)
             self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)

@@ -123,3 +123,18 @@ def test_log_follows_the_contract(run: Callable[..., Log]):
     assert all(values.dtype == np.float64 for values in log.values())
     assert log.joints[:2] == ["left_hip_yaw", "left_hip_roll"]
     np.testing.assert_array_equal(log.time, np.arange(samples) * 0.001)
+
+
+def test_a_run_that_diverges_keeps_what_was_recorded(monkeypatch: pytest.MonkeyPatch):
+    calls = []
+
+    def diverging(error: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        calls.append(1)
+        return error * (np.nan if len(calls) > 100 else 0.0)
+
+    monkeypatch.setattr("fbse_drake.control.position_loop.position_loop", diverging)
+    result = simulate(scenario("leg_swing_gantry", "duration=0.5"))
+    assert result.failure is not None
+    assert result.log.meta["outcome"]["fell"]
+    assert 0.05 < result.log.time[-1] <= 0.12
+    assert all(np.isfinite(values).all() for values in result.log.values())

@@ -150,16 +150,14 @@ class Walk:
 
         # Double supports move, single supports rest, and after the last double support the robot stands.
         breaks = [phase.start for phase in phases] + [round(phases[-1].start + self.double_support, 9)]
-        moves, bump = [], []
+        moves = []
         for number, phase in enumerate(phases):
             k = (number + 1) // 2
             end = targets[k] if phase.is_single else targets[k + 1]
             moves.append((targets[k], end - targets[k]))
-            bump.append(1.0 if number == 0 else 2.0 if number == len(phases) - 1 else 0.0)
         if phases[-1].end > breaks[-1]:
             breaks.append(phases[-1].end)
             moves.append((targets[-1], np.zeros(2)))
-            bump.append(0.0)
         breaks = np.array(breaks)
 
         def polynomial(step: np.ndarray, offset: np.ndarray, bumps: np.ndarray) -> PPoly:
@@ -169,7 +167,8 @@ class Walk:
 
         step, offset = np.array([m[1] for m in moves]), np.array([m[0] for m in moves])
         plain = polynomial(step, offset, np.zeros(len(moves)))
-        first, last = (polynomial(0 * step, 0 * offset, np.array(bump) == k) for k in (1.0, 2.0))
+        pieces = np.arange(len(moves))
+        first, last = (polynomial(0 * step, 0 * offset, pieces == bumped) for bumped in (0, len(phases) - 1))
         ends = breaks[[0, -1]]
         # The CoM depends linearly on the ZMP: two bumps make its velocity vanish at both ends.
         speed = [solve_lipm(zmp, self.com_height, gravity)(ends, 1) for zmp in (plain, first, last)]
