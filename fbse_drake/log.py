@@ -41,6 +41,13 @@ _CHANNELS: list[tuple[str, str, tuple[str | int, ...]]] = [
     (r"\w+/base/angular_velocity", "rad/s", (3,)),
     (r"\w+/base/angular_acceleration", "rad/s^2", (3,)),
     (r"\w+/zmp", "m", (2,)),
+    (r"estimate/support", "1", ("m",)),
+    (r"estimate/imu/angular_velocity_bias", "rad/s", (3,)),
+    (r"estimate/sensors/status", "1", ("m",)),
+    (r"estimate/\w+/status", "1", ()),
+    # Units of the filter's own states, see its LeafSystem.
+    (r"estimate/\w+/(covariance|innovation|innovation_variance)", "-", ("m",)),
+    (r"estimate/friction/parameter(s|_variance)", "-", ("n", "m")),
 ]
 _REQUIRED = ("time", "joint/position", "joint/torque_command")
 

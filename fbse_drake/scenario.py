@@ -14,14 +14,18 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake import resources, schema
+from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
 from fbse_drake.errors import InputError, located
+from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
+from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import load_description
 from fbse_drake.robot.plant import Ground
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
+from fbse_drake.sensors.joint_torque import JointTorqueConfig
 from fbse_drake.walking.reference import ReferenceConfig
 from fbse_drake.walking.walk import Walk
 
@@ -54,6 +58,8 @@ class SensorsConfig:
     encoders: EncoderConfig = field(default_factory=EncoderConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     foot_force: FootForceConfig = field(default_factory=FootForceConfig)
+    # Joint torque sensors, for robots that have them.
+    joint_torque: JointTorqueConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +106,10 @@ class Scenario:
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
+    # Who estimates the friction: !NoEstimator, !Fbse, or a reference method: !TrueFriction, !TorqueSensor, !DisturbanceObserver, !FixedFriction.
+    estimator: EstimatorConfig = field(default_factory=NoEstimator)
+    # What the controller makes of it: !NoCompensation, !IntegralCompensation or !FeedforwardCompensation.
+    compensation: CompensationConfig = field(default_factory=NoCompensation)
     fall: FallConfig = field(default_factory=FallConfig)
     log: LogConfig = field(default_factory=LogConfig)
 
@@ -119,6 +129,10 @@ class Scenario:
             raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
         if self.duration < self.control.period:
             raise InputError(f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}")
+        if isinstance(self.estimator, NoEstimator) and not isinstance(self.compensation, NoCompensation):
+            raise InputError("compensation: needs an estimator (estimator: !Fbse {})")
+        if isinstance(self.estimator, TorqueSensor) and self.sensors.joint_torque is None:
+            raise InputError("estimator: !TorqueSensor needs sensors.joint_torque (as in sensors.joint_torque: {noise: 0.3})")
         periods = {
             "control.period": self.control.period,
             "log.period": self.log.period,
@@ -181,6 +195,12 @@ def check_joints(scenario: Scenario) -> None:
     names, _ = load_description(scenario.robot.description)
     for key in ("kp", "kd", "torque_limit"):
         names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
+    if isinstance(scenario.compensation, IntegralCompensation):
+        names.per_joint(scenario.compensation.gain, key="compensation.gain")
+    if isinstance(scenario.estimator, FixedFriction):
+        scenario.estimator.model.resolve(names, key="estimator.model")
+    if isinstance(scenario.estimator, Fbse):
+        scenario.estimator.friction.model.resolve(names, key="estimator.friction.model")
 
 
 def dump_scenario(scenario: Scenario, name: str) -> str:

@@ -18,7 +18,7 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import FallConfig, Scenario, dump_scenario
 from fbse_drake.station import Station, build_station
 
-# Output ports of the station that are recorded.
+# Output ports that every station has and that are recorded.
 _RECORDED = (
     "measured_joint_state",
     "measured_imu",
@@ -64,7 +64,7 @@ def simulate(
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
     # One sink for all signals: every sink has an event of its own, which costs more than its data.
-    recorded = [station.GetOutputPort(name) for name in _RECORDED]
+    recorded = [station.GetOutputPort(name) for name in _recorded(station)]
     record = builder.AddNamedSystem("record", Multiplexer([port.size() for port in recorded]))
     for i, port in enumerate(recorded):
         builder.Connect(port, record.get_input_port(i))
@@ -125,16 +125,23 @@ def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_h
     return None
 
 
+def _recorded(station: Station) -> list[str]:
+    """Output ports of the station that are recorded."""
+    torque = ["measured_torque"] if station.HasOutputPort("measured_torque") else []
+    return [*_RECORDED, *torque, *(station.estimator.channels if station.estimator is not None else ())]
+
+
 def _base_pose(robot: Robot, context: Context) -> RigidTransform:
     return robot.plant.EvalBodyPoseInWorld(context, robot.base)
 
 
 def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
     robot, n = station.robot, len(station.robot.joint_names)
-    ends = np.cumsum([station.GetOutputPort(port).size() for port in _RECORDED])[:-1]
+    ports = _recorded(station)
+    ends = np.cumsum([station.GetOutputPort(port).size() for port in ports])[:-1]
     # A run that diverges may end in rows that are not numbers.
     rows = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
-    raw = dict(zip(_RECORDED, np.split(record.data().T[rows], ends, axis=1), strict=True))
+    raw = dict(zip(ports, np.split(record.data().T[rows], ends, axis=1), strict=True))
     # The recorded times are sums of periods; the ticks they stand for are exact.
     time = np.round(record.sample_times()[rows] / scenario.log.period) * scenario.log.period
     channels = {
@@ -146,10 +153,14 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "imu/angular_velocity": raw["measured_imu"][:, 3:],
         **_split_pads(robot, raw["measured_pad_force"], ""),
         **_reference_channels(station, time),
+        **({"joint/torque_measured": raw["measured_torque"]} if "measured_torque" in raw else {}),
         "truth/joint/friction_torque": raw["torque_loss"],
         **_split_pads(robot, raw["true_pad_force"], "truth/"),
         **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
     }
+    if station.estimator is not None:
+        shapes = station.estimator.channels.items()
+        channels |= {name: raw[name].reshape(len(time), *shape) for name, shape in shapes}
     meta = {
         "joints": robot.joint_names,
         "sides": robot.description.sides,

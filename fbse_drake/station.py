@@ -4,16 +4,20 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.primitives import Demultiplexer, MatrixGain
 
+from fbse_drake.control.compensation import FrictionCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
 from fbse_drake.errors import InputError, located
+from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
+from fbse_drake.estimators.recursive import Clock
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.scenario import Scenario
 from fbse_drake.sensors.encoders import Encoders
 from fbse_drake.sensors.foot_force import FootForceSensors
 from fbse_drake.sensors.imu import Imu
+from fbse_drake.sensors.joint_torque import JointTorqueSensors
 from fbse_drake.walking.reference import Reference, ReferenceSource, make_reference
 
 
@@ -38,12 +42,16 @@ class Station(Diagram):
         - torque_loss
 
     Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration, ideal pad forces, torque
-    loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the command and may be left unconnected.
+    loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the command and may be left unconnected; a station that
+    compensates its own estimate does not have it. A station with an estimator also has the ports `estimator_friction_estimate` a port
+    for each of `estimator.channels`, see `EstimatorDiagram`; one with joint torque sensors has `measured_torque`.
     """
 
     robot: Robot
     model: Robot
     reference: Reference
+    # None without an estimator.
+    estimator: EstimatorDiagram | None
 
     def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None):
         super().__init__()
@@ -103,7 +111,40 @@ class Station(Diagram):
             builder.Connect(source.GetOutputPort("feedforward_torque"), controller.GetInputPort("feedforward_torque"))
         builder.Connect(controller.get_output_port(), command.get_input_port())
         builder.Connect(command.get_output_port(), plant.get_actuation_input_port())
-        builder.ExportInput(controller.GetInputPort("friction_estimate"), "friction_estimate")
+
+        # Estimator and compensation.
+        period = scenario.control.period
+        self.estimator = make_estimator(scenario.estimator, self.model, period=period, plan=self.reference.plan)
+        available = {
+            "measured_joint_state": encoders.get_output_port(),
+            "measured_imu": imu.get_output_port(),
+            "measured_pad_force": foot_force.GetOutputPort("measured_pad_force"),
+            "torque_command": controller.get_output_port(),
+            "torque_loss": effects.get_output_port(),
+        }
+        if scenario.sensors.joint_torque is not None:
+            sensors = JointTorqueSensors(scenario.sensors.joint_torque, n, scenario.plant.time_step, *draw)
+            torque_sensors = builder.AddNamedSystem("joint_torque_sensors", sensors)
+            for name in ("torque_command", "torque_loss"):
+                builder.Connect(available[name], torque_sensors.GetInputPort(name))
+            available["measured_torque"] = torque_sensors.get_output_port()
+            builder.ExportOutput(torque_sensors.get_output_port(), "measured_torque")
+        if self.estimator is not None:
+            builder.AddNamedSystem("estimator", self.estimator)
+            for i in range(self.estimator.num_input_ports()):
+                port = self.estimator.get_input_port(i)
+                builder.Connect(available[port.get_name()], port)
+            for channel in self.estimator.channels:
+                builder.ExportOutput(self.estimator.GetOutputPort(channel), channel)
+        if self.estimator is not None and not isinstance(scenario.compensation, NoCompensation):
+            compensation = FrictionCompensation(scenario.compensation, names, Clock(period, period * (1 - 1e-6)))
+            builder.AddNamedSystem("compensation", compensation)
+            torque = builder.AddNamedSystem("compensation_torque", Demultiplexer([1, n]))
+            builder.Connect(self.estimator.GetOutputPort("friction_estimate"), compensation.get_input_port())
+            builder.Connect(compensation.get_output_port(), torque.get_input_port())
+            builder.Connect(torque.get_output_port(1), controller.GetInputPort("friction_estimate"))
+        else:
+            builder.ExportInput(controller.GetInputPort("friction_estimate"), "friction_estimate")
 
         builder.ExportOutput(encoders.get_output_port(), "measured_joint_state")
         builder.ExportOutput(imu.get_output_port(), "measured_imu")

@@ -140,6 +140,20 @@ class Robot:
         return np.linalg.inv(self.plant.CalcMassMatrix(context))[np.ix_(index, index)]
 
 
+def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
+    """Matrix that takes the forces on all pads of a foot, [x, y, z] pad by pad, to the wrench [moment, force] at the sole's origin in the
+    sole frame.
+
+    Args:
+        pad_positions: (pads, 3) [m].
+
+    Returns:
+        Shape (6, 3 pads) [m, 1].
+    """
+    moments = [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in pad_positions]
+    return np.concatenate([np.concatenate([moment, np.eye(3)]) for moment in moments], axis=1)
+
+
 def make_robot(
     description: str | Path,
     *,

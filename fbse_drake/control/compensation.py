@@ -1,0 +1,98 @@
+"""What the controller makes of a friction estimate (paper Sec. 7.4)."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.robot.description import RobotDescription
+
+
+@dataclass(frozen=True)
+class NoCompensation:
+    """The estimate is only watched."""
+
+
+@dataclass(frozen=True)
+class IntegralCompensation:
+    """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor): the estimate through a low-pass of bandwidth k_i."""
+
+    # Integral gain by joint [rad/s]; the paper's.
+    gain: dict[str, float] = field(
+        default_factory=lambda: {
+            "hip_yaw": 2.0,
+            "hip_roll": 2.0,
+            "hip_pitch": 1.0,
+            "knee_pitch": 2.0,
+            "ankle_pitch": 2.0,
+            "ankle_roll": 4.0,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        for joint, value in self.gain.items():
+            if value < 0:
+                raise InputError(f"gain.{joint}: expected a number >= 0, found {value:g}")
+
+
+@dataclass(frozen=True)
+class FeedforwardCompensation:
+    """The estimate, low-passed and limited, is added to the command."""
+
+    # Cut-off of the low-pass of first order [Hz].
+    cutoff: float = 20.0
+    # Share of the estimate that is compensated. Friction also damps; all of it is only cancelled where the position loop damps by itself.
+    share: float = 1.0
+    # Largest torque in either direction [Nm].
+    limit: float = 50.0
+
+    def __post_init__(self) -> None:
+        for name in ("cutoff", "limit"):
+            if getattr(self, name) <= 0:
+                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        if not 0 <= self.share <= 1:
+            raise InputError(f"share: expected a number in [0, 1], found {self.share:g}")
+
+
+CompensationConfig = NoCompensation | IntegralCompensation | FeedforwardCompensation
+
+
+class FrictionCompensation(RecursiveEstimator):
+    """Torque that compensates an estimated friction: the estimate through a low-pass of first order for each joint.
+
+    .. pydrake_system::
+
+        name: FrictionCompensation
+        input_ports:
+        - friction_estimate
+        output_ports:
+        - posterior
+
+    `friction_estimate` (n,) [Nm]; field `torque` (n,) [Nm] is what is added to the command.
+    """
+
+    def __init__(self, config: IntegralCompensation | FeedforwardCompensation, names: RobotDescription, clock: Clock):
+        """Raises InputError for an unknown joint, or one without a gain."""
+        n = len(names.joint_names)
+        super().__init__({"torque": n}, clock)
+        if isinstance(config, IntegralCompensation):
+            self._rate = names.per_joint(config.gain, key="compensation.gain")
+            self._share, self._limit = 1.0, math.inf
+        else:
+            self._rate = np.full(n, 2 * math.pi * config.cutoff)
+            self._share, self._limit = config.share, config.limit
+        self._estimate = self.DeclareVectorInputPort("friction_estimate", n)
+        self._declare_posterior("friction_estimate")
+
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+        if math.isnan(elapsed):
+            return last.copy()
+        wanted = np.minimum(np.maximum(self._share * self._estimate.Eval(context), -self._limit), self._limit)
+        keep = np.exp(-self._rate * elapsed)
+        posterior = np.empty(len(last))
+        posterior[0] = 0.0
+        posterior[1:] = keep * last[1:] + (1 - keep) * wanted
+        return posterior

@@ -1,0 +1,282 @@
+"""Friction estimators as diagrams: what a scenario's `estimator` can be, wired from its LeafSystems."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import Demultiplexer
+
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.base_state import (
+    AdaptiveLipm,
+    AdaptiveLipmEstimator,
+    BaseStateConfig,
+    BaseStateEstimator,
+    ContactAided,
+    ContactAidedEstimator,
+)
+from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.friction import (
+    FrictionConfig,
+    ModelAided,
+    ModelAidedEstimator,
+    RecursiveLeastSquaresEstimator,
+)
+from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
+from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.reference_methods import (
+    DisturbanceObserver,
+    FixedFriction,
+    FixedFrictionModel,
+    MomentumObserver,
+    NoEstimator,
+    TorqueSensor,
+    TorqueSensorEstimator,
+    TrueFriction,
+    TrueFrictionSource,
+)
+from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
+from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, SupportDetector
+from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.errors import held_signal
+from fbse_drake.walking.plan import TaskPlan
+
+
+@dataclass(frozen=True)
+class Fbse:
+    """Foot base sensor estimation: attitude, base state, joint accelerations, link torque, friction.
+
+    The defaults are the best variant of every stage; `scenarios/paper_walk_fbse.yaml` also has the paper's.
+    """
+
+    sensor_monitor: SensorMonitorConfig = field(default_factory=SensorMonitorConfig)
+    attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
+    # !ContactAided or the paper's !AdaptiveLipm.
+    base_state: BaseStateConfig = field(default_factory=ContactAided)
+    # !MeasuredSupport or the paper's !PlannedSupport.
+    support: SupportConfig = field(default_factory=MeasuredSupport)
+    joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
+    link_torque: LinkTorqueConfig = field(default_factory=LinkTorqueConfig)
+    # !ModelAided or the paper's !RecursiveLeastSquares.
+    friction: FrictionConfig = field(default_factory=ModelAided)
+
+
+EstimatorConfig = NoEstimator | Fbse | TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
+
+# Fields of the estimators' posteriors that a log keeps: system, field, channel.
+_CHANNELS = [
+    ("sensor_monitor", "trust", "estimate/sensors/status"),
+    ("support", "support", "estimate/support"),
+    ("attitude", "status", "estimate/attitude/status"),
+    ("attitude", "orientation", "estimate/base/orientation"),
+    ("attitude", "angular_velocity_bias", "estimate/imu/angular_velocity_bias"),
+    ("attitude", "covariance", "estimate/attitude/covariance"),
+    ("attitude", "innovation", "estimate/attitude/innovation"),
+    ("attitude", "innovation_variance", "estimate/attitude/innovation_variance"),
+    ("base_state", "status", "estimate/base_state/status"),
+    ("base_state", "base_position", "estimate/base/position"),
+    ("base_state", "base_velocity", "estimate/base/velocity"),
+    ("base_state", "com_position", "estimate/com/position"),
+    ("base_state", "com_velocity", "estimate/com/velocity"),
+    ("base_state", "zmp", "estimate/zmp"),
+    ("base_state", "covariance", "estimate/base_state/covariance"),
+    ("base_state", "innovation", "estimate/base_state/innovation"),
+    ("base_state", "innovation_variance", "estimate/base_state/innovation_variance"),
+    ("joint_acceleration", "status", "estimate/joint_acceleration/status"),
+    ("joint_acceleration", "joint_acceleration", "estimate/joint/acceleration"),
+    ("joint_acceleration", "innovation", "estimate/joint_acceleration/innovation"),
+    ("joint_acceleration", "innovation_variance", "estimate/joint_acceleration/innovation_variance"),
+    ("link_torque", "status", "estimate/link_torque/status"),
+    ("link_torque", "link_torque", "estimate/joint/link_torque"),
+    ("link_torque", "residual", "estimate/joint/residual_torque"),
+    ("friction", "status", "estimate/friction/status"),
+    ("friction", "friction", "estimate/joint/friction_torque"),
+    ("friction", "parameters", "estimate/friction/parameters"),
+    ("friction", "parameter_variance", "estimate/friction/parameter_variance"),
+    ("friction", "innovation", "estimate/friction/innovation"),
+    ("friction", "innovation_variance", "estimate/friction/innovation_variance"),
+]
+
+
+class EstimatorDiagram(Diagram):
+    """A friction estimator; made by `make_estimator`.
+
+    .. pydrake_system::
+
+        name: EstimatorDiagram
+        input_ports:
+        - measured_joint_state
+        - measured_imu
+        - measured_pad_force
+        - torque_command
+        output_ports:
+        - friction_estimate
+        - (one for each channel)
+
+    Inputs are those of the sensors that the estimator needs (`TorqueSensor` has `measured_torque` besides, `TrueFriction` `torque_loss`).
+    `friction_estimate` (n,) [Nm] is that of the tick that ends now. The other outputs are named like the log channels they become, see
+    `channels`.
+    """
+
+    # Log channels, which are also names of output ports, and the shape of one sample.
+    channels: dict[str, tuple[int, ...]]
+
+    def __init__(self, config: EstimatorConfig, robot: Robot, clock: Clock, plan: TaskPlan | None):
+        super().__init__()
+        self.channels = {}
+        self._builder = DiagramBuilder()
+        self._systems: dict[str, RecursiveEstimator] = {}
+        self._split: dict[str, Demultiplexer] = {}
+        n = len(robot.joint_names)
+        if isinstance(config, TrueFriction):
+            friction: RecursiveEstimator = self._add("friction", TrueFrictionSource(n, clock))
+            self._feed(friction, "torque_loss")
+        elif isinstance(config, TorqueSensor):
+            friction = self._add("friction", TorqueSensorEstimator(config, n, clock))
+            self._feed(friction, "measured_torque", "torque_command")
+        elif isinstance(config, FixedFriction):
+            self._add_monitor(SensorMonitorConfig(), robot, clock)
+            friction = self._add("friction", FixedFrictionModel(config, robot, self._parts("sensor_monitor"), clock))
+            self._join(friction, measurements="sensor_monitor")
+        elif isinstance(config, DisturbanceObserver):
+            friction = self._add_momentum_observer(config, robot, clock, plan)
+        elif isinstance(config, Fbse):
+            friction = self._add_fbse(config, robot, clock, plan)
+        else:
+            raise TypeError(f"no estimator: {config}")
+        self._export(n)
+        self._builder.BuildInto(self)
+        del self._builder
+
+    def _add_fbse(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+        self._add_base(config, robot, clock, plan)
+        measurements, attitude, model = (self._parts(name) for name in ("sensor_monitor", "attitude", "model"))
+        acceleration = self._add(
+            "joint_acceleration",
+            JointAccelerationEstimator(config.joint_acceleration, robot, measurements, attitude, model, clock),
+        )
+        self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
+        self._connect_support(acceleration)
+        self._connect_model_at_start(acceleration)
+        link_torque = self._add(
+            "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._parts("joint_acceleration"), clock)
+        )
+        self._join(link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration")
+        self._connect_model_at_start(link_torque)
+        self._feed(link_torque, "torque_command")
+        kind = ModelAidedEstimator if isinstance(config.friction, ModelAided) else RecursiveLeastSquaresEstimator
+        friction = self._add("friction", kind(config.friction, robot, measurements, self._parts("link_torque"), clock))
+        self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
+        self._connect_support(friction)
+        return friction
+
+    def _add_momentum_observer(self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+        self._add_base(Fbse(), robot, clock, plan)
+        parts = [self._parts(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
+        friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
+        self._join(friction, measurements="sensor_monitor", attitude="attitude", base_state="base_state", model="model")
+        self._connect_model_at_start(friction)
+        self._feed(friction, "torque_command")
+        return friction
+
+    def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
+        """Sensor monitor, attitude, support, model and base state."""
+        if not robot.has_floating_base or not robot.description.legs:
+            raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
+        self._add_monitor(config.sensor_monitor, robot, clock)
+        measurements = self._parts("sensor_monitor")
+        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, clock))
+        self._join(attitude, measurements="sensor_monitor")
+        model = self._add("model", FloatingBaseModel(robot, measurements, clock))
+        self._join(model, measurements="sensor_monitor")
+        sides = robot.description.sides
+        if isinstance(config.support, PlannedSupport):
+            if plan is None:
+                raise InputError("estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)")
+            support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
+            source = held_signal(support, float(plan.time[1] - plan.time[0]))
+            self._support = self._builder.AddNamedSystem("support", source).get_output_port()
+            self.channels["estimate/support"] = (len(sides),)
+        else:
+            detector = self._add("support", SupportDetector(config.support, robot, measurements, clock))
+            self._join(detector, measurements="sensor_monitor")
+            self._support = self._field_port("support", "support")
+        middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
+        shared = (robot, measurements, self._parts("attitude"), self._parts("model"), clock, (float(middle[0]), float(middle[1])))
+        base_state: BaseStateEstimator
+        if isinstance(config.base_state, AdaptiveLipm):
+            base_state = AdaptiveLipmEstimator(config.base_state, *shared)
+        else:
+            base_state = ContactAidedEstimator(config.base_state, *shared)
+        self._add("base_state", base_state)
+        self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
+        self._connect_support(base_state)
+
+    def _add_monitor(self, config: SensorMonitorConfig, robot: Robot, clock: Clock) -> None:
+        monitor = self._add("sensor_monitor", SensorMonitor(config, robot, clock))
+        self._feed(monitor, "measured_joint_state", "measured_imu", "measured_pad_force")
+
+    def _add(self, name: str, system: RecursiveEstimator) -> RecursiveEstimator:
+        self._systems[name] = self._builder.AddNamedSystem(name, system)
+        return system
+
+    def _parts(self, name: str) -> dict[str, slice]:
+        return self._systems[name].fields.slices
+
+    def _join(self, system: RecursiveEstimator, **sources: str) -> None:
+        """Connects the posteriors of estimators to input ports of these names."""
+        for port, source in sources.items():
+            self._builder.Connect(self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port))
+
+    def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
+        self._builder.Connect(self._systems["model"].GetOutputPort("at_step_start"), system.GetInputPort("model_at_step_start"))
+
+    def _connect_support(self, system: System) -> None:
+        self._builder.Connect(self._support, system.GetInputPort("support"))
+
+    def _feed(self, system: RecursiveEstimator, *ports: str) -> None:
+        """Makes inputs of the diagram of a system's input ports."""
+        for port in ports:
+            self._builder.ExportInput(system.GetInputPort(port), port)
+
+    def _field_port(self, system: str, name: str) -> OutputPort:
+        """The output port of one field of a posterior."""
+        if system not in self._split:
+            fields = self._systems[system].fields
+            split = self._builder.AddNamedSystem(f"{system}_fields", Demultiplexer(list(fields.sizes.values())))
+            self._builder.Connect(self._systems[system].GetOutputPort("posterior"), split.get_input_port())
+            self._split[system] = split
+        split = self._split[system]
+        return split.get_output_port(list(self._systems[system].fields.sizes).index(name))
+
+    def _export(self, n: int) -> None:
+        self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
+        if "estimate/support" in self.channels:
+            self._builder.ExportOutput(self._support, "estimate/support")
+        for system, name, channel in _CHANNELS:
+            if system in self._systems and name in self._systems[system].fields.sizes:
+                size = self._systems[system].fields.sizes[name]
+                self._builder.ExportOutput(self._field_port(system, name), channel)
+                per_joint = name in ("parameters", "parameter_variance")
+                self.channels[channel] = (n, size // n) if per_joint else () if name == "status" else (size,)
+
+
+def make_estimator(
+    config: EstimatorConfig, robot: Robot, *, period: float, plan: TaskPlan | None = None, every_sample: bool = False
+) -> EstimatorDiagram | None:
+    """Builds a friction estimator, or None for `NoEstimator`.
+
+    Args:
+        robot: the model that is believed.
+        period: tick [s].
+        plan: for the planned support, and for where the feet stand at the start.
+        every_sample: every evaluation at a later time is a tick, whatever the period; for recorded logs.
+
+    Raises:
+        InputError: an estimator that does not fit the robot.
+    """
+    if isinstance(config, NoEstimator):
+        return None
+    return EstimatorDiagram(config, robot, Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)), plan)

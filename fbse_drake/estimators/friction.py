@@ -1,0 +1,337 @@
+"""From the measured friction, which is noisy, to the friction estimate: two LeafSystems with the same ports.
+
+`RecursiveLeastSquares` is the paper's: the measurement while the leg stands, a model identified from it while the leg swings.
+`ModelAided` weighs both at all times.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.robot.plant import Robot
+
+
+def _adopted_model() -> CoulombViscousFriction:
+    return CoulombViscousFriction(transition={"all": 1.0e-6})
+
+
+@dataclass(frozen=True)
+class RecursiveLeastSquares:
+    """Recursive least squares (64)-(67), one joint at a time: the covariance of the paper's 12 parameters never couples joints."""
+
+    # Adopted friction model, linear in what is identified; by default (57) with a sharp sign. Its linear values are where it starts.
+    model: CoulombViscousFriction = field(default_factory=_adopted_model)
+    # Initial covariance of every parameter, Table II.
+    covariance: float = 10.0
+    # Weight that a tick of 1 ms keeps after the next; 1 never forgets.
+    forgetting: float = 1.0
+    # The covariance is set back to its initial value this often [s]; 0 never.
+    reset_period: float = 0.0
+    # Cut-off of the low-pass on the measured friction [Hz]; 0 does not filter, as the paper.
+    cutoff: float = 0.0
+    # What is taken while a leg swings: `model` as in the paper, or the `measurement` (which needs fused accelerations).
+    swing: str = "model"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.forgetting <= 1:
+            raise InputError(f"forgetting: expected a number in (0, 1], found {self.forgetting:g}")
+        if self.covariance <= 0:
+            raise InputError(f"covariance: expected a number > 0, found {self.covariance:g}")
+        for name in ("reset_period", "cutoff"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        if self.swing not in ("model", "measurement"):
+            raise InputError(f"swing: expected model or measurement, found {self.swing}")
+
+
+@dataclass(frozen=True)
+class ModelAided:
+    """Kalman filter, joint by joint, for a friction model's parameters and what the model does not explain.
+
+    The friction is u = phi(velocity)^T parameters + d with constant parameters and d a random walk. Compared is not the measured friction
+    itself but its impulse, the integral over time: errors of velocities, which accelerations differentiate, are white in it. So sharp
+    features come from the model without delay, and the measurement decides over everything slower.
+    """
+
+    # Friction model, linear in what is identified; its linear values are where it starts.
+    model: CoulombViscousFriction = field(default_factory=CoulombViscousFriction)
+    # Initial standard deviation of every parameter [its unit].
+    parameter_uncertainty: float = 3.0
+    # Random walk of d [Nm/sqrt(s)], and its initial standard deviation [Nm].
+    disturbance_walk: float = 0.3
+    disturbance_uncertainty: float = 0.1
+    # Random walk of the parameters [its unit/sqrt(s)].
+    parameter_walk: float = 0.0
+    # Time constant of the smoothing of the velocity that the model sees [s].
+    velocity_smoothing: float = 0.002
+    # What is taken while a leg swings: the `measurement` as in stance, or the `model` alone.
+    swing: str = "measurement"
+
+    def __post_init__(self) -> None:
+        for name in ("parameter_uncertainty", "disturbance_walk", "disturbance_uncertainty", "parameter_walk", "velocity_smoothing"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        if self.swing not in ("model", "measurement"):
+            raise InputError(f"swing: expected model or measurement, found {self.swing}")
+
+
+FrictionConfig = RecursiveLeastSquares | ModelAided
+
+
+@dataclass(frozen=True)
+class FrictionRegressor:
+    """A joint torque effect as a regressor: basis (n, parameters) of a velocity (n,)."""
+
+    effect: type[JointTorqueEffect]
+    # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
+    nonlinear: np.ndarray
+    initial: np.ndarray
+
+    @staticmethod
+    def of(model: JointTorqueEffect, robot: Robot) -> "FrictionRegressor":
+        """Raises InputError for an unknown joint."""
+        resolved = model.resolve(robot.description, key="estimator.friction.model")
+        return FrictionRegressor(resolved.effect, resolved.nonlinear, resolved.linear.T.copy())
+
+    @property
+    def parameters(self) -> int:
+        return self.initial.shape[1]
+
+    def __call__(self, velocity: np.ndarray) -> np.ndarray:
+        basis, _ = self.effect.basis(JointMotion(velocity), self.nonlinear)
+        return np.array(basis).T
+
+
+def recursive_least_squares(
+    parameters: np.ndarray, P: np.ndarray, phi: np.ndarray, measured: np.ndarray, forgetting: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """One tick of (64)-(67) for n joints at once.
+
+    Args:
+        parameters: (n, m); P: their covariances (n, m, m); phi: regressors (n, m); measured: friction (n,) [Nm].
+        forgetting: weight of the past, 1 for the paper's.
+
+    Returns:
+        Parameters, covariances, innovation (n,) and its variance (n,), in units of the measurement noise.
+    """
+    innovation = measured - (phi * parameters).sum(axis=1)  # (65)
+    P_phi = (P @ phi[:, :, None])[:, :, 0]
+    S = forgetting + (phi * P_phi).sum(axis=1)
+    K = P_phi / S[:, None]  # (66)
+    return parameters + K * innovation[:, None], (P - K[:, :, None] * P_phi[:, None, :]) / forgetting, innovation, S  # (64), (67)
+
+
+class FrictionEstimator(RecursiveEstimator):
+    """What both friction estimators share.
+
+    .. pydrake_system::
+
+        name: FrictionEstimator
+        input_ports:
+        - measurements
+        - link_torque
+        - support
+        output_ports:
+        - posterior
+
+    Inputs: posteriors of `SensorMonitor` and `LinkTorqueEstimator`, and a support estimate (feet,). Fields of the posterior: `friction`
+    (n,) [Nm], the estimate for the tick that ends now; `parameters` (n, m) and `covariance` (n, m, m) of the model; `innovation` and
+    `innovation_variance` (n,).
+    """
+
+    def __init__(
+        self,
+        model: JointTorqueEffect,
+        robot: Robot,
+        measurements: dict[str, slice],
+        link_torque: dict[str, slice],
+        clock: Clock,
+        covariance_size: int,
+        further: dict[str, int],
+    ):
+        self._regressor = FrictionRegressor.of(model, robot)
+        n, m = len(robot.joint_names), self._regressor.parameters
+        super().__init__(
+            {
+                "friction": n,
+                "parameters": n * m,
+                "parameter_variance": n * m,
+                "covariance": n * (m + covariance_size) ** 2,
+                "innovation": n,
+                "innovation_variance": n,
+                **further,
+            },
+            clock,
+        )
+        self._measured, self._link_torque, self._n, self._m = measurements, link_torque, n, m
+        sides = list(robot.description.legs.values())
+        # Which leg each joint belongs to.
+        self._leg = np.array([next(k for k, leg in enumerate(sides) if name in leg.joints) for name in robot.joint_names])
+        for name, parts in (("measurements", measurements), ("link_torque", link_torque)):
+            self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
+        self.DeclareVectorInputPort("support", len(sides))
+        names = ("measurements", "link_torque", "support")
+        self._ports = [self.GetInputPort(name) for name in names]
+        self._declare_posterior(*names)
+
+
+class RecursiveLeastSquaresEstimator(FrictionEstimator):
+    """Friction as in the paper (Sec. 6-7): measured in stance, modelled in swing; see `RecursiveLeastSquares` and `FrictionEstimator`.
+
+    .. pydrake_system::
+
+        name: RecursiveLeastSquaresEstimator
+        input_ports:
+        - measurements
+        - link_torque
+        - support
+        output_ports:
+        - posterior
+
+    Further fields: `filtered` (2, n), state of the low-pass [Nm]; `age` [s], time since the last reset of the covariance.
+    """
+
+    def __init__(
+        self, config: RecursiveLeastSquares, robot: Robot, measurements: dict[str, slice], link_torque: dict[str, slice], clock: Clock
+    ):
+        n = len(robot.joint_names)
+        super().__init__(config.model, robot, measurements, link_torque, clock, 0, {"filtered": 2 * n, "age": 1})
+        self._config = config
+
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+        measured, link_torque, support = (port.Eval(context) for port in self._ports)
+        config, fields, n, m = self._config, self.fields, self._n, self._m
+        posterior = last.copy()
+        posterior[0] = max(measured[self._measured["trust"]].tolist())
+        parameters = posterior[fields["parameters"]].reshape(n, m)
+        P = posterior[fields["covariance"]].reshape(n, m, m)
+        if math.isnan(elapsed):
+            parameters[:] = self._regressor.initial
+        age = math.inf if math.isnan(elapsed) else posterior[fields["age"]][0] + elapsed
+        if age == math.inf or (config.reset_period and age >= config.reset_period * (1 - 1e-9)):
+            P[:], age = config.covariance * np.eye(m), 0.0
+        posterior[fields["age"]] = age
+        phi = self._regressor(measured[self._measured["joint_velocity"]])
+        valid = link_torque[self._link_torque["valid"]] > 0
+        if config.swing == "model":
+            valid &= support[self._leg] > 0
+        residual = link_torque[self._link_torque["residual"]]
+        filtered = posterior[fields["filtered"]].reshape(2, n)
+        if config.cutoff > 0 and not math.isnan(elapsed):
+            # Two equal poles; a joint that was not measured starts afresh from its model.
+            keep = math.exp(-2 * math.pi * config.cutoff * 1.55 * elapsed)
+            modelled = (phi * parameters).sum(axis=1)
+            filtered[0] = np.where(valid, keep * filtered[0] + (1 - keep) * residual, modelled)
+            filtered[1] = np.where(valid, keep * filtered[1] + (1 - keep) * filtered[0], modelled)
+            smooth = filtered[1]
+        else:
+            smooth = residual
+        if valid.any():
+            forgetting = 1.0 if config.forgetting == 1 else config.forgetting ** (elapsed / 1e-3)
+            new, P_new, innovation, S = recursive_least_squares(parameters, P, phi, residual, forgetting)
+            parameters[valid], P[valid] = new[valid], P_new[valid]
+            posterior[fields["innovation"]], posterior[fields["innovation_variance"]] = innovation * valid, S
+        posterior[fields["parameter_variance"]] = np.diagonal(P, axis1=1, axis2=2).ravel()
+        posterior[fields["friction"]] = np.where(valid, smooth, (phi * parameters).sum(axis=1))
+        return posterior
+
+
+class ModelAidedEstimator(FrictionEstimator):
+    """Friction from measurement and model together; see `ModelAided` and `FrictionEstimator`.
+
+    .. pydrake_system::
+
+        name: ModelAidedEstimator
+        input_ports:
+        - measurements
+        - link_torque
+        - support
+        output_ports:
+        - posterior
+
+    Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse [Nm s], after the update; `velocity` that the
+    model sees and `last_velocity` as measured [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
+    [impulse, parameters, disturbance].
+    """
+
+    def __init__(self, config: ModelAided, robot: Robot, measurements: dict[str, slice], link_torque: dict[str, slice], clock: Clock):
+        n = len(robot.joint_names)
+        further = {"disturbance": n, "impulse": n, "velocity": n, "last_velocity": n}
+        super().__init__(config.model, robot, measurements, link_torque, clock, 2, further)
+        self._config = config
+
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+        measured, link_torque, support = (port.Eval(context) for port in self._ports)
+        config, fields, n, m = self._config, self.fields, self._n, self._m
+        posterior = last.copy()
+        trust = measured[self._measured["trust"]].tolist()
+        posterior[0] = max(trust)
+        v = measured[self._measured["joint_velocity"]]
+        parameters = posterior[fields["parameters"]].reshape(n, m)
+        P = posterior[fields["covariance"]].reshape(n, m + 2, m + 2)
+        disturbance = posterior[fields["disturbance"]]
+        if math.isnan(elapsed):
+            parameters[:] = self._regressor.initial
+            P[:] = np.diag([0.0, *[config.parameter_uncertainty**2] * m, config.disturbance_uncertainty**2])
+            posterior[fields["velocity"]] = posterior[fields["last_velocity"]] = v
+            return posterior
+        # The joint's velocity over the tick is the mean of those at its ends.
+        velocity = posterior[fields["velocity"]]
+        keep = math.exp(-elapsed / config.velocity_smoothing) if config.velocity_smoothing > 0 else 0.0
+        velocity *= keep
+        velocity += (1 - keep) * 0.5 * (v + posterior[fields["last_velocity"]])
+        posterior[fields["last_velocity"]] = v
+        valid = link_torque[self._link_torque["valid"]] > 0
+        if config.swing == "model":
+            valid &= support[self._leg] > 0
+        phi = np.empty((n, m + 1))
+        phi[:, :m], phi[:, m] = self._regressor(velocity), 1.0
+        x = np.empty((n, m + 1))
+        x[:, :m], x[:, m] = parameters, disturbance
+        impulse = posterior[fields["impulse"]]
+        self._update(x, P, impulse, phi, link_torque, valid, elapsed, posterior)
+        if not valid.all():
+            # A joint that is not measured is left to its model.
+            x[~valid, m] = impulse[~valid] = 0.0
+            P[~valid, 0, :] = P[~valid, :, 0] = 0.0
+        parameters[:], disturbance[:] = x[:, :m], x[:, m]
+        posterior[fields["parameter_variance"]] = np.diagonal(P, axis1=1, axis2=2)[:, 1:-1].ravel()
+        posterior[fields["friction"]] = (phi * x).sum(axis=1)
+        return posterior
+
+    def _update(
+        self,
+        x: np.ndarray,
+        P: np.ndarray,
+        impulse: np.ndarray,
+        phi: np.ndarray,
+        link_torque: np.ndarray,
+        valid: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
+        """One tick of the Kalman filters of all joints, in place: x (n, m + 1), P (n, m + 2, m + 2), impulse (n,)."""
+        config, fields, parts, m = self._config, self.fields, self._link_torque, self._m
+        innovation = impulse + elapsed * (link_torque[parts["residual"]] - (phi * x).sum(axis=1))
+        c = elapsed * (P[:, :, 1:] @ phi[:, :, None])[:, :, 0]
+        added = elapsed * (phi * c[:, 1:]).sum(axis=1) + elapsed**2 * link_torque[parts["torque_variance"]]
+        P[:, 0, :] += c
+        P[:, :, 0] += c
+        P[:, 0, 0] += added
+        P[:, m + 1, m + 1] += config.disturbance_walk**2 * elapsed
+        if config.parameter_walk > 0:
+            for k in range(1, m + 1):
+                P[:, k, k] += config.parameter_walk**2 * elapsed
+        column = P[:, :, 0].copy()
+        S = column[:, 0] + link_torque[parts["impulse_variance"]]
+        K = column * (valid / S)[:, None]
+        x += K[:, 1:] * innovation[:, None]
+        impulse[:] = (1 - K[:, 0]) * innovation
+        P -= K[:, :, None] * column[:, None, :]
+        posterior[fields["innovation"]], posterior[fields["innovation_variance"]] = innovation * valid, S

@@ -1,0 +1,90 @@
+"""Joint torque sensors, between joint and link; few robots have them."""
+
+from dataclasses import dataclass
+
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.primitives import Adder
+
+from fbse_drake.errors import InputError
+from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
+
+
+@dataclass(frozen=True)
+class JointTorqueConfig:
+    """Errors of every sensor."""
+
+    # Standard deviation of white noise [Nm].
+    noise: float = 0.0
+    # Sampling period [s].
+    period: float = 0.001
+
+    def __post_init__(self) -> None:
+        if self.noise < 0:
+            raise InputError(f"noise: expected a number >= 0, found {self.noise:g}")
+        if self.period <= 0:
+            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+
+
+class TransmittedTorque(LeafSystem):
+    """What reached the links in the last plant step: command minus torque loss.
+
+    .. pydrake_system::
+
+        name: TransmittedTorque
+        input_ports:
+        - torque_command
+        - torque_loss
+        output_ports:
+        - link_torque
+
+    All (n,) [Nm]. Discrete state: the link torque of the step that is under way.
+    """
+
+    def __init__(self, joints: int, time_step: float):
+        super().__init__()
+        self._torque_command = self.DeclareVectorInputPort("torque_command", joints)
+        self._torque_loss = self.DeclareVectorInputPort("torque_loss", joints)
+        self._torque = self.DeclareDiscreteState(joints)
+        self.DeclareStateOutputPort("link_torque", self._torque)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
+
+    def _remember(self, context: Context, state: State) -> None:
+        torque = self._torque_command.Eval(context) - self._torque_loss.Eval(context)
+        state.get_mutable_discrete_state(self._torque).set_value(torque)
+
+
+class JointTorqueSensors(Diagram):
+    """Measures the torque that reaches the links, of the step that ends now.
+
+    .. pydrake_system::
+
+        name: JointTorqueSensors
+        input_ports:
+        - torque_command
+        - torque_loss
+        output_ports:
+        - measured_torque
+
+    All (n,) [Nm].
+    """
+
+    def __init__(self, config: JointTorqueConfig, joints: int, time_step: float, seed: int, duration: float):
+        """Puts the sensors together.
+
+        Args:
+            time_step: the plant's step [s].
+            seed: of the errors.
+            duration: noise is drawn for this time [s].
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        true = builder.AddNamedSystem("true", TransmittedTorque(joints, time_step))
+        noise = config.noise * white_noise(seed, "joint torque", ticks_until(duration, config.period), joints)
+        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        noisy = builder.AddNamedSystem("noisy", Adder(2, joints))
+        builder.Connect(true.get_output_port(), noisy.get_input_port(0))
+        builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
+        for name in ("torque_command", "torque_loss"):
+            builder.ExportInput(true.GetInputPort(name), name)
+        builder.ExportOutput(noisy.get_output_port(), "measured_torque")
+        builder.BuildInto(self)
