@@ -1,7 +1,7 @@
 """Base attitude from the IMU: a Kalman filter for gravity feeds an extended Kalman filter on the quaternion (paper Sec. 3, Fig. 2)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.math import RotationMatrix
@@ -27,19 +27,33 @@ class AttitudeConfig:
     acceleration_noise: float = 0.02
     angular_velocity_noise: float = 1.0e-3
     # The trunk's linear acceleration: its size [m/s^2] and how long it keeps its direction [s].
-    motion_acceleration: float = 1.0
+    motion_acceleration: float = 0.5
     motion_time: float = 0.3
     # How large a constant accelerometer bias [m/s^2] and gyro bias [rad/s] may be; 0 does not estimate it.
     acceleration_bias: float = 0.0
     angular_velocity_bias: float = 0.0
-    # Linear acceleration when the estimate starts [m/s^2]; robots start standing.
-    initial_acceleration: float = 0.02
+    # Robots start standing: for this long [s] the trunk accelerates [m/s^2] and turns [rad/s] by no more than this.
+    standing_time: float = 0.05
+    standing_acceleration: float = 0.1
+    standing_rate: float = 3.0e-3
+    # How level the sole of a standing foot is (standard deviation [rad]): the legs then tell the tilt as well, on level ground. 0 does not use
+    # them, as the paper.
+    level_feet: float = 2.0e-3
+    # How long a foot keeps its error [s].
+    stance_time: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("acceleration_bias", "angular_velocity_bias", "angular_velocity_noise", "initial_acceleration"):
+        for name in (
+            "acceleration_bias",
+            "angular_velocity_bias",
+            "angular_velocity_noise",
+            "standing_time",
+            "standing_acceleration",
+            "level_feet",
+        ):
             if getattr(self, name) < 0:
                 raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
-        for name in ("acceleration_noise", "motion_acceleration", "motion_time"):
+        for name in ("acceleration_noise", "motion_acceleration", "motion_time", "stance_time"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
 
@@ -124,7 +138,7 @@ def start_gravity(config: AttitudeConfig, specific_force: Vector) -> GravityEsti
 
     (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all of it where it belongs.)
     """
-    prior = (9.81**2, config.initial_acceleration**2, config.acceleration_bias**2)
+    prior = (9.81**2, config.standing_acceleration**2, config.acceleration_bias**2)
     total = sum(prior) + config.acceleration_noise**2
     parts = [tuple(variance / total * y for y in specific_force) for variance in prior]
     # Covariance of one axis given the reading.
@@ -133,12 +147,15 @@ def start_gravity(config: AttitudeConfig, specific_force: Vector) -> GravityEsti
     return GravityEstimate(parts[0], parts[1], parts[2], covariance)
 
 
-def predict_gravity(config: AttitudeConfig, x: GravityEstimate, w: Vector, rate_variance: float, elapsed: float) -> GravityEstimate:
+def predict_gravity(
+    config: AttitudeConfig, x: GravityEstimate, w: Vector, rate_variance: float, motion_acceleration: float, elapsed: float
+) -> GravityEstimate:
     """Gravity and linear acceleration turn with the IMU; the acceleration fades as a first-order Gauss-Markov process.
 
     Args:
         w: angular velocity [rad/s].
         rate_variance: variance of w [(rad/s)^2].
+        motion_acceleration: standard deviation of the linear acceleration [m/s^2].
         elapsed: time step [s].
     """
     fade = math.exp(-elapsed / config.motion_time)
@@ -147,7 +164,7 @@ def predict_gravity(config: AttitudeConfig, x: GravityEstimate, w: Vector, rate_
     acceleration = tuple(fade * (a + elapsed * t) for a, t in zip(x.acceleration, turned_a, strict=True))
     gg, ga, gb, aa, ab, bb = x.covariance
     gg += (9.81 * elapsed) ** 2 * rate_variance
-    aa = fade * fade * aa + (1 - fade * fade) * config.motion_acceleration**2
+    aa = fade * fade * aa + (1 - fade * fade) * motion_acceleration**2
     return GravityEstimate(gravity, acceleration, x.bias, (gg, fade * ga, gb, aa, fade * ab, bb))
 
 
@@ -195,18 +212,19 @@ def predict_quaternion(config: AttitudeConfig, x: QuaternionEstimate, w: Vector,
     return QuaternionEstimate(quaternion_product(x.q, rotation_vector_to_quaternion(turn)), x.bias, covariance)
 
 
-def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: float) -> QuaternionEstimate:
+def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float) -> QuaternionEstimate:
     """Extended Kalman update with a measured quaternion, written for the small rotation between prediction and measurement,
     followed by the norm correction; q and -q count as the same attitude.
 
     Args:
         variance: of the measured attitude about each horizontal axis [rad^2].
+        correlated: number of ticks for which its error lasts; so many measurements count as one.
     """
     w, i, j, k = quaternion_product((x.q[0], -x.q[1], -x.q[2], -x.q[3]), measured)
     sign = 2.0 if w >= 0 else -2.0
     e = (sign * i, sign * j, sign * k)
     pp, pb, bb = x.covariance
-    S = pp + variance
+    S = pp + variance * max(1.0, correlated)
     kp, kb = pp / S, pb / S
     turn = rotation_vector_to_quaternion((kp * e[0], kp * e[1], kp * e[2]))
     return QuaternionEstimate(
@@ -214,7 +232,7 @@ def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: flo
         tuple(b + kb * v for b, v in zip(x.bias, e, strict=True)),
         (pp - kp * pp, pb - kp * pb, bb - kb * pb),
         e,
-        S,
+        pp + variance,
     )
 
 
@@ -226,43 +244,49 @@ class AttitudeEstimator(RecursiveEstimator):
         name: AttitudeEstimator
         input_ports:
         - measurements
+        - support
+        - model
         output_ports:
         - posterior
 
-    `measurements` is the posterior of a `SensorMonitor`. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`, and a support estimate (feet,). Fields of the posterior:
 
         orientation            (4,)  quaternion [w, x, y, z] of the base in the world (eq. 6); its sign never jumps
         rotation               (9,)  R_WB, row by row
         angular_velocity       (3,)  of the base in base axes, free of the estimated gyro bias [rad/s]
         gravity, acceleration, acceleration_bias, angular_velocity_bias   (3,) each, in IMU axes [m/s^2, rad/s]
         covariance             (9,)  gravity filter (6) and quaternion filter (3) per axis, see `GravityEstimate`, `QuaternionEstimate`
-        innovation, innovation_variance   of both filters, (6,) and (2,)
+        innovation, innovation_variance   of gravity filter, quaternion filter, and quaternion filter from the feet, (9,) and (3,)
 
     Yaw is the gyro's alone: the gravity filter borrows it for its measured quaternion.
     """
 
-    def __init__(self, config: AttitudeConfig, robot: Robot, measurements: dict[str, slice], clock: Clock):
+    def __init__(self, config: AttitudeConfig, robot: Robot, measurements: dict[str, slice], model: dict[str, slice], clock: Clock):
         super().__init__(
             {
                 "orientation": 4,
                 "rotation": 9,
                 "angular_velocity": 3,
+                "age": 1,
                 "imu_orientation": 4,
                 "gravity": 3,
                 "acceleration": 3,
                 "acceleration_bias": 3,
                 "angular_velocity_bias": 3,
                 "covariance": 9,
-                "innovation": 6,
-                "innovation_variance": 2,
+                "innovation": 9,
+                "innovation_variance": 3,
             },
             clock,
         )
         self._config, self._inputs = config, measurements
         self._R_BI = ImuMount(robot).R_BI
         self._q_IB = quaternion_of_matrix(self._R_BI.T)
+        self._foot_rotation = model["foot_rotation"]
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
-        self._declare_posterior("measurements")
+        self._support = self.DeclareVectorInputPort("support", len(robot.description.sides))
+        self._model = self.DeclareVectorInputPort("model", max(part.stop for part in model.values()))
+        self._declare_posterior("measurements", "support", "model")
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
         config = self._config
@@ -270,6 +294,8 @@ class AttitudeEstimator(RecursiveEstimator):
         trust = measured[self._inputs["trust"]][1]
         f = tuple(measured[self._inputs["specific_force"]].tolist())
         w = tuple(measured[self._inputs["angular_velocity"]].tolist())
+        feet = ((0.0, 0.0, 0.0), 0.0)
+        age = 0.0 if math.isnan(elapsed) else float(last[self.fields["age"].start]) + elapsed
         if math.isnan(elapsed):
             if trust:
                 return np.concatenate([[Status.NOT_FINITE], last[1:]])
@@ -289,22 +315,62 @@ class AttitudeEstimator(RecursiveEstimator):
                 quaternion = QuaternionEstimate(quaternion.q, quaternion.bias, (pp + drift, *quaternion.covariance[1:]))
                 w = quaternion.bias
             else:
+                standing = age <= config.standing_time
                 rate = tuple(x - b for x, b in zip(w, quaternion.bias, strict=True))
-                rate_variance = config.angular_velocity_noise**2 + quaternion.covariance[2]
-                gravity = update_gravity(config, predict_gravity(config, gravity, rate, rate_variance, elapsed), f)
+                # An unknown gyro bias turns gravity the same way for as long as the filter remembers.
+                rate_variance = config.angular_velocity_noise**2 + quaternion.covariance[2] * 2.0 * config.motion_time / elapsed
+                motion = config.standing_acceleration if standing else config.motion_acceleration
+                gravity = update_gravity(config, predict_gravity(config, gravity, rate, rate_variance, motion, elapsed), f)
+                tilt_variance = gravity.covariance[0] / 9.81**2
                 quaternion = predict_quaternion(config, quaternion, w, elapsed)
-                # The gravity filter's error lasts for about the time that the trunk's acceleration does: spread over the ticks of it.
-                variance = gravity.covariance[0] / 9.81**2 * max(1.0, 2.0 * config.motion_time / elapsed)
                 measured_q = quaternion_from_gravity(gravity.gravity, yaw_of(quaternion.q))
-                quaternion = update_quaternion(quaternion, measured_q, variance)
-        return self._pack(trust, w, gravity, quaternion)
+                level = self._level_feet(context)
+                if standing and level is not None:
+                    level_q = quaternion_from_gravity(level[0], yaw_of(quaternion.q))
+                    quaternion = self._stand(quaternion, level_q, level[1], w, elapsed)
+                elif standing:
+                    quaternion = self._stand(quaternion, measured_q, tilt_variance, w, elapsed)
+                else:
+                    # The gravity filter's error lasts about as long as the trunk's acceleration.
+                    quaternion = update_quaternion(quaternion, measured_q, tilt_variance, 2.0 * config.motion_time / elapsed)
+                    if level is not None:
+                        by_gravity, level_q = quaternion, quaternion_from_gravity(level[0], yaw_of(quaternion.q))
+                        quaternion = update_quaternion(quaternion, level_q, level[1], 2.0 * config.stance_time / elapsed)
+                        feet = quaternion.innovation, quaternion.innovation_variance
+                        quaternion = replace(
+                            quaternion, innovation=by_gravity.innovation, innovation_variance=by_gravity.innovation_variance
+                        )
+        return self._pack(trust, w, age, gravity, quaternion, feet)
+
+    def _stand(self, x: QuaternionEstimate, measured: Quaternion, tilt_variance: float, w: Vector, elapsed: float) -> QuaternionEstimate:
+        """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias."""
+        config, bb = self._config, x.covariance[2]
+        # The standing robot's own rate is the same in all the ticks.
+        ticks = config.standing_time / elapsed
+        k = bb / (bb + config.angular_velocity_noise**2 + ticks * config.standing_rate**2)
+        bias = tuple(b + k * (rate - b) for b, rate in zip(x.bias, w, strict=True))
+        return QuaternionEstimate(measured, bias, (tilt_variance, 0.0, bb - k * bb))
+
+    def _level_feet(self, context: Context) -> tuple[Vector, float] | None:
+        """Vertical direction in IMU axes by the soles that stand, and its variance [rad^2]; None if nothing stands."""
+        if self._config.level_feet == 0:
+            return None
+        support = self._support.Eval(context)
+        standing = support.sum()
+        if standing == 0:
+            return None
+        normals_B = self._model.Eval(context)[self._foot_rotation].reshape(-1, 3, 3)[:, :, 2]
+        up = ((support @ normals_B) @ self._R_BI).tolist()
+        return (up[0], up[1], up[2]), self._config.level_feet**2 / standing
 
     def _unpack(self, last: np.ndarray) -> tuple[GravityEstimate, QuaternionEstimate]:
         x = last[self.fields["imu_orientation"].start : self.fields["covariance"].stop].tolist()
         gravity = GravityEstimate(tuple(x[4:7]), tuple(x[7:10]), tuple(x[10:13]), tuple(x[16:22]))
         return gravity, QuaternionEstimate(tuple(x[0:4]), tuple(x[13:16]), tuple(x[22:25]))
 
-    def _pack(self, status: float, w: Vector, gravity: GravityEstimate, quaternion: QuaternionEstimate) -> np.ndarray:
+    def _pack(
+        self, status: float, w: Vector, age: float, gravity: GravityEstimate, quaternion: QuaternionEstimate, feet: tuple[Vector, float]
+    ) -> np.ndarray:
         q_WB = quaternion_product(quaternion.q, self._q_IB)
         rate = [x - b for x, b in zip(w, quaternion.bias, strict=True)]
         return np.array(
@@ -313,6 +379,7 @@ class AttitudeEstimator(RecursiveEstimator):
                 *q_WB,
                 *rotation_matrix(q_WB).ravel().tolist(),
                 *(self._R_BI @ rate),
+                age,
                 *quaternion.q,
                 *gravity.gravity,
                 *gravity.acceleration,
@@ -322,8 +389,10 @@ class AttitudeEstimator(RecursiveEstimator):
                 *quaternion.covariance,
                 *gravity.innovation,
                 *quaternion.innovation,
+                *feet[0],
                 gravity.innovation_variance,
                 quaternion.innovation_variance,
+                feet[1],
             ]
         )
 

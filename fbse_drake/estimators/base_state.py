@@ -41,9 +41,9 @@ class ContactAided:
 
     # Standard deviations: acceleration of the base [m/s^2]; what a standing foot moves and turns, as position [m] and velocity [m/s] of the
     # base seen through the leg; error of the acceleration through bias and attitude, its size [m/s^2] and how long it lasts [s].
-    acceleration_noise: float = 0.1
-    position_noise: float = 1.0e-3
-    velocity_noise: float = 5.0e-3
+    acceleration_noise: float = 0.05
+    position_noise: float = 3.0e-4
+    velocity_noise: float = 1.5e-3
     acceleration_error: float = 0.1
     acceleration_error_time: float = 5.0
 

@@ -187,8 +187,6 @@ class EstimatorDiagram(Diagram):
             raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
         self._add_monitor(config.sensor_monitor, robot, clock)
         measurements = self._parts("sensor_monitor")
-        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, clock))
-        self._join(attitude, measurements="sensor_monitor")
         model = self._add("model", FloatingBaseModel(robot, measurements, clock))
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
@@ -203,6 +201,9 @@ class EstimatorDiagram(Diagram):
             detector = self._add("support", SupportDetector(config.support, robot, measurements, clock))
             self._join(detector, measurements="sensor_monitor")
             self._support = self._field_port("support", "support")
+        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._parts("model"), clock))
+        self._join(attitude, measurements="sensor_monitor", model="model")
+        self._connect_support(attitude)
         middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
         shared = (robot, measurements, self._parts("attitude"), self._parts("model"), clock, (float(middle[0]), float(middle[1])))
         base_state: BaseStateEstimator

@@ -69,7 +69,7 @@ class ModelAided:
     # Random walk of the parameters [its unit/sqrt(s)].
     parameter_walk: float = 0.0
     # Time constant of the smoothing of the velocity that the model sees [s].
-    velocity_smoothing: float = 0.002
+    velocity_smoothing: float = 0.0015
     # What is taken while a leg swings: the `measurement` as in stance, or the `model` alone.
     swing: str = "measurement"
 
