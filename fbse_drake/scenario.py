@@ -106,7 +106,8 @@ class Scenario:
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
-    # Who estimates the friction: !NoEstimator, !Fbse, or a reference method: !TrueFriction, !TorqueSensor, !DisturbanceObserver, !FixedFriction.
+    # Who estimates the friction: !NoEstimator, !Fbse, or a reference method: !TrueFriction, !TorqueSensor, !DisturbanceObserver or
+    # !FixedFriction.
     estimator: EstimatorConfig = field(default_factory=NoEstimator)
     # What the controller makes of it: !NoCompensation, !IntegralCompensation or !FeedforwardCompensation.
     compensation: CompensationConfig = field(default_factory=NoCompensation)
@@ -138,6 +139,8 @@ class Scenario:
             "log.period": self.log.period,
             "sensors.encoders.period": self.sensors.encoders.period,
         }
+        if self.sensors.foot_force.delay > 0:
+            periods["sensors.foot_force.delay"] = self.sensors.foot_force.delay
         for key, period in periods.items():
             steps = period / self.plant.time_step
             if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:

@@ -74,7 +74,7 @@ class Station(Diagram):
         with located("reference: "):
             ticks = round(scenario.duration / scenario.control.period)
             self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)
-        robot, names = self.robot, self.robot.description
+        robot, names, time_step = self.robot, self.robot.description, scenario.plant.time_step
         n, plant = len(robot.joint_names), self.robot.plant
         _set_initial_state(robot, self.reference, scenario)
 
@@ -85,7 +85,7 @@ class Station(Diagram):
         context = plant.CreateDefaultContext()
         inertia = conservative_inertia(robot.joint_compliance(context))
         resolved = [effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items()]
-        effects = builder.AddNamedSystem("effects", JointTorqueEffects(resolved, inertia, scenario.plant.time_step))
+        effects = builder.AddNamedSystem("effects", JointTorqueEffects(resolved, inertia, time_step))
         loss_to_force = builder.AddNamedSystem("torque_loss_to_force", MatrixGain(-robot.joint_force_selector))
         builder.Connect(joint_state.get_output_port(), effects.get_input_port())
         builder.Connect(effects.get_output_port(), loss_to_force.get_input_port())
@@ -98,12 +98,12 @@ class Station(Diagram):
         imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, *draw))
         for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
             builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
-        foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, *draw))
+        foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, time_step, *draw))
         builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
 
         # Reference and controller.
         source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))
-        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names, scenario.plant.time_step))
+        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names, time_step))
         command = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
         builder.Connect(encoders.get_output_port(), controller.GetInputPort("estimated_state"))
         builder.Connect(source.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))
@@ -123,7 +123,7 @@ class Station(Diagram):
             "torque_loss": effects.get_output_port(),
         }
         if scenario.sensors.joint_torque is not None:
-            sensors = JointTorqueSensors(scenario.sensors.joint_torque, n, scenario.plant.time_step, *draw)
+            sensors = JointTorqueSensors(scenario.sensors.joint_torque, n, time_step, *draw)
             torque_sensors = builder.AddNamedSystem("joint_torque_sensors", sensors)
             for name in ("torque_command", "torque_loss"):
                 builder.Connect(available[name], torque_sensors.GetInputPort(name))

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
+from conftest import scenario
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from scipy.spatial.transform import Rotation
 
+from fbse_drake import simulate
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.sensors.encoders import EncoderConfig, Encoders, quantize
@@ -82,3 +85,26 @@ def test_zmp_is_kept_while_nothing_stands():
     force = np.zeros((4, 1, 3))
     force[[1, 3], 0, 2] = 100.0
     np.testing.assert_allclose(zero_moment_point(force, position)[:, 0], [1, 1, 1, 3])
+
+
+def test_force_sensors_read_late_and_with_a_gain():
+    quiet = ("duration=0.3", "sensors.foot_force.noise=0")
+    exact = simulate(scenario("paper_walk", *quiet)).log["foot/left/pad_force"]
+    late = simulate(scenario("paper_walk", *quiet, "sensors.foot_force.delay=0.005", "sensors.foot_force.gain=1.02")).log
+    np.testing.assert_allclose(late["foot/left/pad_force"][5:], 1.02 * exact[:-5], atol=1e-9)
+    assert not late["foot/left/pad_force"][:5].any()
+
+
+def test_misaligned_imu_reads_the_same_vectors_in_turned_axes():
+    quiet = ("duration=0.3", "sensors.imu.acceleration_noise=0", "sensors.imu.angular_velocity_noise=0")
+    exact = simulate(scenario("paper_walk", *quiet)).log
+    turned = simulate(scenario("paper_walk", *quiet, "sensors.imu.misalignment=[0.02, -0.01, 0.03]")).log
+    R_IS = Rotation.from_rotvec([0.02, -0.01, 0.03])
+    for channel in ("imu/linear_acceleration", "imu/angular_velocity"):
+        np.testing.assert_allclose(R_IS.apply(turned[channel]), exact[channel], atol=1e-12)
+
+
+def test_joint_torque_sensors_read_what_reaches_the_links():
+    log = simulate(scenario("paper_walk", "duration=0.3", "sensors.joint_torque={noise: 0.0}")).log
+    expected = (log["joint/torque_command"] - log["truth/joint/friction_torque"])[:-1]
+    np.testing.assert_allclose(log["joint/torque_measured"][1:], expected, atol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import Adder, Saturation
+from pydrake.systems.primitives import Adder, DiscreteTimeDelay, Gain, Saturation
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
@@ -15,19 +15,24 @@ from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 @dataclass(frozen=True)
 class FootForceConfig:
-    """Errors of each axis of each pad; all 0 measures exactly."""
+    """Errors of each axis of each pad; the defaults measure exactly."""
 
     # Standard deviation of white noise [N].
     noise: float = 0.0
+    # What is read per force.
+    gain: float = 1.0
+    # How late a reading comes [s], in whole plant steps.
+    delay: float = 0.0
     # Largest force in either direction [N].
     range: float = 5000.0
     # Sampling period [s].
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        if self.noise < 0:
-            raise InputError(f"noise: expected a number >= 0, found {self.noise:g}")
-        for name in ("range", "period"):
+        for name in ("noise", "delay"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        for name in ("gain", "range", "period"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
 
@@ -72,13 +77,15 @@ class FootForceSensors(Diagram):
         - true_pad_force
         - measured_pad_force
 
-    Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's attitude at the start of that step.
+    Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's attitude at the start of that step;
+    a delayed sensor reads zero at first.
     """
 
-    def __init__(self, config: FootForceConfig, robot: Robot, seed: int, duration: float):
+    def __init__(self, config: FootForceConfig, robot: Robot, time_step: float, seed: int, duration: float):
         """Puts the sensors together.
 
         Args:
+            time_step: the plant's step [s].
             seed: of the errors.
             duration: noise is drawn for this time [s].
         """
@@ -91,7 +98,18 @@ class FootForceSensors(Diagram):
         noisy = builder.AddNamedSystem("noisy", Adder(2, size))
         limit = np.full(size, config.range)
         measured = builder.AddNamedSystem("measured", Saturation(-limit, limit))
-        builder.Connect(true.get_output_port(), noisy.get_input_port(0))
+        read = true.get_output_port()
+        if config.delay > 0:
+            # A discrete update sees the next step's force already, and its delay is read one step later: both together are even.
+            steps = round(config.delay / time_step)
+            late = builder.AddNamedSystem("late", DiscreteTimeDelay(time_step, steps, size))
+            builder.Connect(read, late.get_input_port())
+            read = late.get_output_port()
+        if config.gain != 1:
+            scaled = builder.AddNamedSystem("scaled", Gain(config.gain, size))
+            builder.Connect(read, scaled.get_input_port())
+            read = scaled.get_output_port()
+        builder.Connect(read, noisy.get_input_port(0))
         builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
         builder.Connect(noisy.get_output_port(), measured.get_input_port())
         builder.ExportInput(true.get_input_port(), "reaction_forces")

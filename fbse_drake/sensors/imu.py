@@ -4,8 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import Adder, Multiplexer
+from pydrake.systems.primitives import Adder, MatrixGain, Multiplexer
 from pydrake.systems.sensors import Accelerometer, Gyroscope
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
@@ -22,6 +24,8 @@ class ImuConfig:
     # Constant errors, in the IMU frame [m/s^2], [rad/s].
     acceleration_bias: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     angular_velocity_bias: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    # Rotation vector from the IMU frame to the axes that the sensor really has [rad].
+    misalignment: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     # Random walk of the errors [m/s^2/sqrt(s)], [rad/s/sqrt(s)].
     acceleration_bias_walk: float = 0.0
     angular_velocity_bias_walk: float = 0.0
@@ -32,7 +36,7 @@ class ImuConfig:
         for name in ("acceleration_noise", "angular_velocity_noise", "acceleration_bias_walk", "angular_velocity_bias_walk"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
-        for name in ("acceleration_bias", "angular_velocity_bias"):
+        for name in ("acceleration_bias", "angular_velocity_bias", "misalignment"):
             if len(getattr(self, name)) != 3:
                 raise InputError(f"{name}: expected three numbers, found {getattr(self, name)}")
         if self.period <= 0:
@@ -84,7 +88,13 @@ class Imu(Diagram):
         measured = builder.AddNamedSystem("measured", Adder(2, 6))
         builder.Connect(accelerometer.get_output_port(), ideal.get_input_port(0))
         builder.Connect(gyroscope.get_output_port(), ideal.get_input_port(1))
-        builder.Connect(ideal.get_output_port(), measured.get_input_port(0))
+        read = ideal.get_output_port()
+        if any(config.misalignment):
+            R_SI = Rotation.from_rotvec(config.misalignment).as_matrix().T
+            turned = builder.AddNamedSystem("turned", MatrixGain(block_diag(R_SI, R_SI)))
+            builder.Connect(read, turned.get_input_port())
+            read = turned.get_output_port()
+        builder.Connect(read, measured.get_input_port(0))
         builder.Connect(errors.get_output_port(), measured.get_input_port(1))
         for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
             port = builder.ExportInput(accelerometer.GetInputPort(name), name)
