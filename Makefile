@@ -1,10 +1,12 @@
 # make walk   installs into .venv, simulates the paper's walk and says where its report is
 # make test   installs into .venv, checks the style and runs the tests
+# make fbse   prints how good the friction estimate is, and writes out/fbse/report.html
+# make bench  prints speeds, as ratios measured in one run
 PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: walk test lint format bench clean
+.PHONY: walk test lint format bench fbse clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -22,6 +24,11 @@ format: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop
+	$(VENV)/bin/python -m benchmarks.estimator_tick
+
+# How good the friction estimate is, in tables: ten seeds of every walk, some ten minutes.
+fbse: $(INSTALLED)
+	$(VENV)/bin/python -m benchmarks.fbse
 
 # Installs again when the package's needs change.
 $(INSTALLED): pyproject.toml constraints.txt
