@@ -28,7 +28,7 @@ from fbse_drake.estimate import estimate
 from fbse_drake.estimators.identification import identify
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Report, Section, Table, number, write_report
-from fbse_drake.report.metrics import simulation_metrics
+from fbse_drake.report.metrics import run_metrics
 from fbse_drake.resources import folder
 
 # The seed of the walk from which the fixed friction model is identified; none of the others.
@@ -86,7 +86,7 @@ def _start(log: Log, samples: int) -> Log:
 
 
 def _figures(log: Log, failure: str | None, tick_us: float) -> dict[str, Any]:
-    metrics = simulation_metrics(log, 1.0)
+    metrics = run_metrics(log, 1.0)
     return {
         "failure": failure,
         "nrmse": {phase: list(values.values()) for phase, values in metrics["friction_nrmse"].items()},

@@ -67,7 +67,7 @@ class Log(Mapping[str, np.ndarray]):
 
     channels: dict[str, np.ndarray]
     # "joints": names in column order; "sides"; "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
-    # "scenario": YAML text; "outcome".
+    # "scenario": YAML text; "outcome"; "estimator_scenario": YAML text of the scenario whose estimator ran over the log afterwards.
     meta: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -85,6 +85,8 @@ class Log(Mapping[str, np.ndarray]):
             expected = (samples, *(n if size == "n" else size for size in sample_shape))
             if len(values.shape) != len(expected) or any(e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)):
                 raise InputError(f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}")
+            if values.dtype.kind not in "fiub":
+                raise InputError(f"channel {name}: expected numbers, found {values.dtype}")
             finite = np.isfinite(values).reshape(samples, -1).all(axis=1)
             if not finite.all():
                 raise InputError(f"channel {name}: not a finite number in row {int(finite.argmin())}")
@@ -138,7 +140,10 @@ class Log(Mapping[str, np.ndarray]):
             InputError: no such file, truncated, not a log, or another format version.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            file = np.load(path, allow_pickle=False)
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise ValueError("a single array")
+            with file:
                 content = {name: file[name] for name in file.files}
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or 'not a log file (npz)'}") from None

@@ -5,18 +5,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fbse_drake import Log, load_scenario
 from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
 
+FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
+# One foot swings from 0.5 s on.
+WALK = ["paper_walk_fbse", "--set", "duration=1"]
+
 
 def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture):
     status = main(["simulate", "squat", "--set", "duration=0.5", "--set", "seed=4", "--out", str(tmp_path / "out")])
     assert status == DONE
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["fell"] is False
     assert metrics["simulated_time"] == pytest.approx(0.5)
@@ -64,6 +70,7 @@ def test_a_fall_ends_the_run_and_keeps_the_log(tmp_path: Path, capsys: pytest.Ca
         ([], "the following arguments are required: COMMAND"),
         (["simulat", "squat"], "invalid choice: 'simulat'"),
         (["simulate"], "the following arguments are required: SCENARIO"),
+        (["estimate", "squat"], "the following arguments are required: LOG"),
         (["simulate", "squat", "--sed", "3"], "unrecognized arguments: --sed 3"),
         (["simulate", "squid"], "squid: no such file, and no such name in scenarios/"),
         (["simulate", "squat", "--set", "duration=0"], "squat: duration: expected a number > 0, found 0"),
@@ -103,7 +110,7 @@ def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert not [name for name in names if name.endswith(".part")]
     if names:
-        assert names == ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
+        assert names == FILES
         assert Log.load(tmp_path / "out/log.npz").meta["outcome"]["reason"].endswith("interrupted")
 
 
@@ -112,3 +119,142 @@ def test_a_copied_scenario_does_not_overwrite_the_original(tmp_path: Path, monke
     (tmp_path / "mine.yaml").write_text("squat: {duration: 0.05, reference: !Squat {}}\n")
     assert main(["simulate", "mine.yaml", "--quiet"]) == DONE
     assert (tmp_path / "out/mine/log.npz").is_file()
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are empty, which saves the time to draw them."""
+    monkeypatch.setattr("fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report"))
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a walk whose friction was estimated while it walked."""
+    folder = tmp_path_factory.mktemp("walk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report"))
+        assert main(["simulate", *WALK, "--out", str(folder), "--quiet"]) == DONE
+    return folder
+
+
+def without_estimates(log: Log, *beginnings: str) -> Log:
+    """The log without its estimates and channels with these beginnings."""
+    return Log({name: values for name, values in log.items() if not name.startswith(("estimate/", *beginnings))}, log.meta)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_estimate_writes_everything_and_equals_the_live_estimates(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    live = Log.load(walk / "log.npz")
+    without_estimates(live).save(tmp_path / "recorded.npz")
+    assert main(["estimate", *WALK, str(tmp_path / "recorded.npz"), "--out", str(tmp_path / "out")]) == DONE
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+    replayed = Log.load(tmp_path / "out/log.npz")
+    assert set(replayed) == set(live)
+    for name in live:
+        np.testing.assert_allclose(replayed[name], live[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    assert load_scenario(tmp_path / "out/scenario.yaml").duration == 1.0
+    before, after = (json.loads((folder / "metrics.json").read_text()) for folder in (walk, tmp_path / "out"))
+    assert set(after) == set(before)
+    assert 0.01 < after["friction_nrmse"]["swing"]["right_knee_pitch"] < 0.5
+    assert math.isnan(after["friction_nrmse"]["swing"]["left_knee_pitch"])
+    for key in ("friction_rmse", "friction_nrmse"):
+        for phase in ("stance", "swing"):
+            assert after[key][phase] == pytest.approx(before[key][phase], nan_ok=True)
+    assert after["attitude_rmse_deg"] == pytest.approx(before["attitude_rmse_deg"])
+    assert 0 < after["tick_us"]["median"] <= after["tick_us"]["p99"]
+    assert math.isnan(before["tick_us"]["median"])
+    printed = capsys.readouterr().out
+    for text in ("right_knee_pitch", "stance", "attitude error", "base velocity error", "estimator tick", "report.html"):
+        assert text in printed
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_simulate_tells_the_errors_of_estimates(tmp_path: Path, capsys: pytest.CaptureFixture):
+    options = ["--set", "duration=0.4", "--set", "estimator=!Fbse {}", "--out", str(tmp_path)]
+    assert main(["simulate", "squat", *options]) == DONE
+    printed = capsys.readouterr().out
+    assert "friction error, NRMSE" in printed
+    assert "base velocity error" in printed
+    assert "estimator tick" not in printed
+
+
+def test_a_recording_of_a_robot_is_enough(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    """No truth, no plan, no velocities; a tenth of the samples lost, the others late by up to 0.3 ms, on a clock of their own."""
+    live, random = Log.load(walk / "log.npz"), np.random.default_rng(0)
+    kept = np.sort(random.choice(len(live.time), len(live.time) * 9 // 10, replace=False))
+    bare = without_estimates(live, "truth/", "reference/", "joint/velocity")
+    channels = {name: values[kept] for name, values in bare.items()}
+    channels["time"] = channels["time"] + random.uniform(0, 3e-4, len(kept)) + 100.0
+    Log(channels, {key: live.meta[key] for key in ("joints", "sides", "period")}).save(tmp_path / "robot.npz")
+    monkeypatch.chdir(tmp_path)
+    assert main(["estimate", *WALK, "robot.npz"]) == DONE
+    out = tmp_path / "out/paper_walk_fbse_estimate"
+    estimated = Log.load(out / "log.npz")
+    np.testing.assert_array_equal(estimated.time, channels["time"])
+    friction, truth = estimated["estimate/joint/friction_torque"], live["truth/joint/friction_torque"]
+    settled = kept > 300
+    error = friction[settled] - truth[kept[settled] - 1]
+    assert np.sqrt(np.mean(error**2)) < 0.45 * np.sqrt(np.mean(truth**2))
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["fell"], metrics["outcome"]) == (None, "recorded")
+    assert math.isnan(metrics["friction_nrmse"]["stance"]["left_knee_pitch"])
+    assert metrics["tick_us"]["median"] > 0
+    assert "A recording of 1.00 s." in (out / "report.html").read_text()
+    printed = capsys.readouterr().out
+    assert "estimator tick" in printed
+    assert "friction error" not in printed
+    assert "nan" not in printed
+
+
+def cut(log: Log, path: Path) -> None:
+    log.save(path)
+    path.write_bytes(path.read_bytes()[:-5000])
+
+
+def single_array(_: Log, path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.ones(3))
+
+
+def texts(log: Log, path: Path) -> None:
+    meta = np.array(json.dumps({"format_version": 1, **log.meta}))
+    np.savez(path, meta=meta, **(log.channels | {"joint/velocity": log["joint/velocity"].astype(str)}))
+
+
+def renamed(log: Log, path: Path) -> None:
+    Log(log.channels, log.meta | {"joints": [f"other_{name}" for name in log.joints]}).save(path)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("scenario", "damage", "message"),
+    [
+        ("paper_walk_fbse", lambda *_: None, "log.npz: No such file or directory"),
+        ("paper_walk_fbse", cut, "log.npz: truncated or not a log file (npz)"),
+        ("paper_walk_fbse", lambda _, path: path.write_text("time,position"), "log.npz: truncated or not a log file (npz)"),
+        ("paper_walk_fbse", single_array, "log.npz: truncated or not a log file (npz)"),
+        ("paper_walk_fbse", texts, "log.npz: channel joint/velocity: expected numbers"),
+        ("paper_walk_fbse", renamed, "are not the model's"),
+        ("paper_walk_fbse", lambda log, path: without_estimates(log, "foot/").save(path), "measured_pad_force (foot/<side>/pad_force)"),
+        ("paper_walk_fbse", lambda log, path: without_estimates(log, "imu/").save(path), "measured_imu (imu/linear_acceleration"),
+        ("squat", Log.save, "squat over"),
+        ("squid", Log.save, "squid: no such file"),
+    ],
+)
+def test_a_bad_log_is_one_line_and_status_2(
+    scenario: str, damage: Callable[[Log, Path], None], message: str, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    damage(Log.load(walk / "log.npz"), tmp_path / "log.npz")
+    assert main(["estimate", scenario, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    printed = capsys.readouterr()
+    assert printed.err.startswith("fbse: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_estimates_do_not_overwrite_the_log_they_are_made_from(walk: Path, capsys: pytest.CaptureFixture):
+    before = (walk / "log.npz").read_bytes()
+    assert main(["estimate", *WALK, str(walk / "log.npz"), "--out", str(walk)]) == BAD_INPUT
+    assert "would overwrite" in capsys.readouterr().err
+    assert (walk / "log.npz").read_bytes() == before

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from fbse_drake.log import Log
 from fbse_drake.report import figures
 from fbse_drake.report.html import Details, FigureBlock, Report, Section, number, numeric_table, render_report, write_report
-from fbse_drake.report.metrics import simulation_metrics
-from fbse_drake.report.simulation import write_simulation_report
+from fbse_drake.report.metrics import run_metrics
+from fbse_drake.report.run import write_run_report
 
 SAMPLES = 400
-TOPICS = ("walk", "joints", "forces", "friction", "sensors")
+TOPICS = ("walk", "joints", "forces", "friction", "base", "consistency", "sensors")
 PADS = np.array([[0.1, 0.05, 0.0], [0.1, -0.05, 0.0], [-0.1, 0.05, 0.0], [-0.1, -0.05, 0.0]])
 
 
@@ -66,6 +66,42 @@ def joints_only_log() -> Log:
     return Log(channels, {"joints": ["shoulder", "elbow", "wrist_1", "wrist_2"], "period": 0.01})
 
 
+def estimated_log(scenario: str = "walk: {estimator: !Fbse {}}") -> Log:
+    """`walking_log` with estimates: friction 10 % too large, roll wrong by half a degree, filters that are consistent."""
+    log, random = walking_log(), np.random.default_rng(0)
+    truth = log["truth/joint/friction_torque"]
+    tilt = math.radians(0.5) / 2
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (SAMPLES, 1))
+    variances = {"attitude": (9, 3), "base_state": (6, 2), "joint_acceleration": (12, 12), "friction": (4, 4)}
+    channels = {
+        "estimate/joint/friction_torque": 1.1 * np.concatenate([truth[:1], truth[:-1]]),
+        "estimate/friction/parameters": np.tile([2.0, 0.5], (SAMPLES, 4, 1)),
+        "estimate/friction/parameter_variance": np.full((SAMPLES, 4, 2), 0.01),
+        "estimate/base/orientation": np.tile([math.cos(tilt), math.sin(tilt), 0.0, 0.0], (SAMPLES, 1)),
+        "truth/base/orientation": level,
+        "estimate/base/velocity": np.tile([0.001, 0.0, 0.0], (SAMPLES, 1)),
+        "truth/base/velocity": np.zeros((SAMPLES, 3)),
+        "estimate/com/position": log["truth/com/position"] + [0.004, 0.0, 0.0],
+        "estimate/support": np.stack([log[f"reference/foot/{side}/support"] for side in log.sides], axis=1),
+        "estimate/sensors/status": np.zeros((SAMPLES, 4)),
+    }
+    for name, (components, variance) in variances.items():
+        channels[f"estimate/{name}/innovation"] = random.standard_normal((SAMPLES, components))
+        channels[f"estimate/{name}/innovation_variance"] = np.ones((SAMPLES, variance))
+        channels[f"estimate/{name}/status"] = np.zeros(SAMPLES)
+    return Log(log.channels | channels, log.meta | {"scenario": scenario})
+
+
+def without(log: Log, *beginnings: str) -> Log:
+    return Log({name: values for name, values in log.items() if not name.startswith(beginnings)}, log.meta)
+
+
+def line(figure: Figure, panel: int, label: str) -> np.ndarray:
+    """Points of the line with this label."""
+    (found,) = (line for line in figure.axes[panel].get_lines() if line.get_label() == label)
+    return found.get_xydata()
+
+
 class _Page(HTMLParser):
     """Collects the tags and what they refer to."""
 
@@ -86,7 +122,7 @@ class _Page(HTMLParser):
 
 
 def titles(log: Log) -> list[str]:
-    return [block.title for blocks in figures.simulation_figures(log).values() for block in blocks]
+    return [block.title for blocks in figures.run_figures(log).values() for block in blocks]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +130,7 @@ def walk_report(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"
     log = walking_log()
     log = dataclasses.replace(log, meta=log.meta | {"pads": dict.fromkeys(log.sides, PADS.tolist())})
-    write_simulation_report(path, log, simulation_metrics(log, 2.0), name="a_walk")
+    write_run_report(path, log, run_metrics(log, 2.0), name="a_walk")
     return path.read_text(encoding="utf-8")
 
 
@@ -123,10 +159,10 @@ def test_report_tells_outcome_and_figures_of_merit(walk_report):
 
 
 def test_fall_and_scenario_are_escaped_text(tmp_path, monkeypatch):
-    monkeypatch.setattr("fbse_drake.report.simulation.simulation_figures", lambda *_, **__: {topic: [] for topic in TOPICS})
+    monkeypatch.setattr("fbse_drake.report.run.run_figures", lambda *_, **__: {topic: [] for topic in TOPICS})
     log = walking_log(fell=True)
     log = dataclasses.replace(log, meta=log.meta | {"scenario": "title: <script>alert(1)</script>"})
-    write_simulation_report(tmp_path / "report.html", log, simulation_metrics(log, 2.0), name="<b>")
+    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="<b>")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "The run ended early at t = 3.990 s: fell: &lt;tilted&gt;." in text
     assert 'class="outcome failed"' in text
@@ -136,14 +172,13 @@ def test_fall_and_scenario_are_escaped_text(tmp_path, monkeypatch):
 
 def test_figures_follow_the_channels():
     log = walking_log()
-    without_plan = Log({name: values for name, values in log.items() if not name.startswith("reference/")}, log.meta)
-    assert [title for title in titles(log) if title not in titles(without_plan)] == [
+    assert [title for title in titles(log) if title not in titles(without(log, "reference/"))] == [
         "Footprints",
         "Centre of mass",
         "Joint tracking errors",
     ]
     assert titles(joints_only_log()) == ["Joint angles", "Joint torques"]
-    assert tuple(figures.simulation_figures(joints_only_log())) == TOPICS
+    assert tuple(figures.run_figures(joints_only_log())) == TOPICS
 
 
 def test_feet_in_the_air_have_no_force_figure():
@@ -248,3 +283,159 @@ def test_failed_report_keeps_the_old_one(tmp_path):
         write_report(path, Report("new", True, "done", (Section("s", figures=(FigureBlock("f", "", Broken()),)),)))
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_report_of_estimates_tells_their_errors(tmp_path):
+    log = estimated_log()
+    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)), name="a_walk")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert len(_Page(text).titles) == 17
+    # Friction of 1 Nm, estimated as 1.1 Nm, in stance and in swing.
+    numbers = "".join(f'<td class="number">{value}</td>' for value in ("0.100", "0.100", "0.100", "0.100"))
+    assert f"<tr><td>left knee</td>{numbers}</tr>" in text
+    assert '<td>Estimated roll, RMS error</td><td class="number">0.500</td><td>deg</td>' in text
+    assert '<td>Estimated base velocity in x, RMS error</td><td class="number">1.00</td><td>mm/s</td>' in text
+    assert '<td>Estimator tick, median</td><td class="number">600</td><td>µs</td>' in text
+    assert "<tr><td>base state</td><td>velocity</td>" in text
+    assert ">n/a<" not in text
+
+
+def test_report_of_a_recording_tells_what_is_known(tmp_path):
+    log = without(estimated_log(), "truth/", "reference/")
+    log = dataclasses.replace(log, meta={key: log.meta[key] for key in ("joints", "sides", "period")} | {"estimator_scenario": "mine: {}"})
+    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)), name="a_robot")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "A recording of 3.99 s." in text
+    assert "YAML of the estimator that ran over the log" in text
+    assert "Joint tracking error" not in text
+    assert "RMSE [Nm]" not in text
+    assert ">n/a<" not in text
+
+
+@pytest.mark.parametrize("samples", [1, 15])
+def test_a_log_that_ends_before_the_filters_have_settled_has_all_figures(samples):
+    log = estimated_log()
+    assert "Error of the friction estimate" in titles(Log({name: values[:samples] for name, values in log.items()}, log.meta))
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures are empty, which saves the time to draw them."""
+    for name, function in vars(figures).items():
+        if not name.startswith("_") and getattr(function, "__annotations__", {}).get("return") is Figure:
+            monkeypatch.setattr(figures, name, lambda *_, **__: Figure())
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_figures_of_estimates_follow_the_channels():
+    log = estimated_log()
+    added = [
+        "Estimated joint friction",
+        "Error of the friction estimate",
+        "Identified friction parameters",
+        "Base attitude",
+        "Base velocity",
+        "Support",
+        "Consistency of the filters",
+        "Consistency of the friction filters",
+    ]
+    assert [title for title in titles(log) if title not in titles(walking_log())] == added
+    assert "Joint friction" not in titles(log)
+    recorded = without(log, "truth/", "reference/")
+    assert [title for title in added if title not in titles(recorded)] == ["Error of the friction estimate"]
+    assert "Friction over velocity" not in titles(recorded)
+    assert "Centre of mass" in titles(recorded)
+    # An estimator of friction alone.
+    friction_only = Log(walking_log().channels | {"estimate/joint/friction_torque": np.ones((SAMPLES, 4))}, log.meta)
+    assert [title for title in titles(friction_only) if title not in titles(walking_log())] == added[:2]
+
+
+def test_estimate_and_truth_are_drawn_at_the_end_of_the_same_step():
+    log = estimated_log()
+    figure = figures.estimated_friction(log)
+    estimate, truth = line(figure, 0, "estimated, left"), line(figure, 0, "true friction")
+    np.testing.assert_allclose(estimate[1:], truth[1:] * [1.0, 1.1])
+    error = figures.friction_errors(log)
+    assert error.axes[0].get_title(loc="right") == "RMS 0.10 Nm"
+    known = without(log, "truth/")
+    assert [label for label in figures.estimated_friction(known).axes[0].get_legend_handles_labels()[1] if "true" in label] == []
+
+
+def test_swings_of_the_joints_own_leg_are_shaded():
+    for log in (estimated_log(), without(estimated_log(), "reference/")):
+        panels = figures.estimated_friction(log).axes
+        spans = {axes.get_title(loc="left"): [patch.get_extents() for patch in axes.patches] for axes in panels}
+        places = {
+            name: [axes.transData.inverted().transform(box)[:, 0] for box in spans[name]]
+            for axes in panels
+            for name in [axes.get_title(loc="left")]
+        }
+        np.testing.assert_allclose(places["left hip"], [[3.0, 3.99]], atol=1e-6)
+        np.testing.assert_allclose(places["right knee"], [[1.0, 2.0]], atol=1e-6)
+
+
+def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
+    log = estimated_log()
+    spiky = log["estimate/joint/friction_torque"].copy()
+    spiky[200, 0] = 500.0
+    axes = figures.estimated_friction(Log(log.channels | {"estimate/joint/friction_torque": spiky}, log.meta)).axes[0]
+    low, high = axes.get_ylim()
+    assert -1.6 < low < -1.1
+    assert 1.1 < high < 1.6
+    # What really acted is shown whole.
+    true_spike = log["truth/joint/friction_torque"].copy()
+    true_spike[200, 0] = 50.0
+    assert figures.estimated_friction(Log(log.channels | {"truth/joint/friction_torque": true_spike}, log.meta)).axes[0].get_ylim()[1] > 50
+
+
+@pytest.mark.parametrize(
+    ("scenario", "titles", "bands"),
+    [
+        ("walk: {estimator: !Fbse {}}", ["coulomb [Nm]", "viscous [Nm s/rad]"], True),
+        ("walk: {estimator: !Fbse {friction: !RecursiveLeastSquares {}}}", ["coulomb [Nm]", "viscous [Nm s/rad]"], False),
+        ("walk: {sed: 0}", ["parameter 1", "parameter 2"], False),
+        ("not yaml: [", ["parameter 1", "parameter 2"], False),
+    ],
+)
+def test_parameters_are_named_by_the_scenarios_friction_model(scenario, titles, bands):
+    figure = figures.friction_parameters(estimated_log(scenario))
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == titles
+    found = [collection.get_paths()[0].vertices[:, 1] for axes in figure.axes for collection in axes.collections]
+    assert bool(found) == bands
+    if bands:
+        assert (found[0].min(), found[0].max()) == pytest.approx((1.8, 2.2))
+
+
+def test_nis_is_averaged_over_half_a_second():
+    log = estimated_log()
+    innovation = np.ones((SAMPLES, 4)) * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
+    innovation[200:, 0] *= 2.0
+    figure = figures.friction_consistency(Log(log.channels | {"estimate/friction/innovation": innovation}, log.meta))
+    time, nis = line(figure, 0, "NIS, left").T
+    assert np.isnan(nis[time < 0.2]).all()
+    assert nis[(time >= 0.2) & (time < 1.7)] == pytest.approx(1.0)
+    assert nis[time > 2.3] == pytest.approx(4.0)
+    assert nis[200] == pytest.approx(1 + 3 * 26 / 51)
+
+
+def stuck_imu() -> Log:
+    status = np.zeros((SAMPLES, 4))
+    status[100:150, 1] = 2.0
+    return Log(estimated_log().channels | {"estimate/sensors/status": status}, estimated_log().meta)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_status_is_shown_only_if_something_was_not_trusted():
+    assert "Status of sensors and estimators" not in titles(estimated_log())
+    assert "Status of sensors and estimators" in titles(stuck_imu())
+
+
+def test_status_is_drawn_by_sensor_and_estimator():
+    figure = figures.statuses(stuck_imu())
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names[:5] == ["joints", "IMU", "left foot", "right foot", "attitude"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ok", "stuck"]
+    boxes = [collection.get_paths()[0].get_extents() for collection in figure.axes[0].collections if len(collection.get_paths()) == 1]
+    stuck = next(box for box in boxes if box.width < 1)
+    assert (stuck.x0, stuck.x1) == pytest.approx((1.0, 1.5))
+    assert stuck.y0 < names.index("IMU") < stuck.y1

@@ -1,23 +1,48 @@
 """Pictures of a log: one function per figure.
 
 Sides, joints and phases are taken from the log. Colours stand for sides, in the log's order; solid is what happened, dashed what was
-planned. Nothing here touches pyplot or matplotlib's global settings.
+planned. Where something is estimated, the estimate is solid and the truth dashed and red. Nothing here touches pyplot or matplotlib's
+global settings.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import itertools
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import yaml
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
+from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import LogLocator, NullFormatter
+from pydrake.common.yaml import yaml_load
 
+from fbse_drake import schema
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.friction import FrictionConfig, ModelAided
+from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
-from fbse_drake.report.html import FigureBlock
-from fbse_drake.report.metrics import com_rse
+from fbse_drake.report.html import FigureBlock, number
+from fbse_drake.report.metrics import (
+    attitude_error_deg,
+    base_velocity_error,
+    com_rse,
+    ended_step,
+    friction_error,
+    has_feet,
+    joint_position_channel,
+    joint_sides,
+    nis_bounds,
+    normalised_innovations,
+    roll_and_pitch_deg,
+    settled,
+    stance,
+)
+from fbse_drake.scenario import Scenario
 from fbse_drake.walking.plan import Phase
 
 _SIDE_COLORS = ("#2979b5", "#d65f1a", "#2f8f6b", "#8457a8")
@@ -25,7 +50,14 @@ _PLANNED = "#555b62"
 _TRUE = "#15181b"
 _COM = "#7a4fa3"
 _ZMP = "#2f8f6b"
-_FRICTION = "#c81e1e"
+_TRUTH = "#c81e1e"
+_ESTIMATE = "#0b7a86"
+_SWING = "#8a9199"
+_PART_COLORS = (_ESTIMATE, "#d65f1a", _COM, "#8a8f14")
+# Estimate and truth mostly agree: a broad pale line shows beside a thin one on top of it.
+_BROAD = {"linewidth": 1.9, "alpha": 0.55}
+_THIN = {"color": _TRUTH, "linestyle": (0, (4, 1.5)), "linewidth": 0.8}
+_STATUS_COLORS = {Status.OK: "#cfe3d6", Status.NOT_FINITE: "#c81e1e", Status.STUCK: "#e39b16", Status.LOST: "#7a4fa3"}
 
 _WIDTH = 10.0
 # Points drawn of one line, about two per pixel of a wide panel.
@@ -35,15 +67,23 @@ _POSITION_SPAN = 0.05  # [m or rad]
 _ERROR_SPAN = 0.2  # [mrad]
 _FRICTION_SPAN = 0.1  # [Nm]
 _VELOCITY_SPAN = 0.01  # [rad/s]
+_ANGLE_SPAN = 0.1  # [deg]
+_ANGLE_ERROR_SPAN = 0.02  # [deg]
+_BASE_VELOCITY_SPAN = 0.02  # [m/s]
+_BASE_VELOCITY_ERROR_SPAN = 1.0  # [mm/s]
+# Shares of an estimate's samples that a panel shows: what is left out are spikes of a few samples, as when a foot lands.
+_SHOWN_QUANTILES = (0.005, 0.995)
+# NIS is averaged over this long [s], where at least half of the samples bring an update.
+_NIS_WINDOW = 0.5
 # The direction of a foot's force means little below this share of the feet's mean load.
 _LOADED_SHARE = 0.05
 
 
 def support_phases(log: Log) -> list[Phase]:
-    """The plan's phases in order of time; none for a log without planned support."""
-    if not _has_feet(log, "reference/foot/{}/support"):
+    """The phases in order of time, by the plan, without one by the estimated support; none for a log without either."""
+    if not (stands := stance(log)):
         return []
-    support = np.stack([log[f"reference/foot/{side}/support"] > 0 for side in log.sides], axis=1)
+    support = np.stack([stands[side] for side in log.sides], axis=1)
     starts = np.flatnonzero(np.concatenate([[True], (support[1:] != support[:-1]).any(axis=1)]))
     ends = [*log.time[starts[1:]], log.time[-1]]
     return [
@@ -52,17 +92,21 @@ def support_phases(log: Log) -> list[Phase]:
     ]
 
 
-def simulation_figures(
+def run_figures(
     log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pads: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, list[FigureBlock]]:
-    """The figures that this log has the channels for, in order, by topic: walk, joints, forces, friction, sensors.
+    """The figures that this log has the channels for, in order, by topic: walk, joints, forces, friction, base, consistency, sensors.
 
     Args:
         outlines, pads: see `footprints`.
     """
-    planned_feet = _has_feet(log, "reference/foot/{}/support") and _has_feet(log, "reference/foot/{}/position")
-    loaded_feet = _has_feet(log, "foot/{}/pad_force") and not _hangs(log)
+    planned_feet = has_feet(log, "reference/foot/{}/support") and has_feet(log, "reference/foot/{}/position")
+    loaded_feet = has_feet(log, "foot/{}/pad_force") and not _hangs(log)
     friction_known = "truth/joint/friction_torque" in log
+    friction_estimated = "estimate/joint/friction_torque" in log
+    com_known = "reference/com/position" in log and "truth/com/position" in log
+    com_estimated = "estimate/com/position" in log
+    innovations = normalised_innovations(log)
     supports = ", ".join(f"{Phase(0, 0, (side,)).label} support by the {side} leg alone" for side in log.sides)
     catalogue: list[tuple[str, str, str, bool, Callable[[], Figure]]] = [
         (
@@ -76,15 +120,16 @@ def simulation_figures(
         (
             "walk",
             "Centre of mass",
-            "Desired and true CoM, and their root square error (RSE).",
-            "reference/com/position" in log and "truth/com/position" in log,
+            "Desired and true CoM, and their root square error (RSE)."
+            + (" Where the CoM is estimated: the estimate, and its own error." if com_estimated else ""),
+            com_known or com_estimated,
             lambda: com(log),
         ),
         (
             "walk",
             "Feet",
             f"Origins of the soles, true and planned. DS is double support, {supports}.",
-            _has_feet(log, "truth/foot/{}/position"),
+            has_feet(log, "truth/foot/{}/position"),
             lambda: feet(log),
         ),
         (
@@ -121,16 +166,91 @@ def simulation_figures(
             "friction",
             "Joint friction",
             "True friction torque of each joint, positive when it eats positive torque. It changes its sign where the joint turns round.",
-            friction_known,
+            friction_known and not friction_estimated,
             lambda: friction(log),
+        ),
+        (
+            "friction",
+            "Estimated joint friction",
+            "Estimated friction torque of each joint, positive when it eats positive torque"
+            + (", and the true one. " if friction_known else ". ")
+            + "Grey: the joint's own leg swings, where the paper's method has no measurement and takes its model. "
+            "Spikes of a few samples may leave a panel.",
+            friction_estimated,
+            lambda: estimated_friction(log),
+        ),
+        (
+            "friction",
+            "Error of the friction estimate",
+            "Estimated minus true friction. The band is the root mean square (RMS) on either side of zero.",
+            friction_known and friction_estimated,
+            lambda: friction_errors(log),
         ),
         (
             "friction",
             "Friction over velocity",
             "The same torque against joint velocity: a step at zero is dry friction, a slope viscous friction, "
-            "and a spread at one velocity means that friction depends on more than velocity.",
-            friction_known and "truth/joint/velocity" in log,
+            "and a spread at one velocity means that friction depends on more than velocity"
+            + (" (or that the estimate is noisy)." if friction_estimated else "."),
+            (friction_known or friction_estimated) and ("truth/joint/velocity" in log or "joint/velocity" in log),
             lambda: friction_over_velocity(log),
+        ),
+        (
+            "friction",
+            "Identified friction parameters",
+            "Parameters of the adopted friction model as they are learnt while the robot moves; bands are two standard deviations, where "
+            "the filter knows them. A parameter settles only when its joint has moved enough to show it.",
+            "estimate/friction/parameters" in log,
+            lambda: friction_parameters(log),
+        ),
+        (
+            "base",
+            "Base attitude",
+            "Roll and pitch of the base."
+            if "truth/base/orientation" not in log
+            else "Roll and pitch of the base, and the estimate's error.",
+            "estimate/base/orientation" in log,
+            lambda: base_attitude(log),
+        ),
+        (
+            "base",
+            "Base velocity",
+            "Velocity of the base in the world" + (", and the estimate's error." if "truth/base/velocity" in log else "."),
+            "estimate/base/velocity" in log,
+            lambda: base_velocity(log),
+        ),
+        (
+            "base",
+            "Support",
+            "Which feet stand, as planned and as estimated, and the measured load of each foot over the mean load of all feet.",
+            "estimate/support" in log and bool(log.sides),
+            lambda: support(log),
+        ),
+        (
+            "consistency",
+            "Consistency of the filters",
+            f"Normalised innovation squared (NIS), averaged over the components and a sliding window of {_NIS_WINDOW:g} s. About 1: the "
+            "filter's surprises are as large as it expects. Below, it trusts its measurements too little, above too much. The band holds "
+            "95 % of white innovations; those that last, as of a trunk that accelerates, leave it.",
+            bool(innovations.keys() - {"friction"})
+            and any(_has_updates(parts) for name, parts in innovations.items() if name != "friction"),
+            lambda: filter_consistency(log),
+        ),
+        (
+            "consistency",
+            "Consistency of the friction filters",
+            f"The same for the friction filter of each joint, averaged over {_NIS_WINDOW:g} s. Recursive least squares knows no noise in "
+            "Nm; for it, this is the NIS for a noise of 1 Nm.",
+            _has_updates(innovations.get("friction", {})),
+            lambda: friction_consistency(log),
+        ),
+        (
+            "consistency",
+            "Status of sensors and estimators",
+            "When a sensor was not trusted and which estimators that concerns. Not finite: a reading is not a number; stuck: it repeats "
+            "itself to the last bit; lost: a foot does not show the load that it must carry.",
+            any(values.any() for values in _statuses(log).values()),
+            lambda: statuses(log),
         ),
         (
             "sensors",
@@ -160,7 +280,7 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
     axes = figure.subplots()
     _decorate(axes)
     for source, label in (("truth", "{} foot"), ("reference", "planned foothold")):
-        for side in log.sides if _has_feet(log, f"{source}/foot/{{}}/position") else ():
+        for side in log.sides if has_feet(log, f"{source}/foot/{{}}/position") else ():
             color = _side_color(log, side) if source == "truth" else _PLANNED
             for place in _footholds(log, side, f"{source}/foot/{side}/position"):
                 if outlines is None:
@@ -169,7 +289,7 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
                     patch = Polygon(place + outlines[side], edgecolor=color, label=label.format(side))
                     patch.set(**({"facecolor": f"{color}38"} if source == "truth" else {"fill": False, "linestyle": "--"}))
                     axes.add_patch(patch)
-    if pads is not None and _has_feet(log, "foot/{}/pad_force") and _has_feet(log, "truth/foot/{}/position"):
+    if pads is not None and has_feet(log, "foot/{}/pad_force") and has_feet(log, "truth/foot/{}/position"):
         axes.plot(*_measured_zmp(log, pads)[_stride(log)].T, color=_ZMP, linewidth=0.7, alpha=0.7, label="measured ZMP")
     for channel, color, line, width, label in (
         ("reference/zmp", _ZMP, "--", 1.4, "planned ZMP"),
@@ -186,19 +306,31 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
 
 
 def com(log: Log) -> Figure:
-    """Desired and true centre of mass in x and y, and their root square error (as the paper's Fig. 8)."""
-    figure, grid = _time_grid(log, 2, 2, height=5.6)
-    error = 1e3 * com_rse(log)
-    for letter, axes in zip("abcd", grid.flat, strict=True):
+    """Desired, true and estimated centre of mass in x and y, and the root square errors of motion and estimate (as the paper's Fig. 8)."""
+    estimated, known = "estimate/com/position" in log, "truth/com/position" in log
+    errors: list[tuple[str, str, np.ndarray]] = []
+    if known and "reference/com/position" in log:
+        errors.append(("RSE", _COM, com_rse(log)))
+    if known and estimated:
+        errors.append(("RSE of estimate", _ESTIMATE, np.abs(log["estimate/com/position"] - log["truth/com/position"])[:, :2]))
+    figure, grid = _time_grid(log, 2, 1 + len(errors), height=5.6)
+    for letter, axes in zip("abcdef", grid.flat, strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=10)
-    for (position, rse), name, column in zip(grid, "xy", (0, 1), strict=True):
-        _plot(position, log, log["truth/com/position"][:, column], color=_COM, label="true")
-        _plot(position, log, log["reference/com/position"][:, column], color=_TRUE, linestyle="--", linewidth=1.0, label="desired")
-        _plot(rse, log, error[:, column], color=_COM)
+    lines: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("estimate", {"color": _ESTIMATE, "label": "estimated", **_BROAD}),
+        ("truth", {"color": _COM, "label": "true"}),
+        ("reference", {"color": _TRUE, "linestyle": "--", "linewidth": 1.0, "label": "desired"}),
+    )
+    for (position, *error_axes), name, column in zip(grid, "xy", (0, 1), strict=True):
+        for source, style in lines:
+            if f"{source}/com/position" in log:
+                _plot(position, log, log[f"{source}/com/position"][:, column], **style)
         position.set_ylabel(f"CoM {name} [m]")
-        rse.set_ylabel(f"RSE {name} [mm]")
-        rse.set_ylim(0, max(1.0, rse.get_ylim()[1]))
         position.set_ylim(_at_least(position.get_ylim(), _POSITION_SPAN))
+        for axes, (label, color, error) in zip(error_axes, errors, strict=True):
+            _plot(axes, log, 1e3 * error[:, column], color=color)
+            axes.set_ylabel(f"{label} {name} [mm]")
+            axes.set_ylim(0, max(1.0, axes.get_ylim()[1]))
     _add_legend(figure)
     return figure
 
@@ -211,7 +343,7 @@ def feet(log: Log) -> Figure:
         for side, width in zip(log.sides, np.linspace(3, 2, len(log.sides)), strict=True):
             values = log[f"truth/foot/{side}/position"][:, column]
             _plot(axes, log, values, color=_side_color(log, side), linewidth=width, label=f"{side} foot")
-        for side in log.sides if _has_feet(log, "reference/foot/{}/position") else ():
+        for side in log.sides if has_feet(log, "reference/foot/{}/position") else ():
             values = log[f"reference/foot/{side}/position"][:, column]
             _plot(axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="planned")
         axes.set_ylabel(f"{name} [m]")
@@ -224,7 +356,7 @@ def feet(log: Log) -> Figure:
 def joint_angles(log: Log) -> Figure:
     """Reference and true joint angles (measured ones in a log without truth), a panel for each joint."""
     figure, panels = _joint_grid(log, "joint angle [rad]")
-    name = _joint_position(log)
+    name = joint_position_channel(log)
     for joint, axes in panels.items():
         _plot(axes, log, log[name][:, joint], **_joint_style(log, joint, _source(name)))
         if "reference/joint/position" in log:
@@ -238,7 +370,7 @@ def joint_angles(log: Log) -> Figure:
 def joint_errors(log: Log) -> Figure:
     """Reference minus true joint angle (measured in a log without truth), a panel for each joint."""
     figure, panels = _joint_grid(log, "reference minus joint angle [mrad]")
-    error = 1e3 * (log["reference/joint/position"] - log[_joint_position(log)])
+    error = 1e3 * (log["reference/joint/position"] - log[joint_position_channel(log)])
     for joint, axes in panels.items():
         _plot(axes, log, error[:, joint], color=_joint_color(log, joint))
     _widen(panels, _ERROR_SPAN)
@@ -278,8 +410,8 @@ def foot_forces(log: Log) -> Figure:
     ratio.set_ylim(0, max(0.1, ratio.get_ylim()[1]))
     for side, axes in zip(log.sides, pad_axes, strict=True):
         pads = log[f"foot/{side}/pad_force"][:, :, 2].T
-        for number, (values, shade) in enumerate(zip(pads, np.linspace(1, 0.3, len(pads)), strict=True), start=1):
-            _plot(axes, log, values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=f"pad {number}")
+        for pad, (values, shade) in enumerate(zip(pads, np.linspace(1, 0.3, len(pads)), strict=True), start=1):
+            _plot(axes, log, values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=f"pad {pad}")
         axes.set_ylabel(f"{side} pads, vertical [N]")
     for axes in (vertical, *pad_axes):
         axes.legend(handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
@@ -292,34 +424,201 @@ def friction(log: Log) -> Figure:
     figure, panels = _joint_grid(log, "friction torque [Nm]")
     for joint, axes in panels.items():
         values = log["truth/joint/friction_torque"][:, joint]
-        _plot(axes, log, values, color=_FRICTION, linestyle="--", linewidth=1.0, label="true friction")
+        _plot(axes, log, values, color=_TRUTH, linestyle="--", linewidth=1.0, label="true friction")
     _widen(panels, _FRICTION_SPAN)
     _add_legend(figure)
     return figure
 
 
+def estimated_friction(log: Log) -> Figure:
+    """Estimated and, where known, true friction torque, a panel for each joint, with the leg's swings shaded (as the paper's Fig. 6)."""
+    figure, panels = _joint_grid(log, "friction torque [Nm]", own_swing=True)
+    estimate = log["estimate/joint/friction_torque"]
+    truth = ended_step(log["truth/joint/friction_torque"]) if "truth/joint/friction_torque" in log else None
+    for joint, axes in panels.items():
+        _plot(axes, log, estimate[:, joint], **_joint_style(log, joint, "estimated"), **_BROAD)
+        if truth is not None:
+            _plot(axes, log, truth[:, joint], **_THIN, label="true friction")
+    _limit(log, panels, estimate, whole=truth, span=_FRICTION_SPAN)
+    _add_legend(figure)
+    return figure
+
+
+def friction_errors(log: Log) -> Figure:
+    """Estimated minus true friction torque with its root mean square, a panel for each joint."""
+    figure, panels = _joint_grid(log, "estimated minus true friction [Nm]", own_swing=True)
+    error = friction_error(log)
+    rms = np.sqrt(np.mean(error[settled(log)] ** 2, axis=0)) if settled(log).any() else np.full(len(log.joints), np.nan)
+    for joint, axes in panels.items():
+        _plot(axes, log, error[:, joint], color=_joint_color(log, joint), linewidth=0.9)
+        if np.isfinite(rms[joint]):
+            axes.axhspan(-rms[joint], rms[joint], facecolor=_TRUTH, alpha=0.15, linewidth=0, zorder=3, label="± RMS")
+            for edge in (-rms[joint], rms[joint]):
+                axes.axhline(edge, color=_TRUTH, linewidth=0.9, linestyle="--", zorder=4)
+            axes.set_title(f"RMS {number(float(rms[joint]), 2)} Nm", loc="right", fontsize=9, pad=3, color=_PLANNED)
+    _limit(log, panels, error, span=_FRICTION_SPAN)
+    _add_legend(figure)
+    return figure
+
+
 def friction_over_velocity(log: Log) -> Figure:
-    """True friction torque against true joint velocity, a panel for the joints that the sides have in common."""
+    """Friction torque, estimated and true as far as known, against joint velocity, a panel for the joints that the sides have in common.
+
+    Estimates are those of the step that began with the velocity.
+    """
     rows = _joint_rows(log)
     columns = min(3, len(rows))
     figure = Figure(figsize=(_WIDTH, 0.6 + 2.6 * -(-len(rows) // columns)), layout="constrained")
     grid = figure.subplots(-(-len(rows) // columns), columns, squeeze=False)
     for axes in grid.flat[len(rows) :]:
         axes.set_axis_off()
+    velocity = log["truth/joint/velocity" if "truth/joint/velocity" in log else "joint/velocity"]
+    truth = log.get("truth/joint/friction_torque")
+    estimate = log.get("estimate/joint/friction_torque")
+    if estimate is not None:
+        estimate = np.concatenate([estimate[1:], estimate[-1:]])
     for axes, (role, joints) in zip(grid.flat, rows.items(), strict=False):
         _decorate(axes)
         axes.locator_params(axis="x", nbins=5)
         axes.set_title(role.replace("_", " "), loc="left", fontsize=10)
+        shown = estimate if estimate is not None else truth
         # Smaller dots on larger ones: where the sides agree, both can be seen.
         for (side, joint), size in zip(joints.items(), np.linspace(4.5, 2, max(2, len(joints))), strict=False):
-            velocity, torque = (log[f"truth/joint/{name}"][_stride(log), joint] for name in ("velocity", "friction_torque"))
-            color = _joint_color(log, joint)
-            axes.plot(velocity, torque, ".", color=color, markersize=size, markeredgewidth=0, label=f"{side} leg" if side else None)
+            label = f"{'estimated, ' if estimate is not None else ''}{side} leg" if side else None
+            _dots(axes, velocity[_stride(log), joint], shown[_stride(log), joint], _joint_color(log, joint), size, label)
+        if estimate is not None and truth is not None:
+            for joint in joints.values():
+                _dots(axes, velocity[_stride(log), joint], truth[_stride(log), joint], _TRUTH, 1.8, "true friction")
         axes.set_xlim(_at_least(axes.get_xlim(), _VELOCITY_SPAN))
-        axes.set_ylim(_at_least(axes.get_ylim(), _FRICTION_SPAN))
+        if estimate is None:
+            axes.set_ylim(_at_least(axes.get_ylim(), _FRICTION_SPAN))
+        else:
+            _limit(log, dict.fromkeys(joints.values(), axes), estimate, whole=truth, span=_FRICTION_SPAN)
     figure.supxlabel("joint velocity [rad/s]", fontsize=10)
     figure.supylabel("friction torque [Nm]", fontsize=10)
-    _add_legend(figure, markerscale=2.5)
+    _add_legend(figure, marker_size=9)
+    return figure
+
+
+def friction_parameters(log: Log) -> Figure:
+    """Identified parameters of the friction model, a column for each parameter and a row for the joints that the sides have in common."""
+    values = log["estimate/friction/parameters"]
+    config = _friction_config(log)
+    linear = {} if config is None else {name: parameter for name, parameter in config.model.parameters.items() if parameter.linear}
+    titles = [f"{name} [{parameter.unit}]" for name, parameter in linear.items()]
+    if len(titles) != values.shape[2]:
+        titles = [f"parameter {place}" for place in range(1, values.shape[2] + 1)]
+    # The variance of recursive least squares is in units of a noise that it does not know.
+    deviation = None
+    if isinstance(config, ModelAided) and "estimate/friction/parameter_variance" in log:
+        deviation = np.sqrt(np.maximum(0.0, log["estimate/friction/parameter_variance"]))
+    rows = _joint_rows(log)
+    figure, grid = _time_grid(log, len(rows), len(titles), height=0.8 + 1.55 * len(rows), phases=False)
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title, loc="left", fontsize=10)
+    for (role, joints), row in zip(rows.items(), grid, strict=True):
+        row[0].set_ylabel(role.replace("_", " "))
+        for parameter, axes in enumerate(row):
+            for joint in joints.values():
+                curve = values[:, joint, parameter]
+                _plot(axes, log, curve, **_joint_style(log, joint, "identified"))
+                if deviation is not None:
+                    band, color = 2 * deviation[:, joint, parameter], _joint_color(log, joint)
+                    thin = _stride(log)
+                    axes.fill_between(
+                        log.time[thin],
+                        (curve - band)[thin],
+                        (curve + band)[thin],
+                        color=color,
+                        alpha=0.2,
+                        linewidth=0,
+                        label="± 2 standard deviations",
+                    )
+            shown = values[:, list(joints.values()), parameter]
+            axes.set_ylim(_readable(log, shown, span=_FRICTION_SPAN))
+    _add_legend(figure)
+    return figure
+
+
+def base_attitude(log: Log) -> Figure:
+    """Roll and pitch of the base, estimated and true, and the error."""
+    channels = ("estimate/base/orientation", "truth/base/orientation")
+    estimate, truth = (roll_and_pitch_deg(log[channel]) if channel in log else None for channel in channels)
+    error = attitude_error_deg(log) if truth is not None else None
+    return _estimate_and_error(log, ("roll", "pitch"), ("deg", "deg"), (estimate, truth, error), (_ANGLE_SPAN, _ANGLE_ERROR_SPAN))
+
+
+def base_velocity(log: Log) -> Figure:
+    """Velocity of the base in the world, estimated and true, and the error."""
+    error = 1e3 * base_velocity_error(log) if "truth/base/velocity" in log else None
+    curves = (log["estimate/base/velocity"], log.get("truth/base/velocity"), error)
+    return _estimate_and_error(log, "xyz", ("m/s", "mm/s"), curves, (_BASE_VELOCITY_SPAN, _BASE_VELOCITY_ERROR_SPAN))
+
+
+def support(log: Log) -> Figure:
+    """Planned and estimated stance and measured load of each foot."""
+    figure, grid = _time_grid(log, len(log.sides), 1, height=1.0 + 1.9 * len(log.sides), phases=False)
+    forces = {side: log[f"foot/{side}/pad_force"][:, :, 2].sum(axis=1) for side in log.sides if has_feet(log, "foot/{}/pad_force")}
+    weight = np.mean(sum(forces.values())) if forces else 0.0
+    strips = [("estimated stance", log["estimate/support"].T > 0, 1.0)]
+    if has_feet(log, "reference/foot/{}/support"):
+        strips.insert(0, ("planned stance", [log[f"reference/foot/{side}/support"] > 0 for side in log.sides], 0.45))
+    for foot, (side, axes) in enumerate(zip(log.sides, grid.flat, strict=True)):
+        for place, (label, stands, strength) in enumerate(strips, start=1):
+            style = {"facecolor": _side_color(log, side), "alpha": strength, "linewidth": 0, "label": label}
+            axes.broken_barh(_stretches(log, stands[foot]), (-0.22 * place, 0.16), **style)
+        if weight > 0:
+            _plot(axes, log, forces[side] / weight, color=_TRUE, linewidth=0.8, label="load / mean load of all feet")
+        axes.set_ylabel(f"{side} foot [1]")
+        axes.set_ylim(-0.22 * len(strips) - 0.06, 1.4)
+        axes.set_yticks([0, 0.5, 1])
+    _name_phases(grid[0, 0], log)
+    _add_legend(figure)
+    return figure
+
+
+def filter_consistency(log: Log) -> Figure:
+    """NIS of the filters but those of the friction, a panel for each filter."""
+    filters = {name: parts for name, parts in normalised_innovations(log).items() if name != "friction" and _has_updates(parts)}
+    figure, grid = _time_grid(log, len(filters), 1, height=0.8 + 2.0 * len(filters))
+    for (name, parts), axes in zip(filters.items(), grid.flat, strict=True):
+        curves = {part: squares for part, squares in parts.items() if np.isfinite(squares).any()}
+        _plot_nis(axes, log, curves, dict(zip(curves, itertools.cycle(_PART_COLORS), strict=False)))
+        axes.set_title(name.replace("_", " "), loc="left", fontsize=10)
+        axes.set_ylabel("NIS [1]")
+        axes.legend(handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=9)
+    _add_legend(figure, without={part for parts in filters.values() for part in parts})
+    return figure
+
+
+def friction_consistency(log: Log) -> Figure:
+    """NIS of the friction filter of each joint."""
+    figure, panels = _joint_grid(log, "NIS [1]", own_swing=True)
+    parts = list(normalised_innovations(log)["friction"].values())
+    for joint, axes in panels.items():
+        label = str(_joint_style(log, joint, "NIS")["label"])
+        _plot_nis(axes, log, {label: parts[joint]}, {label: _joint_color(log, joint)})
+    _add_legend(figure)
+    return figure
+
+
+def statuses(log: Log) -> Figure:
+    """What sensor monitor and estimators said of their inputs over time."""
+    rows = _statuses(log)
+    figure = Figure(figsize=(_WIDTH, 1.2 + 0.3 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    _decorate(axes)
+    axes.grid(visible=False, axis="y")
+    axes.margins(x=0)
+    seen = sorted({int(value) for values in rows.values() for value in np.unique(values)})
+    for place, values in enumerate(rows.values()):
+        for status in seen:
+            axes.broken_barh(_stretches(log, values == status), (place - 0.36, 0.72), facecolor=_STATUS_COLORS[Status(status)], linewidth=0)
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.invert_yaxis()
+    axes.set_xlabel("time [s]")
+    handles = [Patch(facecolor=_STATUS_COLORS[Status(status)], label=Status(status).name.lower().replace("_", " ")) for status in seen]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(seen), frameon=False, fontsize=10)
     return figure
 
 
@@ -336,18 +635,9 @@ def imu(log: Log) -> Figure:
     return figure
 
 
-def _has_feet(log: Log, channel: str) -> bool:
-    """Whether the log has this channel for every side, and has sides."""
-    return bool(log.sides) and all(channel.format(side) in log for side in log.sides)
-
-
 def _hangs(log: Log) -> bool:
     """Whether no foot ever touches the ground; known only from truth."""
-    return _has_feet(log, "truth/foot/{}/pad_force") and not any(log[f"truth/foot/{side}/pad_force"].any() for side in log.sides)
-
-
-def _joint_position(log: Log) -> str:
-    return "truth/joint/position" if "truth/joint/position" in log else "joint/position"
+    return has_feet(log, "truth/foot/{}/pad_force") and not any(log[f"truth/foot/{side}/pad_force"].any() for side in log.sides)
 
 
 def _source(channel: str) -> str:
@@ -358,27 +648,59 @@ def _side_color(log: Log, side: str) -> str:
     return _SIDE_COLORS[log.sides.index(side) % len(_SIDE_COLORS)]
 
 
-def _joint_side(log: Log, joint: str) -> str | None:
-    return next((side for side in log.sides if joint.startswith(f"{side}_")), None)
-
-
 def _joint_color(log: Log, joint: int) -> str:
-    side = _joint_side(log, log.joints[joint])
+    side = joint_sides(log)[joint]
     return _TRUE if side is None else _side_color(log, side)
 
 
 def _joint_style(log: Log, joint: int, label: str) -> dict[str, str]:
-    side = _joint_side(log, log.joints[joint])
+    side = joint_sides(log)[joint]
     return {"color": _joint_color(log, joint), "label": label if side is None else f"{label}, {side}"}
 
 
 def _joint_rows(log: Log) -> dict[str, dict[str, int]]:
     """Columns of the joints in the log by what they are called without their side, and by side."""
     rows: dict[str, dict[str, int]] = {}
-    for column, name in enumerate(log.joints):
-        side = _joint_side(log, name)
+    for column, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
         rows.setdefault(name if side is None else name.removeprefix(f"{side}_"), {})[side or ""] = column
     return rows
+
+
+def _friction_config(log: Log) -> FrictionConfig | None:
+    """How the log's friction was estimated, by the scenario that it holds; None where that does not tell."""
+    text = log.meta.get("estimator_scenario", log.meta.get("scenario"))
+    if not text:
+        return None
+    try:
+        tree = yaml_load(data=text)
+        scenario = schema.build(Scenario, next(iter(tree.values())), file="log")
+    except (InputError, yaml.YAMLError, AttributeError, StopIteration):
+        # A log of another version, or of another program.
+        return None
+    return scenario.estimator.friction if isinstance(scenario.estimator, Fbse) else None
+
+
+def _statuses(log: Log) -> dict[str, np.ndarray]:
+    """Status over time (N,) by sensor and estimator."""
+    found = {}
+    if "estimate/sensors/status" in log:
+        values = log["estimate/sensors/status"].T
+        names = ["joints", "IMU", *(f"{side} foot" for side in log.sides)]
+        found |= dict(zip(names if len(names) == len(values) else map(str, range(1, len(values) + 1)), values, strict=True))
+    suffix = "/status"
+    estimators = [name for name in log if name.endswith(suffix) and name != "estimate/sensors/status"]
+    return found | {name.removeprefix("estimate/").removesuffix(suffix).replace("_", " "): log[name] for name in estimators}
+
+
+def _has_updates(parts: Mapping[str, np.ndarray]) -> bool:
+    return any(np.isfinite(squares).any() for squares in parts.values())
+
+
+def _stretches(log: Log, holds: np.ndarray) -> list[tuple[float, float]]:
+    """Start and length [s] of the stretches of time in which something holds, (N,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(-1, 2)
+    ends = np.append(log.time, log.time[-1])
+    return [(float(log.time[start]), float(ends[end] - log.time[start])) for start, end in edges]
 
 
 def _footholds(log: Log, side: str, channel: str) -> Iterable[np.ndarray]:
@@ -411,20 +733,114 @@ def _plot(axes: Axes, log: Log, values: np.ndarray, **style: Any) -> None:
     axes.plot(log.time[rows], values[rows], **{"linewidth": 1.2, **style})
 
 
-def _time_grid(log: Log, rows: int, columns: int, *, height: float) -> tuple[Figure, np.ndarray]:
-    """A figure with panels over time that show the phases; panels have shape (rows, columns)."""
+def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, size: float, label: str | None) -> None:
+    axes.plot(x, y, ".", color=color, markersize=size, markeredgewidth=0, label=label)
+
+
+def _plot_nis(axes: Axes, log: Log, curves: Mapping[str, np.ndarray], colors: Mapping[str, str]) -> None:
+    """Draws NIS, averaged over a sliding window, with its 95 % band on a logarithmic scale; curves (N, components) have equal shapes."""
+    start = np.searchsorted(log.time, log.time - _NIS_WINDOW / 2, side="left")
+    end = np.searchsorted(log.time, log.time + _NIS_WINDOW / 2, side="right")
+    counted = settled(log)
+    highest, lowest = 2.0, 0.5
+    for label, squares in curves.items():
+        components = squares.shape[1]
+        known = np.isfinite(squares) & counted[:, None]
+        totals = np.concatenate([[0.0], np.cumsum(np.where(known, squares, 0.0).sum(axis=1))])
+        counts = np.concatenate([[0], np.cumsum(known.sum(axis=1))])
+        total, count = totals[end] - totals[start], counts[end] - counts[start]
+        enough = (count > 0) & (2 * count >= components * (end - start)) & counted
+        mean = np.full(len(log.time), np.nan)
+        mean[enough] = np.maximum(total[enough] / count[enough], 1e-12)
+        if enough.any():
+            highest, lowest = max(highest, float(np.nanmax(mean))), min(lowest, float(np.nanmin(mean)))
+        thin = _stride(log)
+        axes.plot(log.time[thin], mean[thin], color=colors[label], linewidth=1.1, label=label)
+    window = float(np.median(end - start)) * next(iter(curves.values())).shape[1]
+    lower, upper = nis_bounds(np.array(window)).tolist()
+    axes.axhspan(lower, upper, facecolor=_TRUE, alpha=0.25, linewidth=0, label="95 % of white innovations")
+    axes.set_yscale("log")
+    axes.set_ylim(max(1e-4, 0.7 * lowest), min(1e4, 1.4 * highest))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if highest > 100 * lowest else (1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    if len(log.time) > 1:
+        axes.set_xlim(log.time[0], log.time[-1])
+
+
+def _estimate_and_error(
+    log: Log,
+    names: Sequence[str],
+    units: tuple[str, str],
+    curves: tuple[np.ndarray, np.ndarray | None, np.ndarray | None],
+    spans: tuple[float, float],
+) -> Figure:
+    """A row for each quantity: estimate with truth, and, where the truth is known, the error.
+
+    Args:
+        units: of the quantity and of its error.
+        curves: estimate, truth and error, (N, names) each.
+        spans: the least that panels of quantity and error show.
+    """
+    estimate, truth, error = curves
+    figure, grid = _time_grid(log, len(names), 1 if error is None else 2, height=0.9 + 1.75 * len(names))
+    for column, (name, row) in enumerate(zip(names, grid, strict=True)):
+        _plot(row[0], log, estimate[:, column], color=_ESTIMATE, label="estimated", **_BROAD)
+        if truth is not None:
+            _plot(row[0], log, truth[:, column], **_THIN, label="true")
+        row[0].set_ylabel(f"{name} [{units[0]}]")
+        row[0].set_ylim(_readable(log, estimate[:, column], whole=None if truth is None else truth[:, column], span=spans[0]))
+        if error is not None:
+            _plot(row[1], log, error[:, column], color=_ESTIMATE, linewidth=0.9)
+            row[1].set_ylabel(f"error of {name} [{units[1]}]")
+            row[1].set_ylim(_readable(log, error[:, column], span=spans[1]))
+    _add_legend(figure)
+    return figure
+
+
+def _readable(log: Log, estimate: np.ndarray, *, whole: np.ndarray | None = None, span: float) -> tuple[float, float]:
+    """Limits that show an estimate without its shortest spikes and without the filters' settling, and all of `whole`; (N, ...) each."""
+    curves = estimate.reshape(len(log.time), -1)
+    known = np.isfinite(curves).all(axis=1)
+    shown = curves[known & settled(log)] if (known & settled(log)).any() else curves[known]
+    values = np.quantile(shown, _SHOWN_QUANTILES, axis=0).ravel() if len(shown) else np.zeros(1)
+    if whole is not None:
+        values = np.append(values, whole[np.isfinite(whole)])
+    margin = 0.08 * (values.max() - values.min())
+    return _at_least((float(values.min() - margin), float(values.max() + margin)), span)
+
+
+def _limit(log: Log, panels: Mapping[int, Axes], estimate: np.ndarray, *, whole: np.ndarray | None = None, span: float) -> None:
+    """Gives panels of joints, which share limits along a row, limits as by `_readable`."""
+    for joints in _joint_rows(log).values():
+        columns = [joint for joint in joints.values() if joint in panels]
+        if columns:
+            limits = _readable(log, estimate[:, columns], whole=None if whole is None else whole[:, columns], span=span)
+            panels[columns[0]].set_ylim(limits)
+
+
+def _time_grid(log: Log, rows: int, columns: int, *, height: float, phases: bool = True) -> tuple[Figure, np.ndarray]:
+    """A figure with panels over time that show the phases, if so wished; panels have shape (rows, columns)."""
     figure = Figure(figsize=(_WIDTH, height), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axes in grid.flat:
-        _decorate_time(axes, log)
+        if phases:
+            _decorate_time(axes, log)
+        else:
+            _decorate(axes)
+            axes.margins(x=0)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     figure.align_ylabels()
     return figure, grid
 
 
-def _joint_grid(log: Log, quantity: str) -> tuple[Figure, dict[int, Axes]]:
-    """A figure with a panel over time for each joint, by its column in the log: a row for each role, a column for each side."""
+def _joint_grid(log: Log, quantity: str, *, own_swing: bool = False) -> tuple[Figure, dict[int, Axes]]:
+    """A figure with a panel over time for each joint, by its column in the log: a row for each role, a column for each side.
+
+    Args:
+        own_swing: shades when the joint's own leg swings instead of the single supports.
+    """
     joint_rows = list(_joint_rows(log).values())
     columns = max(len(row) for row in joint_rows)
     figure = Figure(figsize=(_WIDTH, 0.8 + 1.55 * len(joint_rows)), layout="constrained")
@@ -434,7 +850,7 @@ def _joint_grid(log: Log, quantity: str) -> tuple[Figure, dict[int, Axes]]:
         for axes in row_axes[len(row) :]:
             axes.set_axis_off()
         for joint, axes in zip(row.values(), row_axes, strict=False):
-            _decorate_time(axes, log)
+            _decorate_time(axes, log, swing_of=joint_sides(log)[joint] if own_swing else None)
             axes.set_title(log.joints[joint].replace("_", " "), loc="left", fontsize=10, pad=3)
             panels[joint] = axes
     figure.supxlabel("time [s]", fontsize=10)
@@ -451,12 +867,15 @@ def _decorate(axes: Axes) -> None:
     axes.locator_params(nbins="auto", steps=[1, 2, 5, 10])
 
 
-def _decorate_time(axes: Axes, log: Log) -> None:
-    """Also shades the plan's single supports in the colour of the leg that stands."""
+def _decorate_time(axes: Axes, log: Log, *, swing_of: str | None = None) -> None:
+    """Also shades the single supports in the colour of the leg that stands, or when the leg of one side swings."""
     _decorate(axes)
     axes.margins(x=0)
     for phase in support_phases(log):
-        if len(phase.support) == 1:
+        if swing_of is not None:
+            if swing_of not in phase.support:
+                axes.axvspan(phase.start, phase.end, facecolor=_SWING, alpha=0.22, linewidth=0, label="the joint's leg swings")
+        elif phase.is_single:
             side = phase.support[0]
             axes.axvspan(phase.start, phase.end, facecolor=_side_color(log, side), alpha=0.12, linewidth=0, label=f"{side} leg supports")
 
@@ -482,20 +901,27 @@ def _name_phases(axes: Axes, log: Log) -> None:
             axes.text(middle, 1.02, phase.label, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, color=_PLANNED)
 
 
-def _add_legend(figure: Figure, *, markerscale: float = 1.0) -> None:
-    """One legend above all panels: every label once, solid lines before dashed ones before areas."""
+def _add_legend(figure: Figure, *, marker_size: float | None = None, without: Collection[str] = ()) -> None:
+    """One legend above all panels: every label once but for those `without`, solid lines before dashed ones before areas.
+
+    Args:
+        marker_size: of all markers in the legend [points]; None as they are drawn.
+    """
     found: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            if label not in without:
+                found.setdefault(label, handle)
     if not found:
         return
 
     def rank(label: str) -> int:
         handle = found[label]
-        return int(handle.get_linestyle() == "--") if isinstance(handle, Line2D) else 2
+        return int(handle.is_dashed()) if isinstance(handle, Line2D) else 2
 
     labels = sorted(found, key=rank)
     columns = len(labels) if len(labels) < 6 else -(-len(labels) // 2)
     handles = [found[label] for label in labels]
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns, markerscale=markerscale, frameon=False, fontsize=10)
+    legend = figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=10)
+    for handle in legend.legend_handles if marker_size is not None else ():
+        handle.set(markersize=marker_size)

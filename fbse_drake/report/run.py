@@ -1,4 +1,4 @@
-"""The report of a simulated run."""
+"""The report of a run: simulated, or recorded and estimated."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,41 +8,53 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from fbse_drake.log import Log
-from fbse_drake.report.figures import simulation_figures
+from fbse_drake.report.figures import run_figures
 from fbse_drake.report.html import Details, Report, Section, Table, number, numeric_table, write_report
+from fbse_drake.report.metrics import consistency
 
 
-def write_simulation_report(
+def write_run_report(
     path: str | Path,
     log: Log,
     metrics: Mapping[str, Any],
     *,
     name: str,
 ) -> None:
-    """Writes the report of a simulated run as one HTML file.
+    """Writes the report of a run as one HTML file; it shows what the log has the channels for.
 
     Args:
-        metrics: contents of metrics.json, see `simulation_metrics`.
+        metrics: contents of metrics.json, see `run_metrics`.
         name: what the scenario is called.
     """
     pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items()}
     # A sole reaches at least as far as its pads.
     outlines = {side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()}
-    figures = {topic: tuple(blocks) for topic, blocks in simulation_figures(log, outlines=outlines, pads=pads).items()}
+    figures = {topic: tuple(blocks) for topic, blocks in run_figures(log, outlines=outlines or None, pads=pads or None).items()}
     sections = [
         Section("Summary", log.meta.get("title", ""), tables=_key_figures(metrics)),
         Section("Motion", figures=figures["walk"]),
         Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
         Section("Foot forces", figures=figures["forces"]),
         Section("Friction", tables=_friction_table(metrics), figures=figures["friction"]),
+        Section("Base state", figures=figures["base"]),
+        Section("Consistency", _CONSISTENCY, tables=_consistency_table(log), figures=figures["consistency"]),
         Section("Sensors", figures=figures["sensors"]),
-        Section("Scenario", "The scenario as it was run, with all its defaults.", details=(Details("YAML", log.meta["scenario"]),)),
+        Section("Scenario", "The scenario as it was run, with all its defaults.", details=_scenarios(log)),
     ]
     shown = tuple(section for section in sections if section.tables or section.figures or section.details)
     write_report(path, Report(name, not metrics["fell"], _outcome(metrics), shown))
 
 
+_CONSISTENCY = (
+    "A filter is consistent if its innovations are as large as it expects: then their normalised squares (NIS) average 1, and the mean "
+    "lies between the bounds with 95 % probability if the innovations are white. Errors that last make it leave the bounds without being "
+    "wrong."
+)
+
+
 def _outcome(metrics: Mapping[str, Any]) -> str:
+    if metrics["outcome"] == "recorded":
+        return f"A recording of {number(metrics['simulated_time'])} s."
     if metrics["outcome"] != "finished":
         return f"The run ended early at {metrics['outcome']}."
     return f"The run finished after {number(metrics['simulated_time'])} s."
@@ -52,16 +64,16 @@ def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
     tracking = metrics["joint_tracking_rms"]
     worst = max(tracking, key=tracking.get)
     rows = [
-        ("Simulated time", metrics["simulated_time"], "s"),
+        ("Length of the run", metrics["simulated_time"], "s"),
         ("Wall time", metrics["wall_time"], "s"),
-        ("Simulated time per wall time", metrics["real_time_factor"], "1"),
+        ("Length per wall time", metrics["real_time_factor"], "1"),
         ("Joint tracking error, RMS, mean of the joints", 1e3 * float(np.mean(list(tracking.values()))), "mrad"),
         (f"Joint tracking error, RMS, worst joint ({_words(worst)})", 1e3 * tracking[worst], "mrad"),
         *((f"CoM error in {axis}, mean", 1e3 * value, "mm") for axis, value in metrics["com_rse_mean"].items()),
         *((f"Creep of the {side} foot in a stance, largest", 1e3 * value, "mm") for side, value in metrics["stance_creep_max"].items()),
         *((f"Estimated {angle}, RMS error", value, "deg") for angle, value in metrics["attitude_rmse_deg"].items()),
-        *((f"Estimated base velocity in {axis}, RMS error", value, "m/s") for axis, value in metrics["base_velocity_rmse"].items()),
-        *((f"Controller tick, {statistic}", value, "µs") for statistic, value in metrics["tick_us"].items()),
+        *((f"Estimated base velocity in {axis}, RMS error", 1e3 * value, "mm/s") for axis, value in metrics["base_velocity_rmse"].items()),
+        *((f"Estimator tick, {statistic}", value, "µs") for statistic, value in metrics["tick_us"].items()),
     ]
     return numeric_table(("", "Value", "Unit"), rows)
 
@@ -76,6 +88,21 @@ def _friction_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
     kinds = [metrics[kind][phase] for phase in ("stance", "swing") for kind in ("friction_rmse", "friction_nrmse")]
     rows = [(_words(joint), *(values[joint] for values in kinds)) for joint in metrics["joint_tracking_rms"]]
     return numeric_table(("Joint", "Stance, RMSE [Nm]", "Stance, NRMSE [1]", "Swing, RMSE [Nm]", "Swing, NRMSE [1]"), rows)
+
+
+def _consistency_table(log: Log) -> tuple[Table, ...]:
+    rows = [
+        (_words(name), _words(part), found.nis, found.lower, found.upper, float(found.count))
+        for name, parts in consistency(log).items()
+        for part, found in parts.items()
+    ]
+    return numeric_table(("Filter", "Innovation of", "Mean NIS [1]", "Lower bound", "Upper bound", "Innovations"), rows)
+
+
+def _scenarios(log: Log) -> tuple[Details, ...]:
+    """Scenarios that the log holds: that of the simulation, and that of the estimator which ran over the log later."""
+    titles = {"scenario": "YAML", "estimator_scenario": "YAML of the estimator that ran over the log"}
+    return tuple(Details(title, log.meta[key]) for key, title in titles.items() if key in log.meta)
 
 
 def _words(name: str) -> str:
