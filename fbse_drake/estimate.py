@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
+from fbse_drake.estimators.estimator import make_estimator
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.scenario import Scenario
@@ -37,22 +37,7 @@ def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] 
     Raises:
         InputError: no estimator in the scenario, a log that lacks a channel, other joints or feet than the model's.
     """
-    believed = scenario.believed
-    with located("model: "):
-        robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
-    inputs = _inputs(robot, log)
-    ticks = np.arange(round(scenario.duration / scenario.control.period) + 1) * scenario.control.period
-    with located("reference: "):
-        plan = make_reference(scenario.reference, robot, ticks).plan
-    period = float(log.meta["period"])
-    estimator = make_estimator(scenario.estimator, robot, period=period, plan=plan, every_sample=True)
-    if estimator is None:
-        raise InputError("estimator: the scenario has none (estimator: !Fbse {})")
-    for i in range(estimator.num_input_ports()):
-        name = estimator.get_input_port(i).get_name()
-        if name not in inputs:
-            raise InputError(f"the log has no channel for the estimator's input {name} ({_CHANNELS_OF[name]})")
-    values, tick_time = _replay(estimator, log.time, inputs, progress)
+    values, tick_time = Replay(scenario, log).run(progress)
     kept = {name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")}
     return EstimationResult(replace(log, channels=kept | values), tick_time)
 
@@ -109,30 +94,64 @@ def differentiate(time: np.ndarray, position: np.ndarray, time_constant: float) 
     return velocity
 
 
-def _replay(
-    estimator: EstimatorDiagram, time: np.ndarray, inputs: dict[str, np.ndarray], progress: Callable[[float], None] | None
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    context = estimator.CreateDefaultContext()
-    sources = []
-    for i in range(estimator.num_input_ports()):
-        port = estimator.get_input_port(i)
-        sources.append((port.FixValue(context, inputs[port.get_name()][0]), inputs[port.get_name()]))
-    outputs = {name: estimator.GetOutputPort(name) for name in estimator.channels}
-    values = {name: np.empty((len(time), port.size())) for name, port in outputs.items()}
-    tick_time = np.empty(len(time))
-    friction = estimator.GetOutputPort("friction_estimate")
-    for k, now in enumerate(time):
-        context.SetTime(now)
-        for fixed, samples in sources:
-            fixed.GetMutableData().get_mutable_value().SetFromVector(samples[k])
-        start = clock.perf_counter()
-        friction.Eval(context)
-        evaluated = clock.perf_counter() - start
-        for name, port in outputs.items():
-            values[name][k] = port.Eval(context)
-        start = clock.perf_counter()
-        estimator.ExecuteForcedEvents(context, publish=False)
-        tick_time[k] = evaluated + clock.perf_counter() - start
-        if progress is not None and k % 100 == 0:
-            progress(float(now))
-    return {name: value.reshape(len(time), *estimator.channels[name]) for name, value in values.items()}, tick_time
+class Replay:
+    """A scenario's estimator and a log that it runs over; see `estimate`."""
+
+    def __init__(self, scenario: Scenario, log: Log):
+        believed = scenario.believed
+        with located("model: "):
+            robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
+        inputs = _inputs(robot, log)
+        ticks = np.arange(round(scenario.duration / scenario.control.period) + 1) * scenario.control.period
+        with located("reference: "):
+            plan = make_reference(scenario.reference, robot, ticks).plan
+        period = float(log.meta["period"])
+        estimator = make_estimator(scenario.estimator, robot, period=period, plan=plan, every_sample=True)
+        if estimator is None:
+            raise InputError("estimator: the scenario has none (estimator: !Fbse {})")
+        for i in range(estimator.num_input_ports()):
+            name = estimator.get_input_port(i).get_name()
+            if name not in inputs:
+                raise InputError(f"the log has no channel for the estimator's input {name} ({_CHANNELS_OF[name]})")
+        self.estimator, self.time = estimator, log.time
+        self.context = estimator.CreateDefaultContext()
+        # Takes the update of every tick.
+        self._next_context = estimator.CreateDefaultContext()
+        self._next = self._next_context.get_mutable_state()
+        self._next_values = self._next_context.get_discrete_state()
+        self._sources = []
+        for i in range(estimator.num_input_ports()):
+            port = estimator.get_input_port(i)
+            self._sources.append((port.FixValue(self.context, inputs[port.get_name()][0]), inputs[port.get_name()]))
+
+    def feed(self, sample: int) -> None:
+        """Sets time and inputs to a sample of the log."""
+        self.context.SetTime(self.time[sample])
+        for fixed, samples in self._sources:
+            fixed.GetMutableData().get_mutable_value().SetFromVector(samples[sample])
+
+    def update(self) -> None:
+        """Lets the estimators remember the tick. (`ExecuteForcedEvents` does so too, but allocates two states.)"""
+        self.estimator.CalcForcedUnrestrictedUpdate(self.context, self._next)
+        self.context.SetDiscreteState(self._next_values)
+
+    def run(self, progress: Callable[[float], None] | None = None) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Estimates by channel, each (N, ...), and the time that each tick took [s], shape (N,)."""
+        estimator, context = self.estimator, self.context
+        outputs = {name: estimator.GetOutputPort(name) for name in estimator.channels}
+        values = {name: np.empty((len(self.time), port.size())) for name, port in outputs.items()}
+        tick_time = np.empty(len(self.time))
+        friction = estimator.GetOutputPort("friction_estimate")
+        for k, now in enumerate(self.time):
+            self.feed(k)
+            start = clock.perf_counter()
+            friction.Eval(context)
+            evaluated = clock.perf_counter() - start
+            for name, port in outputs.items():
+                values[name][k] = port.Eval(context)
+            start = clock.perf_counter()
+            self.update()
+            tick_time[k] = evaluated + clock.perf_counter() - start
+            if progress is not None and k % 100 == 0:
+                progress(float(now))
+        return {name: value.reshape(len(self.time), *estimator.channels[name]) for name, value in values.items()}, tick_time

@@ -71,7 +71,7 @@ class FrictionCompensation(RecursiveEstimator):
         output_ports:
         - posterior
 
-    `friction_estimate` (n,) [Nm]; field `torque` (n,) [Nm] is what is added to the command.
+    `friction_estimate` (n,) [Nm]; field `torque` (n,) [Nm] is what is added to the command. (It has no status.)
     """
 
     def __init__(self, config: IntegralCompensation | FeedforwardCompensation, names: RobotDescription, clock: Clock):
@@ -87,12 +87,10 @@ class FrictionCompensation(RecursiveEstimator):
         self._estimate = self.DeclareVectorInputPort("friction_estimate", n)
         self._declare_posterior("friction_estimate")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        posterior[:] = last
         if math.isnan(elapsed):
-            return last.copy()
+            return
         wanted = np.minimum(np.maximum(self._share * self._estimate.Eval(context), -self._limit), self._limit)
         keep = np.exp(-self._rate * elapsed)
-        posterior = np.empty(len(last))
-        posterior[0] = 0.0
         posterior[1:] = keep * last[1:] + (1 - keep) * wanted
-        return posterior

@@ -1,19 +1,39 @@
 """Base attitude from the IMU: a Kalman filter for gravity feeds an extended Kalman filter on the quaternion (paper Sec. 3, Fig. 2)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
+from fbse_drake.estimators.spatial import (
+    Quaternion,
+    Rotation,
+    Vector,
+    add,
+    cross,
+    normalized,
+    put,
+    quaternion_from_gravity,
+    quaternion_product,
+    rotate,
+    rotate_back,
+    rotation_matrix,
+    rotation_vector_to_quaternion,
+    scale,
+    subtract,
+    vector_at,
+    yaw_of,
+)
 from fbse_drake.robot.plant import Robot
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+_NOT_FINITE = float(Status.NOT_FINITE)
 
 # What the angular velocity is taken to be while the gyro is not trusted [rad/s].
 _UNKNOWN_RATE = 0.3
@@ -36,8 +56,8 @@ class AttitudeConfig:
     standing_time: float = 0.05
     standing_acceleration: float = 0.1
     standing_rate: float = 3.0e-3
-    # How level the sole of a standing foot is (standard deviation [rad]): the legs then tell the tilt as well, on level ground. 0 does not use
-    # them, as the paper.
+    # How level the sole of a standing foot is (standard deviation [rad]): the legs then tell the tilt as well, on level ground. 0 does not
+    # use them, as the paper.
     level_feet: float = 2.0e-3
     # How long a foot keeps its error [s].
     stance_time: float = 0.5
@@ -58,68 +78,7 @@ class AttitudeConfig:
                 raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
 
 
-def cross(a: Vector, b: Vector) -> Vector:
-    """a x b. (On floats: for single vectors that is many times faster than numpy.)"""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """a * b of quaternions [w, x, y, z]."""
-    w, x, y, z = a
-    s, i, j, k = b
-    return w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i, w * k + x * j - y * i + z * s
-
-
-def rotation_vector_to_quaternion(r: Vector) -> Quaternion:
-    """Quaternion of a rotation by |r| [rad] about r."""
-    half = 0.5 * math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
-    scale = 0.5 if half < 1e-8 else math.sin(half) / (2.0 * half)
-    return math.cos(half), scale * r[0], scale * r[1], scale * r[2]
-
-
-def normalized(q: Quaternion) -> Quaternion:
-    """The norm correction: the quaternion of unit length in q's direction."""
-    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
-
-
-def yaw_of(q: Quaternion) -> float:
-    """z-Euler angle of a quaternion (z-y-x order) [rad]."""
-    w, x, y, z = q
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-def quaternion_from_gravity(up: Vector, yaw: float) -> Quaternion:
-    """Quaternion with the x- and y-Euler angles that make `up` vertical, and this z-Euler angle.
-
-    Args:
-        up: direction of the specific force at rest, in the rotated frame, any length.
-    """
-    roll = math.atan2(up[1], up[2])
-    pitch = math.atan2(-up[0], math.hypot(up[1], up[2]))
-    cr, sr, cp, sp, cy, sy = (f(0.5 * angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def rotation_matrix(q: Quaternion) -> np.ndarray:
-    """Matrix of a unit quaternion, shape (3, 3)."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-@dataclass(frozen=True)
-class GravityEstimate:
+class GravityEstimate(NamedTuple):
     """State of the gravity filter, in IMU axes [m/s^2]. The three axes share one covariance, for states and noise are isotropic."""
 
     # Specific force of rest (minus gravity), linear acceleration, accelerometer bias.
@@ -129,64 +88,68 @@ class GravityEstimate:
     # Upper triangle of the covariance of one axis: gg, ga, gb, aa, ab, bb.
     covariance: tuple[float, float, float, float, float, float]
     # Measured minus predicted specific force, and its variance per axis.
-    innovation: Vector = (0.0, 0.0, 0.0)
-    innovation_variance: float = 0.0
+    innovation: Vector
+    innovation_variance: float
 
 
-def start_gravity(config: AttitudeConfig, specific_force: Vector) -> GravityEstimate:
+@njit(cache=True)
+def start_gravity(specific_force: Vector, acceleration_variance: float, bias_variance: float, noise_variance: float) -> GravityEstimate:
     """Decomposes the first reading by the pseudo-inverse, weighted with how large each part may be.
 
     (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all of it where it belongs.)
+
+    Args:
+        acceleration_variance, bias_variance, noise_variance: how large the robot's acceleration, the accelerometer's bias and its noise
+            may be, per axis [m^2/s^4].
     """
-    prior = (9.81**2, config.standing_acceleration**2, config.acceleration_bias**2)
-    total = sum(prior) + config.acceleration_noise**2
-    parts = [tuple(variance / total * y for y in specific_force) for variance in prior]
+    g, a, b = 9.81**2, acceleration_variance, bias_variance
+    total = g + a + b + noise_variance
     # Covariance of one axis given the reading.
-    g, a, b = prior
     covariance = (g - g * g / total, -g * a / total, -g * b / total, a - a * a / total, -a * b / total, b - b * b / total)
-    return GravityEstimate(parts[0], parts[1], parts[2], covariance)
+    parts = scale(g / total, specific_force), scale(a / total, specific_force), scale(b / total, specific_force)
+    return GravityEstimate(parts[0], parts[1], parts[2], covariance, (0.0, 0.0, 0.0), 0.0)
 
 
+@njit(cache=True)
 def predict_gravity(
-    config: AttitudeConfig, x: GravityEstimate, w: Vector, rate_variance: float, motion_acceleration: float, elapsed: float
+    x: GravityEstimate, w: Vector, rate_variance: float, motion_acceleration: float, motion_time: float, elapsed: float
 ) -> GravityEstimate:
     """Gravity and linear acceleration turn with the IMU; the acceleration fades as a first-order Gauss-Markov process.
 
     Args:
         w: angular velocity [rad/s].
         rate_variance: variance of w [(rad/s)^2].
-        motion_acceleration: standard deviation of the linear acceleration [m/s^2].
+        motion_acceleration, motion_time: standard deviation of the linear acceleration [m/s^2], and how long it keeps its direction [s].
         elapsed: time step [s].
     """
-    fade = math.exp(-elapsed / config.motion_time)
-    turned_g, turned_a = cross(x.gravity, w), cross(x.acceleration, w)
-    gravity = tuple(g + elapsed * t for g, t in zip(x.gravity, turned_g, strict=True))
-    acceleration = tuple(fade * (a + elapsed * t) for a, t in zip(x.acceleration, turned_a, strict=True))
+    fade = math.exp(-elapsed / motion_time)
+    gravity = add(x.gravity, scale(elapsed, cross(x.gravity, w)))
+    acceleration = scale(fade, add(x.acceleration, scale(elapsed, cross(x.acceleration, w))))
     gg, ga, gb, aa, ab, bb = x.covariance
     gg += (9.81 * elapsed) ** 2 * rate_variance
     aa = fade * fade * aa + (1 - fade * fade) * motion_acceleration**2
-    return GravityEstimate(gravity, acceleration, x.bias, (gg, fade * ga, gb, aa, fade * ab, bb))
+    return GravityEstimate(gravity, acceleration, x.bias, (gg, fade * ga, gb, aa, fade * ab, bb), x.innovation, x.innovation_variance)
 
 
-def update_gravity(config: AttitudeConfig, x: GravityEstimate, specific_force: Vector) -> GravityEstimate:
+@njit(cache=True)
+def update_gravity(x: GravityEstimate, specific_force: Vector, noise_variance: float) -> GravityEstimate:
     """Kalman update with y = gravity + acceleration + bias + noise."""
     gg, ga, gb, aa, ab, bb = x.covariance
     pg, pa, pb = gg + ga + gb, ga + aa + ab, gb + ab + bb
-    S = pg + pa + pb + config.acceleration_noise**2
+    S = pg + pa + pb + noise_variance
     kg, ka, kb = pg / S, pa / S, pb / S
-    e = tuple(y - g - a - b for y, g, a, b in zip(specific_force, x.gravity, x.acceleration, x.bias, strict=True))
+    e = subtract(subtract(subtract(specific_force, x.gravity), x.acceleration), x.bias)
     return GravityEstimate(
-        tuple(g + kg * v for g, v in zip(x.gravity, e, strict=True)),
-        tuple(a + ka * v for a, v in zip(x.acceleration, e, strict=True)),
-        tuple(b + kb * v for b, v in zip(x.bias, e, strict=True)),
+        add(x.gravity, scale(kg, e)),
+        add(x.acceleration, scale(ka, e)),
+        add(x.bias, scale(kb, e)),
         (gg - kg * pg, ga - kg * pa, gb - kg * pb, aa - ka * pa, ab - ka * pb, bb - kb * pb),
         e,
         S,
     )
 
 
-@dataclass(frozen=True)
-class QuaternionEstimate:
+class QuaternionEstimate(NamedTuple):
     """State of the quaternion filter. Attitude error and gyro bias are isotropic and share one 2 x 2 covariance for all axes."""
 
     # Attitude of the IMU in the world.
@@ -196,22 +159,25 @@ class QuaternionEstimate:
     # Covariance of [attitude error, bias error] of one axis: [rad^2], [rad^2/s], [rad^2/s^2].
     covariance: tuple[float, float, float]
     # Rotation from the predicted to the measured quaternion [rad], and its variance per axis.
-    innovation: Vector = (0.0, 0.0, 0.0)
-    innovation_variance: float = 0.0
+    innovation: Vector
+    innovation_variance: float
 
 
-def predict_quaternion(config: AttitudeConfig, x: QuaternionEstimate, w: Vector, elapsed: float) -> QuaternionEstimate:
-    """Turns the quaternion with the gyro, free of its bias."""
-    turn = tuple(elapsed * (rate - b) for rate, b in zip(w, x.bias, strict=True))
+@njit(cache=True)
+def predict_quaternion(x: QuaternionEstimate, w: Vector, noise_variance: float, elapsed: float) -> QuaternionEstimate:
+    """Turns the quaternion with the gyro, free of its bias.
+
+    Args:
+        noise_variance: of w [(rad/s)^2].
+    """
+    turn = scale(elapsed, subtract(w, x.bias))
     pp, pb, bb = x.covariance
-    covariance = (
-        pp - 2 * elapsed * pb + elapsed**2 * (bb + config.angular_velocity_noise**2),
-        pb - elapsed * bb,
-        bb,
-    )
-    return QuaternionEstimate(quaternion_product(x.q, rotation_vector_to_quaternion(turn)), x.bias, covariance)
+    covariance = (pp - 2 * elapsed * pb + elapsed**2 * (bb + noise_variance), pb - elapsed * bb, bb)
+    q = quaternion_product(x.q, rotation_vector_to_quaternion(turn))
+    return QuaternionEstimate(q, x.bias, covariance, x.innovation, x.innovation_variance)
 
 
+@njit(cache=True)
 def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float) -> QuaternionEstimate:
     """Extended Kalman update with a measured quaternion, written for the small rotation between prediction and measurement,
     followed by the norm correction; q and -q count as the same attitude.
@@ -221,19 +187,178 @@ def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: flo
         correlated: number of ticks for which its error lasts; so many measurements count as one.
     """
     w, i, j, k = quaternion_product((x.q[0], -x.q[1], -x.q[2], -x.q[3]), measured)
-    sign = 2.0 if w >= 0 else -2.0
-    e = (sign * i, sign * j, sign * k)
+    e = scale(2.0 if w >= 0 else -2.0, (i, j, k))
     pp, pb, bb = x.covariance
     S = pp + variance * max(1.0, correlated)
     kp, kb = pp / S, pb / S
-    turn = rotation_vector_to_quaternion((kp * e[0], kp * e[1], kp * e[2]))
     return QuaternionEstimate(
-        normalized(quaternion_product(x.q, turn)),
-        tuple(b + kb * v for b, v in zip(x.bias, e, strict=True)),
+        normalized(quaternion_product(x.q, rotation_vector_to_quaternion(scale(kp, e)))),
+        add(x.bias, scale(kb, e)),
         (pp - kp * pp, pb - kp * pb, bb - kb * pb),
         e,
         pp + variance,
     )
+
+
+@njit(cache=True)
+def stand_still(
+    x: QuaternionEstimate, measured: Quaternion, tilt_variance: float, w: Vector, noise_variance: float, own_rate_variance: float
+) -> QuaternionEstimate:
+    """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias.
+
+    Args:
+        noise_variance: of w [(rad/s)^2].
+        own_rate_variance: of the standing robot's own rate [(rad/s)^2], as it counts in one tick: the rate is the same in all.
+    """
+    bb = x.covariance[2]
+    k = bb / (bb + noise_variance + own_rate_variance)
+    bias = add(x.bias, scale(k, subtract(w, x.bias)))
+    return QuaternionEstimate(measured, bias, (tilt_variance, 0.0, bb - k * bb), x.innovation, x.innovation_variance)
+
+
+@njit(cache=True)
+def level_direction(support: np.ndarray, model: np.ndarray, foot_rotation: int) -> tuple[Vector, float]:
+    """Vertical direction in base axes by the soles that stand, of any length, and how many they are.
+
+    Args:
+        support: (feet,).
+        model: posterior of `FloatingBaseModel`; foot_rotation: where in it.
+    """
+    up, standing = (0.0, 0.0, 0.0), 0.0
+    for foot in range(len(support)):
+        R = foot_rotation + 9 * foot
+        up = add(up, scale(support[foot], (model[R + 2], model[R + 5], model[R + 8])))
+        standing += support[foot]
+    return up, standing
+
+
+@njit(cache=True)
+def _unpack(last: np.ndarray, start: int) -> tuple[GravityEstimate, QuaternionEstimate]:
+    """Both filters' states from a posterior, whose `imu_orientation` starts there."""
+    gravity, q = start + 4, start
+    P = start + 16
+    return GravityEstimate(
+        vector_at(last, gravity),
+        vector_at(last, gravity + 3),
+        vector_at(last, gravity + 6),
+        (last[P], last[P + 1], last[P + 2], last[P + 3], last[P + 4], last[P + 5]),
+        (0.0, 0.0, 0.0),
+        0.0,
+    ), QuaternionEstimate(
+        (last[q], last[q + 1], last[q + 2], last[q + 3]),
+        vector_at(last, gravity + 9),
+        (last[P + 6], last[P + 7], last[P + 8]),
+        (0.0, 0.0, 0.0),
+        0.0,
+    )
+
+
+@njit(cache=True)
+def _estimate_attitude(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    support: np.ndarray,
+    model: np.ndarray,
+    places: tuple[int, ...],
+    R_BI: Rotation,
+    q_IB: Quaternion,
+    config: tuple[float, ...],
+) -> None:
+    """One tick of `AttitudeEstimator`; fills the posterior.
+
+    Args:
+        places: of what is read, see the first lines.
+        config: the values of `AttitudeConfig`.
+    """
+    imu_trust, specific_force, angular_velocity, foot_rotation, age_at, filters_at = places
+    (
+        acceleration_noise,
+        rate_noise,
+        motion_acceleration,
+        motion_time,
+        acceleration_bias,
+        rate_bias,
+        standing_time,
+        standing_acceleration,
+        standing_rate,
+        level_feet,
+        stance_time,
+    ) = config
+    first, trust = math.isnan(elapsed), measured[imu_trust]
+    f, w = vector_at(measured, specific_force), vector_at(measured, angular_velocity)
+    age = 0.0 if first else last[age_at] + elapsed
+    feet_innovation, feet_variance = (0.0, 0.0, 0.0), 0.0
+    if first:
+        if trust > 0:
+            posterior[:] = last
+            posterior[STATUS] = _NOT_FINITE
+            return
+        gravity = start_gravity(f, standing_acceleration**2, acceleration_bias**2, acceleration_noise**2)
+        q = quaternion_from_gravity(gravity.gravity, 0.0)
+        # The base looks ahead, however the IMU sits on it.
+        q = quaternion_product(rotation_vector_to_quaternion((0.0, 0.0, -yaw_of(quaternion_product(q, q_IB)))), q)
+        tilt_variance = gravity.covariance[0] / 9.81**2
+        quaternion = QuaternionEstimate(q, (0.0, 0.0, 0.0), (tilt_variance, 0.0, rate_bias**2), (0.0, 0.0, 0.0), 0.0)
+    else:
+        gravity, quaternion = _unpack(last, filters_at)
+        if trust > 0:
+            # Nobody knows how the robot turns: hold, and let the next good readings have their way.
+            drift = (_UNKNOWN_RATE * elapsed) ** 2
+            gg, ga, gb, aa, ab, bb = gravity.covariance
+            gravity = GravityEstimate(
+                gravity.gravity, gravity.acceleration, gravity.bias, (gg + 9.81**2 * drift, ga, gb, aa, ab, bb), (0.0, 0.0, 0.0), 0.0
+            )
+            pp, pb, bb = quaternion.covariance
+            quaternion = QuaternionEstimate(quaternion.q, quaternion.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
+            w = quaternion.bias
+        else:
+            standing = age <= standing_time
+            # An unknown gyro bias turns gravity the same way for as long as the filter remembers.
+            rate_variance = rate_noise**2 + quaternion.covariance[2] * 2.0 * motion_time / elapsed
+            motion = standing_acceleration if standing else motion_acceleration
+            gravity = predict_gravity(gravity, subtract(w, quaternion.bias), rate_variance, motion, motion_time, elapsed)
+            gravity = update_gravity(gravity, f, acceleration_noise**2)
+            tilt_variance = gravity.covariance[0] / 9.81**2
+            quaternion = predict_quaternion(quaternion, w, rate_noise**2, elapsed)
+            by_gravity = quaternion_from_gravity(gravity.gravity, yaw_of(quaternion.q))
+            up_B, soles = level_direction(support, model, foot_rotation)
+            up_I = rotate_back(R_BI, up_B)
+            use_feet = level_feet > 0 and soles > 0
+            level_variance = level_feet**2 / max(1.0, soles)
+            if standing:
+                measured_q, variance = by_gravity, tilt_variance
+                if use_feet:
+                    measured_q, variance = quaternion_from_gravity(up_I, yaw_of(quaternion.q)), level_variance
+                own_rate_variance = standing_time / elapsed * standing_rate**2
+                quaternion = stand_still(quaternion, measured_q, variance, w, rate_noise**2, own_rate_variance)
+            else:
+                # The gravity filter's error lasts about as long as the trunk's acceleration.
+                quaternion = update_quaternion(quaternion, by_gravity, tilt_variance, 2.0 * motion_time / elapsed)
+                if use_feet:
+                    by_feet = quaternion_from_gravity(up_I, yaw_of(quaternion.q))
+                    x = update_quaternion(quaternion, by_feet, level_variance, 2.0 * stance_time / elapsed)
+                    feet_innovation, feet_variance = x.innovation, x.innovation_variance
+                    quaternion = QuaternionEstimate(x.q, x.bias, x.covariance, quaternion.innovation, quaternion.innovation_variance)
+    # Field by field in the posterior's order, behind its time.
+    q_WB = quaternion_product(quaternion.q, q_IB)
+    posterior[STATUS] = trust
+    end = put(posterior, STATUS + 1, q_WB)
+    end = put(posterior, end, rotation_matrix(q_WB))
+    end = put(posterior, end, rotate(R_BI, subtract(w, quaternion.bias)))
+    end = put(posterior, end, (age,))
+    end = put(posterior, end, quaternion.q)
+    end = put(posterior, end, gravity.gravity)
+    end = put(posterior, end, gravity.acceleration)
+    end = put(posterior, end, gravity.bias)
+    end = put(posterior, end, quaternion.bias)
+    end = put(posterior, end, gravity.covariance)
+    end = put(posterior, end, quaternion.covariance)
+    end = put(posterior, end, gravity.innovation)
+    end = put(posterior, end, quaternion.innovation)
+    end = put(posterior, end, feet_innovation)
+    put(posterior, end, (gravity.innovation_variance, quaternion.innovation_variance, feet_variance))
 
 
 class AttitudeEstimator(RecursiveEstimator):
@@ -264,6 +389,7 @@ class AttitudeEstimator(RecursiveEstimator):
     def __init__(self, config: AttitudeConfig, robot: Robot, measurements: dict[str, slice], model: dict[str, slice], clock: Clock):
         super().__init__(
             {
+                "status": 1,
                 "orientation": 4,
                 "rotation": 9,
                 "angular_velocity": 3,
@@ -279,124 +405,21 @@ class AttitudeEstimator(RecursiveEstimator):
             },
             clock,
         )
-        self._config, self._inputs = config, measurements
-        self._R_BI = ImuMount(robot).R_BI
-        self._q_IB = quaternion_of_matrix(self._R_BI.T)
-        self._foot_rotation = model["foot_rotation"]
+        self._places = (
+            measurements["trust"].start + 1,
+            *starts(measurements, "specific_force", "angular_velocity"),
+            *starts(model, "foot_rotation"),
+            *starts(self.fields.slices, "age", "imu_orientation"),
+        )
+        R_BI = ImuMount(robot).R_BI
+        self._R_BI = tuple(R_BI.ravel().tolist())
+        self._q_IB = tuple(RotationMatrix(R_BI.T).ToQuaternion().wxyz().tolist())
+        self._config = tuple(float(value) for value in astuple(config))
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._support = self.DeclareVectorInputPort("support", len(robot.description.sides))
         self._model = self.DeclareVectorInputPort("model", max(part.stop for part in model.values()))
         self._declare_posterior("measurements", "support", "model")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        config = self._config
-        measured = self._measurements.Eval(context)
-        trust = measured[self._inputs["trust"]][1]
-        f = tuple(measured[self._inputs["specific_force"]].tolist())
-        w = tuple(measured[self._inputs["angular_velocity"]].tolist())
-        feet = ((0.0, 0.0, 0.0), 0.0)
-        age = 0.0 if math.isnan(elapsed) else float(last[self.fields["age"].start]) + elapsed
-        if math.isnan(elapsed):
-            if trust:
-                return np.concatenate([[Status.NOT_FINITE], last[1:]])
-            gravity = start_gravity(config, f)
-            q = quaternion_from_gravity(gravity.gravity, 0.0)
-            tilt = gravity.covariance[0] / 9.81**2
-            quaternion = QuaternionEstimate(q, (0.0, 0.0, 0.0), (tilt, 0.0, config.angular_velocity_bias**2))
-        else:
-            gravity, quaternion = self._unpack(last)
-            if trust:
-                # Nobody knows how the robot turns: hold, and let the next good readings have their way.
-                gg, pp = gravity.covariance[0], quaternion.covariance[0]
-                drift = (_UNKNOWN_RATE * elapsed) ** 2
-                gravity = GravityEstimate(
-                    gravity.gravity, gravity.acceleration, gravity.bias, (gg + 9.81**2 * drift, *gravity.covariance[1:])
-                )
-                quaternion = QuaternionEstimate(quaternion.q, quaternion.bias, (pp + drift, *quaternion.covariance[1:]))
-                w = quaternion.bias
-            else:
-                standing = age <= config.standing_time
-                rate = tuple(x - b for x, b in zip(w, quaternion.bias, strict=True))
-                # An unknown gyro bias turns gravity the same way for as long as the filter remembers.
-                rate_variance = config.angular_velocity_noise**2 + quaternion.covariance[2] * 2.0 * config.motion_time / elapsed
-                motion = config.standing_acceleration if standing else config.motion_acceleration
-                gravity = update_gravity(config, predict_gravity(config, gravity, rate, rate_variance, motion, elapsed), f)
-                tilt_variance = gravity.covariance[0] / 9.81**2
-                quaternion = predict_quaternion(config, quaternion, w, elapsed)
-                measured_q = quaternion_from_gravity(gravity.gravity, yaw_of(quaternion.q))
-                level = self._level_feet(context)
-                if standing and level is not None:
-                    level_q = quaternion_from_gravity(level[0], yaw_of(quaternion.q))
-                    quaternion = self._stand(quaternion, level_q, level[1], w, elapsed)
-                elif standing:
-                    quaternion = self._stand(quaternion, measured_q, tilt_variance, w, elapsed)
-                else:
-                    # The gravity filter's error lasts about as long as the trunk's acceleration.
-                    quaternion = update_quaternion(quaternion, measured_q, tilt_variance, 2.0 * config.motion_time / elapsed)
-                    if level is not None:
-                        by_gravity, level_q = quaternion, quaternion_from_gravity(level[0], yaw_of(quaternion.q))
-                        quaternion = update_quaternion(quaternion, level_q, level[1], 2.0 * config.stance_time / elapsed)
-                        feet = quaternion.innovation, quaternion.innovation_variance
-                        quaternion = replace(
-                            quaternion, innovation=by_gravity.innovation, innovation_variance=by_gravity.innovation_variance
-                        )
-        return self._pack(trust, w, age, gravity, quaternion, feet)
-
-    def _stand(self, x: QuaternionEstimate, measured: Quaternion, tilt_variance: float, w: Vector, elapsed: float) -> QuaternionEstimate:
-        """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias."""
-        config, bb = self._config, x.covariance[2]
-        # The standing robot's own rate is the same in all the ticks.
-        ticks = config.standing_time / elapsed
-        k = bb / (bb + config.angular_velocity_noise**2 + ticks * config.standing_rate**2)
-        bias = tuple(b + k * (rate - b) for b, rate in zip(x.bias, w, strict=True))
-        return QuaternionEstimate(measured, bias, (tilt_variance, 0.0, bb - k * bb))
-
-    def _level_feet(self, context: Context) -> tuple[Vector, float] | None:
-        """Vertical direction in IMU axes by the soles that stand, and its variance [rad^2]; None if nothing stands."""
-        if self._config.level_feet == 0:
-            return None
-        support = self._support.Eval(context)
-        standing = support.sum()
-        if standing == 0:
-            return None
-        normals_B = self._model.Eval(context)[self._foot_rotation].reshape(-1, 3, 3)[:, :, 2]
-        up = ((support @ normals_B) @ self._R_BI).tolist()
-        return (up[0], up[1], up[2]), self._config.level_feet**2 / standing
-
-    def _unpack(self, last: np.ndarray) -> tuple[GravityEstimate, QuaternionEstimate]:
-        x = last[self.fields["imu_orientation"].start : self.fields["covariance"].stop].tolist()
-        gravity = GravityEstimate(tuple(x[4:7]), tuple(x[7:10]), tuple(x[10:13]), tuple(x[16:22]))
-        return gravity, QuaternionEstimate(tuple(x[0:4]), tuple(x[13:16]), tuple(x[22:25]))
-
-    def _pack(
-        self, status: float, w: Vector, age: float, gravity: GravityEstimate, quaternion: QuaternionEstimate, feet: tuple[Vector, float]
-    ) -> np.ndarray:
-        q_WB = quaternion_product(quaternion.q, self._q_IB)
-        rate = [x - b for x, b in zip(w, quaternion.bias, strict=True)]
-        return np.array(
-            [
-                status,
-                *q_WB,
-                *rotation_matrix(q_WB).ravel().tolist(),
-                *(self._R_BI @ rate),
-                age,
-                *quaternion.q,
-                *gravity.gravity,
-                *gravity.acceleration,
-                *gravity.bias,
-                *quaternion.bias,
-                *gravity.covariance,
-                *quaternion.covariance,
-                *gravity.innovation,
-                *quaternion.innovation,
-                *feet[0],
-                gravity.innovation_variance,
-                quaternion.innovation_variance,
-                feet[1],
-            ]
-        )
-
-
-def quaternion_of_matrix(R: np.ndarray) -> Quaternion:
-    """Unit quaternion of a rotation matrix."""
-    return tuple(RotationMatrix(R).ToQuaternion().wxyz().tolist())
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured, support, model = self._measurements.Eval(context), self._support.Eval(context), self._model.Eval(context)
+        _estimate_attitude(posterior, last, elapsed, measured, support, model, self._places, self._R_BI, self._q_IB, self._config)

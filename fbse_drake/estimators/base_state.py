@@ -1,17 +1,32 @@
 """Position and velocity of CoM and base: the paper's adaptive Kalman filter on the LIPM, and leg kinematics fused with the IMU."""
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
-from fbse_drake.robot.plant import Robot, grasp_map
+from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
+from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
+from fbse_drake.estimators.spatial import (
+    Rotation,
+    Vector,
+    add,
+    cross,
+    put,
+    rotate,
+    rotate_back,
+    rotation_at,
+    scale,
+    subtract,
+    vector_at,
+)
+from fbse_drake.robot.plant import Robot
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,79 @@ def update_lipm(
     return LipmEstimate(x, P, Adaptation(np.abs(Q), R, mean_residual, mean_correction), e, S)  # (27)
 
 
+class LegOdometry(NamedTuple):
+    """The base seen through the legs that stand."""
+
+    # Does any foot stand whose sensors, and the encoders, are trusted? Without one, position and velocity mean nothing.
+    stands: bool
+    # Of the base's origin in the world [m], [m/s].
+    position: Vector
+    velocity: Vector
+
+
+@njit(cache=True)
+def _follow_legs(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    R_WB: Rotation,
+    model: np.ndarray,
+    support: np.ndarray,
+    pad_position: np.ndarray,
+    pad_foot: np.ndarray,
+    places: tuple[int, ...],
+    origin: Vector,
+) -> LegOdometry:
+    """Starts a posterior of `BaseStateEstimator` as a copy of the last; anchors the feet that land; ZMP from the foot forces (eqs. 8, 9).
+
+    Args:
+        places: of what is read and written, see the first lines.
+        origin: where the middle of the soles is at the start [m].
+    """
+    trust, pad_force, foot_position, foot_rotation, foot_jacobian, velocity_start, velocity_stop = places[:7]
+    base_position, zmp_at, anchors, standing = places[7:]
+    first, feet, v = math.isnan(elapsed), len(support), velocity_stop - velocity_start
+    posterior[:] = last
+    posterior[STATUS] = measured[trust : trust + 2 + feet].max()
+    if first:
+        # The soles' middle is where it is said to be.
+        middle = (0.0, 0.0, 0.0)
+        for foot in range(feet):
+            middle = add(middle, scale(1.0 / feet, vector_at(model, foot_position + 3 * foot)))
+        put(posterior, base_position, subtract(origin, rotate(R_WB, middle)))
+    wrench = foot_wrenches(measured[pad_force:], pad_position, pad_foot, feet)
+    total, zmp_x, zmp_y = 0.0, 0.0, 0.0
+    position, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for foot in range(feet):
+        anchor_at, p_BF = anchors + 3 * foot, rotate(R_WB, vector_at(model, foot_position + 3 * foot))  # world axes
+        if first or (support[foot] > 0 and not last[standing + foot] > 0):
+            landed = add(vector_at(posterior, base_position), p_BF)
+            put(posterior, anchor_at, (landed[0], landed[1], 0.0))
+        posterior[standing + foot] = support[foot]
+        # Feet that stand count with their load.
+        load = wrench[foot, 5]
+        if support[foot] > 0 and measured[trust + 2 + foot] == 0 and load > 1.0:
+            anchor, R_BF = vector_at(posterior, anchor_at), rotation_at(model, foot_rotation + 9 * foot)
+            centre_of_pressure = rotate(R_WB, rotate(R_BF, (-wrench[foot, 1] / load, wrench[foot, 0] / load, 0.0)))
+            zmp_x += load * (anchor[0] + centre_of_pressure[0])
+            zmp_y += load * (anchor[1] + centre_of_pressure[1])
+            position = add(position, scale(load, subtract(anchor, p_BF)))
+            row = foot_jacobian + (6 * foot + 3) * v
+            vx, vy, vz = 0.0, 0.0, 0.0
+            for j in range(v):
+                rate = model[velocity_start + j]
+                vx += model[row + j] * rate
+                vy += model[row + v + j] * rate
+                vz += model[row + 2 * v + j] * rate
+            velocity = subtract(velocity, scale(load, rotate(R_BF, (vx, vy, vz))))
+            total += load
+    if total > 0:
+        posterior[zmp_at], posterior[zmp_at + 1] = zmp_x / total, zmp_y / total
+        position, velocity = scale(1.0 / total, position), scale(1.0 / total, rotate(R_WB, velocity))
+    return LegOdometry(total > 0 and measured[trust] == 0, position, velocity)
+
+
 class BaseStateEstimator(RecursiveEstimator):
     """What both estimators of the base state share: feet that stand anchor the robot in the world.
 
@@ -159,6 +247,7 @@ class BaseStateEstimator(RecursiveEstimator):
         feet = len(robot.description.sides)
         super().__init__(
             {
+                "status": 1,
                 "base_position": 3,
                 "base_velocity": 3,
                 "com_position": 3,
@@ -170,96 +259,20 @@ class BaseStateEstimator(RecursiveEstimator):
             },
             clock,
         )
-        self._measured, self._attitude, self._model = measurements, attitude, model
-        self._origin, self._mount = np.array([*origin, 0.0]), ImuMount(robot)
-        self._gravity = robot.plant.gravity_field().gravity_vector()
-        self._grasp = [grasp_map(robot.pad_positions(side)) for side in robot.description.sides]
-        counts = np.cumsum([0, *(3 * len(leg.pads) for leg in robot.description.legs.values())])
-        start = measurements["pad_force"].start
-        self._pads = [slice(start + int(a), start + int(b)) for a, b in zip(counts, counts[1:], strict=False)]
-        self._feet, self._velocities = feet, 6 + len(robot.joint_names)
+        self._mount, self._pads, self._origin = ImuMount(robot), FootPads(robot), (*origin, 0.0)
+        self._gravity: Vector = tuple(robot.plant.gravity_field().gravity_vector().tolist())
+        self._leg_places = (
+            *starts(measurements, "trust", "pad_force"),
+            *starts(model, "foot_position", "foot_rotation", "foot_jacobian", "velocity"),
+            model["velocity"].stop,
+            *starts(self.fields.slices, "base_position", "zmp", "anchors", "standing"),
+        )
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         self.DeclareVectorInputPort("support", feet)
-        self._ports = [self.GetInputPort(name) for name in ("measurements", "attitude", "model", "support")]
-        self._declare_posterior("measurements", "attitude", "model", "support")
-
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        measured, attitude, model, support = (port.Eval(context) for port in self._ports)
-        trust = measured[self._measured["trust"]].tolist()
-        fields = self.fields
-        R_WB = attitude[self._attitude["rotation"]].reshape(3, 3)
-        p_BF = model[self._model["foot_position"]].reshape(-1, 3) @ R_WB.T  # world axes from here on
-        first = math.isnan(elapsed)
-        posterior = last.copy()
-        if first:
-            # The soles' middle is where it is said to be.
-            posterior[fields["base_position"]] = self._origin - p_BF.mean(axis=0)
-        anchors = posterior[fields["anchors"]].reshape(-1, 3)
-        standing = last[fields["standing"]]
-        touchdown = (support > 0) & ~(standing > 0)
-        if first or touchdown.any():
-            landed = posterior[fields["base_position"]] + p_BF
-            landed[:, 2] = 0.0
-            fresh = np.ones(self._feet, dtype=bool) if first else touchdown
-            anchors[fresh] = landed[fresh]
-        posterior[fields["standing"]] = support
-        posterior[0] = max(trust)
-        # Leg kinematics of the feet that stand, weighted with their load.
-        load, zmp, total = [], np.zeros(2), 0.0
-        R_BF = model[self._model["foot_rotation"]].reshape(-1, 3, 3)
-        for k in range(self._feet):
-            moment_x, moment_y, _, _, _, vertical = (self._grasp[k] @ measured[self._pads[k]]).tolist()
-            usable = support[k] > 0 and not trust[2 + k] and vertical > 1.0
-            load.append(vertical if usable else 0.0)
-            if usable:
-                cop = R_WB @ (R_BF[k] @ np.array([-moment_y / vertical, moment_x / vertical, 0.0]))
-                zmp += vertical * (anchors[k] + cop)[:2]
-                total += vertical
-        posterior[fields["zmp"]] = zmp / total if total > 0 else last[fields["zmp"]]
-        stands = total > 0 and not trust[0]
-        position = velocity = np.zeros(3)
-        if stands:
-            share = np.array(load) / total
-            position = share @ (anchors - p_BF)
-            J = model[self._model["foot_jacobian"]].reshape(self._feet, 6, self._velocities)
-            v_F = J[:, 3:] @ model[self._model["velocity"]]
-            velocity = -(R_WB @ (share[:, None] * (R_BF @ v_F[:, :, None])[:, :, 0]).sum(axis=0))
-        offset = -(R_WB @ model[self._model["com"]])  # c_offset: from CoM to base
-        w_W = R_WB @ attitude[self._attitude["angular_velocity"]]
-        self._estimate(
-            posterior,
-            first=first,
-            elapsed=elapsed,
-            specific_force=None if trust[1] else measured[self._measured["specific_force"]],
-            kinematics=(position, velocity) if stands else None,
-            R_WB=R_WB,
-            w_W=w_W,
-            offset=offset,
-        )
-        return posterior
-
-    @abstractmethod
-    def _estimate(
-        self,
-        posterior: np.ndarray,
-        *,
-        first: bool,
-        elapsed: float,
-        specific_force: np.ndarray | None,
-        kinematics: tuple[np.ndarray, np.ndarray] | None,
-        R_WB: np.ndarray,
-        w_W: np.ndarray,
-        offset: np.ndarray,
-    ) -> None:
-        """Puts this tick's estimate into `posterior`.
-
-        Args:
-            specific_force: the IMU's, in its axes [m/s^2]; None while it is not trusted.
-            kinematics: position and velocity of the base seen through the legs that stand; None when nothing stands.
-            w_W: angular velocity in world axes [rad/s].
-            offset: c_offset, from CoM to base in world axes [m].
-        """
+        names = ("measurements", "attitude", "model", "support")
+        self._measurements, self._attitude, self._model, self._support = (self.GetInputPort(name) for name in names)
+        self._declare_posterior(*names)
 
 
 class AdaptiveLipmEstimator(BaseStateEstimator):
@@ -281,7 +294,16 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
     `imu_acceleration` (3,) of the last tick.
     """
 
-    def __init__(self, config: AdaptiveLipm, *shared: object):
+    def __init__(
+        self,
+        config: AdaptiveLipm,
+        robot: Robot,
+        measurements: dict[str, slice],
+        attitude: dict[str, slice],
+        model: dict[str, slice],
+        clock: Clock,
+        origin: tuple[float, float],
+    ):
         further = {
             "state": 6,
             "covariance": 18,
@@ -294,34 +316,43 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
             "rate": 3,
             "imu_acceleration": 3,
         }
-        super().__init__(*shared, further)  # type: ignore[arg-type]
+        super().__init__(robot, measurements, attitude, model, clock, origin, further)
         self._config = config
+        self._imu_trust, self._specific_force = measurements["trust"].start + 1, measurements["specific_force"]
+        self._rotation, self._angular_velocity, self._com = attitude["rotation"], attitude["angular_velocity"], model["com"]
 
-    def _estimate(
-        self,
-        posterior: np.ndarray,
-        *,
-        first: bool,
-        elapsed: float,
-        specific_force: np.ndarray | None,
-        kinematics: tuple[np.ndarray, np.ndarray] | None,
-        R_WB: np.ndarray,
-        w_W: np.ndarray,
-        offset: np.ndarray,
-    ) -> None:
-        fields, config = self.fields, self._config
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
+        model, support = self._model.Eval(context), self._support.Eval(context)
+        first, fields, config = math.isnan(elapsed), self.fields, self._config
+        R_WB = attitude[self._rotation].reshape(3, 3)
+        legs = _follow_legs(
+            posterior,
+            last,
+            elapsed,
+            measured,
+            tuple(R_WB.ravel().tolist()),
+            model,
+            support,
+            self._pads.position,
+            self._pads.foot,
+            self._leg_places,
+            self._origin,
+        )
+        offset = -(R_WB @ model[self._com])  # c_offset: from CoM to base
+        w_W = R_WB @ attitude[self._angular_velocity]
         w_dot = np.zeros(3) if first else (w_W - posterior[fields["rate"]]) / elapsed
         # From the IMU to the CoM: minus the sum of (16), whose sign is wrong in print.
         arm = -(R_WB @ self._mount.p_BI + offset)
         acceleration = posterior[fields["imu_acceleration"]].copy()
-        if specific_force is not None:
-            acceleration = R_WB @ (self._mount.R_BI @ specific_force) + self._gravity
+        if measured[self._imu_trust] == 0:
+            acceleration = R_WB @ (self._mount.R_BI @ measured[self._specific_force]) + self._gravity
             acceleration += np.cross(w_dot, arm) + np.cross(w_W, np.cross(w_W, arm))  # (16)
         change = np.zeros(3) if first else acceleration - posterior[fields["imu_acceleration"]]
         posterior[fields["rate"]], posterior[fields["imu_acceleration"]] = w_W, acceleration
         base_z, velocity_z = posterior[fields["base_position"]][2], posterior[fields["base_velocity"]][2]
-        if kinematics is not None:
-            base_z, velocity_z = kinematics[0][2], kinematics[1][2]
+        if legs.stands:
+            base_z, velocity_z = legs.position[2], legs.velocity[2]
         height = base_z - offset[2]
         parts = {name: posterior[fields[name]].reshape(2, -1) for name in ("state", "covariance", "process_noise", "mean_correction")}
         for axis in range(2):
@@ -331,7 +362,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
                 parts["process_noise"][axis] = config.process_noise
                 posterior[fields["measurement_noise"]][axis] = config.measurement_noise
                 continue
-            if kinematics is None:
+            if not legs.stands:
                 # No load, no ZMP: predict only.
                 A = np.array([[1.0, elapsed, 0.5 * elapsed**2], [0.0, 1.0, elapsed], [0.0, 0.0, 1.0]])
                 parts["state"][axis] = A @ parts["state"][axis] + [0.0, 0.0, change[axis]]
@@ -344,7 +375,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
             )
             last = LipmEstimate(parts["state"][axis], parts["covariance"][axis].reshape(3, 3), adaptation)
             zmp = float(posterior[fields["zmp"]][axis])
-            new = update_lipm(config, last, float(change[axis]), zmp, height, -float(self._gravity[2]), elapsed)
+            new = update_lipm(config, last, float(change[axis]), zmp, height, -self._gravity[2], elapsed)
             parts["state"][axis], parts["covariance"][axis] = new.x, new.P.ravel()
             parts["process_noise"][axis], parts["mean_correction"][axis] = new.adaptation.Q, new.adaptation.mean_correction
             posterior[fields["measurement_noise"]][axis] = new.adaptation.R
@@ -359,8 +390,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
         posterior[fields["base_velocity"]] = [*(c_dot + turning[:2]), velocity_z]  # (33)
 
 
-@dataclass(frozen=True)
-class ContactAidedCovariance:
+class ContactAidedCovariance(NamedTuple):
     """Covariance of position, velocity and acceleration error of the base, the same for all three axes."""
 
     pp: float
@@ -369,6 +399,132 @@ class ContactAidedCovariance:
     vv: float
     va: float
     aa: float
+
+
+class ContactAidedEstimate(NamedTuple):
+    """Position [m] and velocity [m/s] of the base and error of its acceleration [m/s^2], in world axes."""
+
+    position: Vector
+    velocity: Vector
+    acceleration_error: Vector
+    covariance: ContactAidedCovariance
+
+
+@njit(cache=True)
+def predict_contact_aided(
+    x: ContactAidedEstimate, acceleration: Vector, noise: float, error: float, error_time: float, elapsed: float
+) -> ContactAidedEstimate:
+    """Prediction of one axis: p' = p + T v, v' = v - T a, a' = fade a.
+
+    Args:
+        acceleration: of the base, free of its estimated error [m/s^2]; noise: its standard deviation [m/s^2].
+        error, error_time: size of the acceleration's error [m/s^2], and how long it lasts [s].
+        elapsed: time step T [s].
+    """
+    T, fade = elapsed, math.exp(-elapsed / error_time)
+    pp, pv, pa, vv, va, aa = x.covariance
+    pp, pv, pa = pp + T * (2 * pv + T * vv), pv + T * (vv - pa - T * va), fade * (pa + T * va)
+    vv, va, aa = vv + T * (T * aa - 2 * va) + (T * noise) ** 2, fade * (va - T * aa), fade * fade * aa
+    aa += (1 - fade * fade) * error**2
+    return ContactAidedEstimate(
+        add(x.position, add(scale(T, x.velocity), scale(0.5 * T * T, acceleration))),
+        add(x.velocity, scale(T, acceleration)),
+        scale(fade, x.acceleration_error),
+        ContactAidedCovariance(pp, pv, pa, vv, va, aa),
+    )
+
+
+@njit(cache=True)
+def update_position(x: ContactAidedEstimate, innovation: Vector, S: float) -> ContactAidedEstimate:
+    """Kalman update with a measured position; S: variance of the innovation per axis [m^2]."""
+    pp, pv, pa, vv, va, aa = x.covariance
+    kp, kv, ka = pp / S, pv / S, pa / S
+    return ContactAidedEstimate(
+        add(x.position, scale(kp, innovation)),
+        add(x.velocity, scale(kv, innovation)),
+        add(x.acceleration_error, scale(ka, innovation)),
+        ContactAidedCovariance(pp - kp * pp, pv - kp * pv, pa - kp * pa, vv - kv * pv, va - kv * pa, aa - ka * pa),
+    )
+
+
+@njit(cache=True)
+def update_velocity(x: ContactAidedEstimate, innovation: Vector, S: float) -> ContactAidedEstimate:
+    """Kalman update with a measured velocity; S: variance of the innovation per axis [(m/s)^2]."""
+    pp, pv, pa, vv, va, aa = x.covariance
+    kp, kv, ka = pv / S, vv / S, va / S
+    return ContactAidedEstimate(
+        add(x.position, scale(kp, innovation)),
+        add(x.velocity, scale(kv, innovation)),
+        add(x.acceleration_error, scale(ka, innovation)),
+        ContactAidedCovariance(pp - kp * pv, pv - kp * vv, pa - kp * va, vv - kv * vv, va - kv * va, aa - ka * va),
+    )
+
+
+@njit(cache=True)
+def _estimate_base_state(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    attitude: np.ndarray,
+    model: np.ndarray,
+    support: np.ndarray,
+    pad_position: np.ndarray,
+    pad_foot: np.ndarray,
+    leg_places: tuple[int, ...],
+    places: tuple[int, ...],
+    frames: tuple[Vector, Rotation, Vector, Vector],
+    config: tuple[float, ...],
+) -> None:
+    """One tick of `ContactAidedEstimator`; fills the posterior.
+
+    Args:
+        leg_places: see `_follow_legs`; places: of what is read and written besides, see the first lines.
+        frames: where the middle of the soles is at the start, rotation and lever arm of the IMU, gravity.
+        config: the values of `ContactAided`.
+    """
+    imu_trust, specific_force, rotation, angular_velocity, com, base_position, further = places
+    acceleration_noise, position_noise, velocity_noise, acceleration_error, acceleration_error_time = config
+    origin, R_BI, p_BI, gravity = frames
+    R_WB, w_B = rotation_at(attitude, rotation), vector_at(attitude, angular_velocity)
+    legs = _follow_legs(posterior, last, elapsed, measured, R_WB, model, support, pad_position, pad_foot, leg_places, origin)
+    offset = scale(-1.0, rotate(R_WB, vector_at(model, com)))  # c_offset: from CoM to base
+    w_W = rotate(R_WB, w_B)
+    covariance_at, innovation_at, variance_at, rate_at = further + 3, further + 9, further + 15, further + 17
+    P = covariance_at
+    x = ContactAidedEstimate(
+        vector_at(posterior, base_position),
+        vector_at(posterior, base_position + 3),
+        vector_at(posterior, further),
+        ContactAidedCovariance(last[P], last[P + 1], last[P + 2], last[P + 3], last[P + 4], last[P + 5]),
+    )
+    if math.isnan(elapsed):
+        P_first = ContactAidedCovariance(position_noise**2, 0.0, 0.0, velocity_noise**2, 0.0, acceleration_error**2)
+        x = ContactAidedEstimate(x.position, x.velocity, x.acceleration_error, P_first)
+    else:
+        acceleration, noise = (0.0, 0.0, 0.0), _UNKNOWN_ACCELERATION
+        if measured[imu_trust] == 0:
+            w_dot = scale(1.0 / elapsed, rotate_back(R_WB, subtract(w_W, vector_at(last, rate_at))))
+            force = base_specific_force(vector_at(measured, specific_force), w_B, w_dot, R_BI, p_BI)
+            acceleration = subtract(add(rotate(R_WB, force), gravity), x.acceleration_error)
+            noise = acceleration_noise
+        x = predict_contact_aided(x, acceleration, noise, acceleration_error, acceleration_error_time, elapsed)
+        if legs.stands:
+            innovation, S = subtract(legs.position, x.position), x.covariance.pp + position_noise**2
+            x = update_position(x, innovation, S)
+            put(posterior, innovation_at, innovation)
+            posterior[variance_at] = S
+            innovation, S = subtract(legs.velocity, x.velocity), x.covariance.vv + velocity_noise**2
+            x = update_velocity(x, innovation, S)
+            put(posterior, innovation_at + 3, innovation)
+            posterior[variance_at + 1] = S
+    end = put(posterior, base_position, x.position)
+    end = put(posterior, end, x.velocity)
+    end = put(posterior, end, subtract(x.position, offset))
+    put(posterior, end, subtract(x.velocity, cross(w_W, offset)))
+    put(posterior, further, x.acceleration_error)
+    put(posterior, covariance_at, x.covariance)
+    put(posterior, rate_at, w_W)
 
 
 class ContactAidedEstimator(BaseStateEstimator):
@@ -385,69 +541,45 @@ class ContactAidedEstimator(BaseStateEstimator):
         output_ports:
         - posterior
 
-    Further fields: `acceleration_error` (3,) of the IMU in world axes [m/s^2]; `covariance` (6,), see `ContactAidedCovariance`; `innovation`
-    (6,) of position and velocity [m, m/s] and `innovation_variance` (2,) per axis; `rate` (3,) of the last tick.
+    Further fields: `acceleration_error` (3,) of the IMU in world axes [m/s^2]; `covariance` (6,), see `ContactAidedCovariance`;
+    `innovation` (6,) of position and velocity [m, m/s] and `innovation_variance` (2,) per axis; `rate` (3,) of the last tick.
     """
 
-    def __init__(self, config: ContactAided, *shared: object):
-        further = {"acceleration_error": 3, "covariance": 6, "innovation": 6, "innovation_variance": 2, "rate": 3}
-        super().__init__(*shared, further)  # type: ignore[arg-type]
-        self._config = config
-
-    def _estimate(
+    def __init__(
         self,
-        posterior: np.ndarray,
-        *,
-        first: bool,
-        elapsed: float,
-        specific_force: np.ndarray | None,
-        kinematics: tuple[np.ndarray, np.ndarray] | None,
-        R_WB: np.ndarray,
-        w_W: np.ndarray,
-        offset: np.ndarray,
-    ) -> None:
-        fields, config = self.fields, self._config
-        p, v = posterior[fields["base_position"]], posterior[fields["base_velocity"]]
-        error, P = posterior[fields["acceleration_error"]], posterior[fields["covariance"]]
-        if first:
-            P[:] = [config.position_noise**2, 0.0, 0.0, config.velocity_noise**2, 0.0, config.acceleration_error**2]
-        else:
-            pp, pv, pa, vv, va, aa = P.tolist()
-            acceleration, noise = np.zeros(3), _UNKNOWN_ACCELERATION
-            if specific_force is not None:
-                w_B = w_W @ R_WB
-                w_dot = (w_W - posterior[fields["rate"]]) @ R_WB / elapsed
-                acceleration = R_WB @ self._mount.base_specific_force(specific_force, w_B, w_dot) + self._gravity - error
-                noise = config.acceleration_noise
-            T = elapsed
-            p += T * v + (0.5 * T * T) * acceleration
-            v += T * acceleration
-            fade = math.exp(-T / config.acceleration_error_time)
-            error *= fade
-            # Prediction of one axis: p' = p + T v, v' = v - T a, a' = fade a.
-            pp, pv, pa = pp + T * (2 * pv + T * vv), pv + T * (vv - pa - T * va), fade * (pa + T * va)
-            vv, va, aa = vv + T * (T * aa - 2 * va) + (T * noise) ** 2, fade * (va - T * aa), fade * fade * aa
-            aa += (1 - fade * fade) * config.acceleration_error**2
-            if kinematics is not None:
-                innovation = posterior[fields["innovation"]]
-                variance = posterior[fields["innovation_variance"]]
-                S = pp + config.position_noise**2
-                e = kinematics[0] - p
-                innovation[:3], variance[0] = e, S
-                kp, kv, ka = pp / S, pv / S, pa / S
-                p += kp * e
-                v += kv * e
-                error += ka * e
-                pp, pv, pa, vv, va, aa = pp - kp * pp, pv - kp * pv, pa - kp * pa, vv - kv * pv, va - kv * pa, aa - ka * pa
-                S = vv + config.velocity_noise**2
-                e = kinematics[1] - v
-                innovation[3:], variance[1] = e, S
-                kp, kv, ka = pv / S, vv / S, va / S
-                p += kp * e
-                v += kv * e
-                error += ka * e
-                pp, pv, pa, vv, va, aa = pp - kp * pv, pv - kp * vv, pa - kp * va, vv - kv * vv, va - kv * va, aa - ka * va
-            P[:] = pp, pv, pa, vv, va, aa
-        posterior[fields["rate"]] = w_W
-        posterior[fields["com_position"]] = p - offset
-        posterior[fields["com_velocity"]] = v - np.cross(w_W, offset)
+        config: ContactAided,
+        robot: Robot,
+        measurements: dict[str, slice],
+        attitude: dict[str, slice],
+        model: dict[str, slice],
+        clock: Clock,
+        origin: tuple[float, float],
+    ):
+        further = {"acceleration_error": 3, "covariance": 6, "innovation": 6, "innovation_variance": 2, "rate": 3}
+        super().__init__(robot, measurements, attitude, model, clock, origin, further)
+        self._places = (
+            measurements["trust"].start + 1,
+            *starts(measurements, "specific_force"),
+            *starts(attitude, "rotation", "angular_velocity"),
+            *starts(model, "com"),
+            *starts(self.fields.slices, "base_position", "acceleration_error"),
+        )
+        self._frames = (self._origin, self._mount.rotation, self._mount.lever_arm, self._gravity)
+        self._config = tuple(float(value) for value in astuple(config))
+
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        _estimate_base_state(
+            posterior,
+            last,
+            elapsed,
+            self._measurements.Eval(context),
+            self._attitude.Eval(context),
+            self._model.Eval(context),
+            self._support.Eval(context),
+            self._pads.position,
+            self._pads.foot,
+            self._leg_places,
+            self._places,
+            self._frames,
+            self._config,
+        )

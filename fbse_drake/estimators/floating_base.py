@@ -6,13 +6,19 @@ with a constant velocity added to it (Galilean invariance). So neither an error 
 velocity can spoil the link torque.
 """
 
+import math
+
 import numpy as np
+from numba import njit
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
+from fbse_drake.estimators.spatial import Rotation, Vector, add, cross, dot, put, rotate, scale, vector_at
 from fbse_drake.robot.plant import Robot
+
+_ORIGIN = np.zeros(3)
 
 
 class ImuMount:
@@ -20,21 +26,100 @@ class ImuMount:
 
     def __init__(self, robot: Robot):
         X_BI = robot.imu.CalcPose(robot.plant.CreateDefaultContext(), robot.base.body_frame())
-        # Rotation (3, 3) and lever arm (3,) [m].
+        # Rotation (3, 3) and lever arm (3,) [m]; and the two as tuples.
         self.R_BI, self.p_BI = X_BI.rotation().matrix(), X_BI.translation()
-        x, y, z = self.p_BI
-        self._lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self.rotation: Rotation = tuple(self.R_BI.ravel().tolist())
+        self.lever_arm: Vector = tuple(self.p_BI.tolist())
 
-    def base_specific_force(self, specific_force: np.ndarray, w: np.ndarray, w_dot: np.ndarray) -> np.ndarray:
-        """Specific force of the base's origin in base axes, shape (3,) [m/s^2].
 
-        Args:
-            specific_force: of the IMU, in its axes (3,) [m/s^2].
-            w, w_dot: angular velocity and acceleration of the base in base axes (3,) [rad/s, rad/s^2].
-        """
-        # w x (w x p) = (p.w) w - (w.w) p
-        p = self.p_BI
-        return self.R_BI @ specific_force + self._lever @ w_dot - (p @ w) * w + (w @ w) * p
+@njit(cache=True)
+def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector) -> Vector:
+    """Specific force of the base's origin in base axes [m/s^2].
+
+    Args:
+        specific_force: of the IMU, in its axes [m/s^2].
+        w, w_dot: angular velocity and acceleration of the base in base axes [rad/s, rad/s^2].
+        R_BI, p_BI: see `ImuMount`.
+    """
+    # Minus w_dot x p minus w x (w x p), with w x (w x p) = (p.w) w - (w.w) p.
+    turning = add(scale(-dot(p_BI, w), w), scale(dot(w, w), p_BI))
+    return add(add(rotate(R_BI, specific_force), cross(p_BI, w_dot)), turning)
+
+
+@njit(cache=True)
+def _plant_state(
+    state: np.ndarray, measured: np.ndarray, q_index: np.ndarray, v_index: np.ndarray, places: tuple[int, ...], R_BI: Rotation
+) -> None:
+    """Puts joint angles and velocities and the base's angular velocity into a plant's state, in place.
+
+    Args:
+        state: [positions, velocities] of the plant.
+        q_index: place of each joint's angle in it, shape (n,).
+        v_index: place of each of our velocities [base angular, base linear, joints] in it, shape (6 + n,).
+        places: of what is read, see the first line.
+    """
+    joint_position, joint_velocity, angular_velocity = places
+    w = rotate(R_BI, vector_at(measured, angular_velocity))
+    for i in range(3):
+        state[v_index[i]] = w[i]
+    for i in range(len(q_index)):
+        state[q_index[i]], state[v_index[6 + i]] = measured[joint_position + i], measured[joint_velocity + i]
+
+
+@njit(cache=True)
+def _put_dynamics(
+    posterior: np.ndarray,
+    M: np.ndarray,
+    bias: np.ndarray,
+    state: np.ndarray,
+    order: np.ndarray,
+    v_index: np.ndarray,
+    places: tuple[int, ...],
+) -> None:
+    """Puts the joint rows of mass matrix and bias, the centre of mass and the velocity into a posterior of `FloatingBaseModel`.
+
+    Args:
+        M, bias: of the whole plant, in its order of velocities.
+        state: [positions, velocities] of the plant.
+        order: place of each of our velocities in the plant's, shape (6 + n,); v_index: in its state.
+        places: of the fields, see the first line.
+    """
+    mass_matrix, bias_at, com, velocity = places
+    v, posterior[STATUS] = len(order), 0.0
+    for i in range(6, v):
+        row = mass_matrix + (i - 6) * v
+        for j in range(v):
+            posterior[row + j] = M[order[i], order[j]]
+        posterior[bias_at + i - 6] = bias[order[i]]
+    # The base's block of H is [[I, m [c]x], [-m [c]x, m]], for the base stands upright.
+    x, y, z, mass = order[0], order[1], order[2], M[order[3], order[3]]
+    put(posterior, com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
+    for i in range(v):
+        posterior[velocity + i] = state[v_index[i]]
+
+
+@njit(cache=True)
+def _put_foot(
+    posterior: np.ndarray, foot: int, J: np.ndarray, bias: np.ndarray, X_BF: np.ndarray, order: np.ndarray, places: tuple[int, ...]
+) -> None:
+    """Puts the kinematics of a foot into a posterior of `FloatingBaseModel`.
+
+    Args:
+        J: (6, velocities of the plant), bias: (6,), X_BF: (3, 4), see `FloatingBaseModel`.
+        order: place of each of our velocities in the plant's, shape (6 + n,).
+        places: of the fields, see the first line.
+    """
+    foot_jacobian, foot_bias, foot_position, foot_rotation = places
+    v = len(order)
+    for i in range(6):
+        row = foot_jacobian + (6 * foot + i) * v
+        for j in range(v):
+            posterior[row + j] = J[i, order[j]]
+        posterior[foot_bias + 6 * foot + i] = bias[i]
+    for i in range(3):
+        for j in range(3):
+            posterior[foot_rotation + 9 * foot + 3 * i + j] = X_BF[i, j]
+        posterior[foot_position + 3 * foot + i] = X_BF[i, 3]
 
 
 class FloatingBaseModel(RecursiveEstimator):
@@ -51,8 +136,8 @@ class FloatingBaseModel(RecursiveEstimator):
 
     `measurements` is the posterior of a `SensorMonitor`. `posterior` belongs to the present tick; `at_step_start` to the tick before, where
     the step began whose accelerations and forces are measured now. Velocities are ordered [base angular (3), base linear (3), joints (n)]
-    whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but those of a foot, which are in its
-    sole frame F:
+    whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but those of a foot, which are in
+    its sole frame F:
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
         bias            (n,)       joint rows of C v [Nm]
@@ -69,6 +154,7 @@ class FloatingBaseModel(RecursiveEstimator):
         v = 6 + n
         super().__init__(
             {
+                "status": 1,
                 "mass_matrix": n * v,
                 "bias": n,
                 "foot_jacobian": f * 6 * v,
@@ -80,47 +166,33 @@ class FloatingBaseModel(RecursiveEstimator):
             },
             clock,
         )
-        self._robot, self._soles = robot, [robot.sole(side) for side in robot.description.sides]
-        self._R_BI = ImuMount(robot).R_BI
+        self._plant, self._plant_context = robot.plant, robot.plant.CreateDefaultContext()
+        self._world, self._soles = robot.plant.world_frame(), [robot.sole(side) for side in robot.description.sides]
+        self._R_BI = ImuMount(robot).rotation
+        # Place in the plant's velocities, and in its state, of each of ours.
         base = robot.base.floating_velocities_start_in_v()
-        # Place in the plant's velocities of each of ours; fancy indexing is saved where the orders agree.
-        order = np.concatenate([np.arange(base, base + 6), robot.velocity_index])
-        same = len(order) == robot.plant.num_velocities() and (order == np.arange(len(order))).all()
-        self._order = slice(None) if same else order
-        self._rows = slice(6, None) if same else np.ix_(robot.velocity_index, order)
-        self._q = robot.base_pose_positions(RigidTransform())
-        self._plant_context = robot.plant.CreateDefaultContext()
-        self._inputs = measurements
+        self._order = np.concatenate([np.arange(base, base + 6), robot.velocity_index])
+        self._q_index, self._v_index = robot.position_index, robot.plant.num_positions() + self._order
+        self._state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(robot.plant.num_velocities())])
+        self._measured_places = starts(measurements, "joint_position", "joint_velocity", "angular_velocity")
+        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "velocity")
+        self._foot_places = starts(self.fields.slices, "foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
         self.DeclareStateOutputPort("at_step_start", self._last)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        measured, robot = self._measurements.Eval(context), self._robot
-        plant, plant_context = robot.plant, self._plant_context
-        q, velocity = self._q.copy(), np.zeros(6 + len(robot.joint_names))
-        q[robot.position_index] = measured[self._inputs["joint_position"]]
-        velocity[:3] = self._R_BI @ measured[self._inputs["angular_velocity"]]
-        velocity[6:] = measured[self._inputs["joint_velocity"]]
-        v = np.zeros(plant.num_velocities())
-        v[self._order] = velocity
-        plant.SetPositionsAndVelocities(plant_context, np.concatenate([q, v]))
-        world, origin, sole_kinematics = plant.world_frame(), np.zeros(3), []
-        X_WF = [sole.CalcPoseInWorld(plant_context) for sole in self._soles]
-        for sole in self._soles:
-            J = plant.CalcJacobianSpatialVelocity(plant_context, JacobianWrtVariable.kV, sole, origin, world, sole)
-            A = plant.CalcBiasSpatialAcceleration(plant_context, JacobianWrtVariable.kV, sole, origin, world, sole)
-            sole_kinematics.append((J[:, self._order].ravel(), A.get_coeffs()))
-        return np.concatenate(
-            [
-                [0.0],
-                plant.CalcMassMatrix(plant_context)[self._rows].ravel(),
-                plant.CalcBiasTerm(plant_context)[robot.velocity_index],
-                *(J for J, _ in sole_kinematics),
-                *(A for _, A in sole_kinematics),
-                *(X.translation() for X in X_WF),
-                *(X.rotation().matrix().ravel() for X in X_WF),
-                plant.CalcCenterOfMassPositionInWorld(plant_context),
-                velocity,
-            ]
-        )
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
+        plant, now, state, order = self._plant, self._plant_context, self._state, self._order
+        measured = self._measurements.Eval(context)
+        if not math.isfinite(measured.dot(measured)):
+            posterior.fill(math.nan)  # Drake would refuse it.
+            return
+        _plant_state(state, measured, self._q_index, self._v_index, self._measured_places, self._R_BI)
+        plant.SetPositionsAndVelocities(now, state)
+        M, bias = plant.CalcMassMatrix(now), plant.CalcBiasTerm(now)
+        _put_dynamics(posterior, M, bias, state, order, self._v_index, self._places)
+        for foot, sole in enumerate(self._soles):
+            J = plant.CalcJacobianSpatialVelocity(now, JacobianWrtVariable.kV, sole, _ORIGIN, self._world, sole)
+            A = plant.CalcBiasSpatialAcceleration(now, JacobianWrtVariable.kV, sole, _ORIGIN, self._world, sole)
+            X_BF = sole.CalcPoseInWorld(now).GetAsMatrix34()
+            _put_foot(posterior, foot, J, A.get_coeffs(), X_BF, order, self._foot_places)

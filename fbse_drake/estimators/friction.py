@@ -8,12 +8,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.foot_pads import leg_of_joint
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.robot.plant import Robot
 
 
@@ -86,7 +88,7 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 
 @dataclass(frozen=True)
 class FrictionRegressor:
-    """A joint torque effect as a regressor: basis (n, parameters) of a velocity (n,)."""
+    """A joint torque effect as a regressor: basis (parameters, n) of a velocity (n,)."""
 
     effect: type[JointTorqueEffect]
     # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
@@ -105,7 +107,7 @@ class FrictionRegressor:
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
         basis, _ = self.effect.basis(JointMotion(velocity), self.nonlinear)
-        return np.array(basis).T
+        return np.array(basis)
 
 
 def recursive_least_squares(
@@ -159,6 +161,7 @@ class FrictionEstimator(RecursiveEstimator):
         n, m = len(robot.joint_names), self._regressor.parameters
         super().__init__(
             {
+                "status": 1,
                 "friction": n,
                 "parameters": n * m,
                 "parameter_variance": n * m,
@@ -170,14 +173,12 @@ class FrictionEstimator(RecursiveEstimator):
             clock,
         )
         self._measured, self._link_torque, self._n, self._m = measurements, link_torque, n, m
-        sides = list(robot.description.legs.values())
-        # Which leg each joint belongs to.
-        self._leg = np.array([next(k for k, leg in enumerate(sides) if name in leg.joints) for name in robot.joint_names])
+        self._leg = leg_of_joint(robot)
         for name, parts in (("measurements", measurements), ("link_torque", link_torque)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
-        self.DeclareVectorInputPort("support", len(sides))
+        self.DeclareVectorInputPort("support", len(robot.description.sides))
         names = ("measurements", "link_torque", "support")
-        self._ports = [self.GetInputPort(name) for name in names]
+        self._measurements, self._link, self._support = (self.GetInputPort(name) for name in names)
         self._declare_posterior(*names)
 
 
@@ -204,11 +205,11 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         super().__init__(config.model, robot, measurements, link_torque, clock, 0, {"filtered": 2 * n, "age": 1})
         self._config = config
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        measured, link_torque, support = (port.Eval(context) for port in self._ports)
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured, link_torque, support = self._measurements.Eval(context), self._link.Eval(context), self._support.Eval(context)
         config, fields, n, m = self._config, self.fields, self._n, self._m
-        posterior = last.copy()
-        posterior[0] = max(measured[self._measured["trust"]].tolist())
+        posterior[:] = last
+        posterior[STATUS] = max(measured[self._measured["trust"]].tolist())
         parameters = posterior[fields["parameters"]].reshape(n, m)
         P = posterior[fields["covariance"]].reshape(n, m, m)
         if math.isnan(elapsed):
@@ -217,7 +218,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if age == math.inf or (config.reset_period and age >= config.reset_period * (1 - 1e-9)):
             P[:], age = config.covariance * np.eye(m), 0.0
         posterior[fields["age"]] = age
-        phi = self._regressor(measured[self._measured["joint_velocity"]])
+        phi = self._regressor(measured[self._measured["joint_velocity"]]).T
         valid = link_torque[self._link_torque["valid"]] > 0
         if config.swing == "model":
             valid &= support[self._leg] > 0
@@ -239,7 +240,117 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
             posterior[fields["innovation"]], posterior[fields["innovation_variance"]] = innovation * valid, S
         posterior[fields["parameter_variance"]] = np.diagonal(P, axis1=1, axis2=2).ravel()
         posterior[fields["friction"]] = np.where(valid, smooth, (phi * parameters).sum(axis=1))
-        return posterior
+
+
+@njit(cache=True)
+def smooth_velocity(
+    last: np.ndarray, measured: np.ndarray, elapsed: float, n: int, places: tuple[int, int, int], time_constant: float
+) -> np.ndarray:
+    """Low-pass of first order over joint velocities, shape (n,) [rad/s].
+
+    Args:
+        last, measured: posteriors of `ModelAidedEstimator` a tick ago and of `SensorMonitor`.
+        places: of what is read, see the first line.
+        time_constant: of the low-pass [s], 0 does not smooth.
+    """
+    joint_velocity, smoothed, measured_last = places
+    keep, velocity = math.exp(-elapsed / time_constant) if time_constant > 0 else 0.0, np.empty(n)
+    for joint in range(n):
+        # The joint's velocity over the tick is the mean of those at its ends.
+        mean = 0.5 * (measured[joint_velocity + joint] + last[measured_last + joint])
+        velocity[joint] = keep * last[smoothed + joint] + (1 - keep) * mean
+    return velocity
+
+
+@njit(cache=True)
+def _estimate_friction(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    link_torque: np.ndarray,
+    support: np.ndarray,
+    velocity: np.ndarray,
+    phi: np.ndarray,
+    joint_leg: np.ndarray,
+    places: tuple[int, ...],
+    measures_swing: bool,
+    walks: tuple[float, float],
+) -> None:
+    """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint; fills the posterior.
+
+    Args:
+        velocity: that the model sees, shape (n,) [rad/s].
+        phi: the model's regressors, shape (m, n).
+        joint_leg: which leg each joint belongs to, shape (n,).
+        places: of what is read and written, see the first lines.
+        measures_swing: whether the measurement counts while the leg swings.
+        walks: random walks of disturbance and parameters, see `ModelAided`.
+    """
+    trust, joint_velocity, residual, torque_variance, impulse_variance, valid_at = places[:6]
+    friction, parameters, variances, covariance, innovations, innovation_variances, disturbance, impulse_at, smoothed, measured_at = places[
+        6:
+    ]
+    disturbance_walk, parameter_walk = walks
+    m, n = phi.shape
+    size = m + 2
+    regressor, x = np.ones(m + 1), np.empty(m + 1)
+    posterior[STATUS] = measured[trust : trust + 2 + len(support)].max()
+    for joint in range(n):
+        valid = link_torque[valid_at + joint] > 0 and (measures_swing or support[joint_leg[joint]] > 0)
+        # Parameters and disturbance, whose regressor is one.
+        for k in range(m):
+            regressor[k], x[k] = phi[k, joint], last[parameters + joint * m + k]
+        x[m] = last[disturbance + joint]
+        start = covariance + joint * size * size
+        posterior[start : start + size * size] = last[start : start + size * size]
+        P = posterior[start : start + size * size].reshape(size, size)
+        # Prediction: the impulse error grows by the friction's error times the tick.
+        innovation = last[impulse_at + joint] + elapsed * link_torque[residual + joint]
+        added = elapsed**2 * link_torque[torque_variance + joint]
+        for k in range(m + 1):
+            innovation -= elapsed * regressor[k] * x[k]
+        for i in range(size):
+            c = 0.0
+            for k in range(m + 1):
+                c += elapsed * P[i, 1 + k] * regressor[k]
+            P[i, 0] += c
+            if i > 0:
+                added += elapsed * regressor[i - 1] * c
+        # Its own row and column are the same.
+        P[0, 0] += P[0, 0] - last[start] + added
+        P[size - 1, size - 1] += disturbance_walk**2 * elapsed
+        for i in range(1, m + 1):
+            P[0, i] = P[i, 0]
+            P[i, i] += parameter_walk**2 * elapsed
+        P[0, size - 1] = P[size - 1, 0]
+        # Update.
+        column = P[:, 0].copy()
+        S = column[0] + link_torque[impulse_variance + joint]
+        impulse = innovation
+        if valid:
+            for i in range(size):
+                gain = column[i] / S
+                if i == 0:
+                    impulse -= gain * innovation
+                else:
+                    x[i - 1] += gain * innovation
+                for k in range(size):
+                    P[i, k] -= gain * column[k]
+        else:
+            # A joint that is not measured is left to its model.
+            x[m] = impulse = 0.0
+            P[0, :] = 0.0
+            P[:, 0] = 0.0
+        total = 0.0
+        for k in range(m + 1):
+            total += regressor[k] * x[k]
+        for k in range(m):
+            posterior[parameters + joint * m + k], posterior[variances + joint * m + k] = x[k], P[1 + k, 1 + k]
+        posterior[friction + joint] = total
+        posterior[disturbance + joint], posterior[impulse_at + joint] = x[m], impulse
+        posterior[innovations + joint], posterior[innovation_variances + joint] = innovation if valid else 0.0, S
+        posterior[smoothed + joint], posterior[measured_at + joint] = velocity[joint], measured[joint_velocity + joint]
 
 
 class ModelAidedEstimator(FrictionEstimator):
@@ -255,83 +366,54 @@ class ModelAidedEstimator(FrictionEstimator):
         output_ports:
         - posterior
 
-    Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse [Nm s], after the update; `velocity` that the
-    model sees and `last_velocity` as measured [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
-    [impulse, parameters, disturbance].
+    Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse [Nm s], after the update; `velocity` that
+    the model sees and `last_velocity` as measured [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is
+    that of [impulse, parameters, disturbance].
     """
 
     def __init__(self, config: ModelAided, robot: Robot, measurements: dict[str, slice], link_torque: dict[str, slice], clock: Clock):
         n = len(robot.joint_names)
         further = {"disturbance": n, "impulse": n, "velocity": n, "last_velocity": n}
         super().__init__(config.model, robot, measurements, link_torque, clock, 2, further)
-        self._config = config
+        self._config, self._measures_swing = config, config.swing == "measurement"
+        self._velocity_places = (*starts(measurements, "joint_velocity"), *starts(self.fields.slices, "velocity", "last_velocity"))
+        self._smoothing, self._walks = float(config.velocity_smoothing), (float(config.disturbance_walk), float(config.parameter_walk))
+        written = ("friction", "parameters", "parameter_variance", "covariance", "innovation", "innovation_variance", *further)
+        self._places = (
+            *starts(measurements, "trust", "joint_velocity"),
+            *starts(link_torque, "residual", "torque_variance", "impulse_variance", "valid"),
+            *starts(self.fields.slices, *written),
+        )
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        measured, link_torque, support = (port.Eval(context) for port in self._ports)
-        config, fields, n, m = self._config, self.fields, self._n, self._m
-        posterior = last.copy()
-        trust = measured[self._measured["trust"]].tolist()
-        posterior[0] = max(trust)
-        v = measured[self._measured["joint_velocity"]]
-        parameters = posterior[fields["parameters"]].reshape(n, m)
-        P = posterior[fields["covariance"]].reshape(n, m + 2, m + 2)
-        disturbance = posterior[fields["disturbance"]]
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured, link_torque, support = self._measurements.Eval(context), self._link.Eval(context), self._support.Eval(context)
         if math.isnan(elapsed):
-            parameters[:] = self._regressor.initial
-            P[:] = np.diag([0.0, *[config.parameter_uncertainty**2] * m, config.disturbance_uncertainty**2])
-            posterior[fields["velocity"]] = posterior[fields["last_velocity"]] = v
-            return posterior
-        # The joint's velocity over the tick is the mean of those at its ends.
-        velocity = posterior[fields["velocity"]]
-        keep = math.exp(-elapsed / config.velocity_smoothing) if config.velocity_smoothing > 0 else 0.0
-        velocity *= keep
-        velocity += (1 - keep) * 0.5 * (v + posterior[fields["last_velocity"]])
-        posterior[fields["last_velocity"]] = v
-        valid = link_torque[self._link_torque["valid"]] > 0
-        if config.swing == "model":
-            valid &= support[self._leg] > 0
-        phi = np.empty((n, m + 1))
-        phi[:, :m], phi[:, m] = self._regressor(velocity), 1.0
-        x = np.empty((n, m + 1))
-        x[:, :m], x[:, m] = parameters, disturbance
-        impulse = posterior[fields["impulse"]]
-        self._update(x, P, impulse, phi, link_torque, valid, elapsed, posterior)
-        if not valid.all():
-            # A joint that is not measured is left to its model.
-            x[~valid, m] = impulse[~valid] = 0.0
-            P[~valid, 0, :] = P[~valid, :, 0] = 0.0
-        parameters[:], disturbance[:] = x[:, :m], x[:, m]
-        posterior[fields["parameter_variance"]] = np.diagonal(P, axis1=1, axis2=2)[:, 1:-1].ravel()
-        posterior[fields["friction"]] = (phi * x).sum(axis=1)
-        return posterior
+            self._start(posterior, measured)
+            return
+        velocity = smooth_velocity(last, measured, elapsed, self._n, self._velocity_places, self._smoothing)
+        _estimate_friction(
+            posterior,
+            last,
+            elapsed,
+            measured,
+            link_torque,
+            support,
+            velocity,
+            self._regressor(velocity),
+            self._leg,
+            self._places,
+            self._measures_swing,
+            self._walks,
+        )
 
-    def _update(
-        self,
-        x: np.ndarray,
-        P: np.ndarray,
-        impulse: np.ndarray,
-        phi: np.ndarray,
-        link_torque: np.ndarray,
-        valid: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
-    ) -> None:
-        """One tick of the Kalman filters of all joints, in place: x (n, m + 1), P (n, m + 2, m + 2), impulse (n,)."""
-        config, fields, parts, m = self._config, self.fields, self._link_torque, self._m
-        innovation = impulse + elapsed * (link_torque[parts["residual"]] - (phi * x).sum(axis=1))
-        c = elapsed * (P[:, :, 1:] @ phi[:, :, None])[:, :, 0]
-        added = elapsed * (phi * c[:, 1:]).sum(axis=1) + elapsed**2 * link_torque[parts["torque_variance"]]
-        P[:, 0, :] += c
-        P[:, :, 0] += c
-        P[:, 0, 0] += added
-        P[:, m + 1, m + 1] += config.disturbance_walk**2 * elapsed
-        if config.parameter_walk > 0:
-            for k in range(1, m + 1):
-                P[:, k, k] += config.parameter_walk**2 * elapsed
-        column = P[:, :, 0].copy()
-        S = column[:, 0] + link_torque[parts["impulse_variance"]]
-        K = column * (valid / S)[:, None]
-        x += K[:, 1:] * innovation[:, None]
-        impulse[:] = (1 - K[:, 0]) * innovation
-        P -= K[:, :, None] * column[:, None, :]
-        posterior[fields["innovation"]], posterior[fields["innovation_variance"]] = innovation * valid, S
+    def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
+        config, n, m = self._config, self._n, self._m
+        P = np.diag([0.0, *[config.parameter_uncertainty**2] * m, config.disturbance_uncertainty**2])
+        now = measured[self._measured["joint_velocity"]]
+        posterior[:] = self.fields.pack(
+            status=measured[self._measured["trust"]].max(),
+            parameters=self._regressor.initial,
+            covariance=np.tile(P, (n, 1, 1)),
+            velocity=now,
+            last_velocity=now,
+        )

@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import Context
-from scipy.linalg.lapack import dposv
 
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
+from fbse_drake.estimators.spatial import Rotation, Vector, put, rotate, rotate_back, rotation_at, scale, subtract, vector_at
 from fbse_drake.robot.plant import Robot
 
 
@@ -47,6 +48,31 @@ def minimum_norm(J: np.ndarray, y: np.ndarray) -> np.ndarray:
     return J.T @ np.linalg.solve(J @ J.T, y)
 
 
+@njit(cache=True)
+def solve_positive_definite(S: np.ndarray, B: np.ndarray) -> None:
+    """Replaces B (c, m) by S^-1 B, by Cholesky; S (c, c) is symmetric positive definite and is overwritten."""
+    c, m = B.shape
+    for i in range(c):
+        for j in range(i + 1):
+            total = S[i, j]
+            for k in range(j):
+                total -= S[i, k] * S[j, k]
+            S[i, j] = math.sqrt(total) if i == j else total / S[j, j]
+    for i in range(c):
+        for k in range(i):
+            for j in range(m):
+                B[i, j] -= S[i, k] * B[k, j]
+        for j in range(m):
+            B[i, j] /= S[i, i]
+    for i in range(c - 1, -1, -1):
+        for k in range(i + 1, c):
+            for j in range(m):
+                B[i, j] -= S[k, i] * B[k, j]
+        for j in range(m):
+            B[i, j] /= S[i, i]
+
+
+@njit(cache=True)
 def fuse(
     measured: np.ndarray, variance: np.ndarray, J: np.ndarray, y: np.ndarray, constraint_variance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -59,13 +85,151 @@ def fuse(
     Returns:
         The accelerations x (v,), dx/dmeasured (v, v), the innovation y - J measured (c,) and its variance (c,).
     """
-    JP = J * variance
-    S = JP @ J.T
-    S.flat[:: len(y) + 1] += constraint_variance
-    innovation = y - J @ measured
-    # Gain, transposed, and correction from one Cholesky solution.
-    _, gain, _ = dposv(S, JP)
-    return measured + innovation @ gain, np.eye(len(measured)) - gain.T @ J, innovation, S.flat[:: len(y) + 1]
+    c, v = J.shape
+    gain, S, innovation, x = np.empty((c, v)), np.zeros((c, c)), y.copy(), measured.copy()
+    J_T = np.ascontiguousarray(J.T)
+    for i in range(c):
+        for k in range(v):
+            gain[i, k] = J[i, k] * variance[k]
+            innovation[i] -= J[i, k] * measured[k]
+            for j in range(i + 1):
+                S[i, j] += gain[i, k] * J_T[k, j]
+        S[i, i] += constraint_variance[i]
+    innovation_variance = np.diag(S).copy()
+    solve_positive_definite(S, gain)  # the gain's transpose
+    sensitivity = np.eye(v)
+    for i in range(c):
+        for k in range(v):
+            x[k] += gain[i, k] * innovation[i]
+            for j in range(v):
+                sensitivity[k, j] -= gain[i, k] * J[i, j]
+    return x, sensitivity, innovation, innovation_variance
+
+
+@njit(cache=True)
+def measured_acceleration(
+    measured: np.ndarray, model: np.ndarray, elapsed: float, places: tuple[int, ...], R_BI: Rotation, p_BI: Vector
+) -> np.ndarray:
+    """What gyro, accelerometer and encoders say of the accelerations of base and joints, shape (v,), see `JointAccelerationEstimator`.
+
+    Args:
+        measured, model: posteriors of `SensorMonitor`, and of `FloatingBaseModel` where the tick began.
+        places: of what is read, see the first line.
+    """
+    joint_velocity, specific_force, angular_velocity, velocity_start, velocity_stop = places
+    v = velocity_stop - velocity_start
+    acceleration = np.empty(v)
+    w_start = vector_at(model, velocity_start)
+    w_dot = scale(1.0 / elapsed, subtract(rotate(R_BI, vector_at(measured, angular_velocity)), w_start))
+    put(acceleration, 0, w_dot)
+    put(acceleration, 3, base_specific_force(vector_at(measured, specific_force), w_start, w_dot, R_BI, p_BI))
+    for i in range(6, v):
+        acceleration[i] = (measured[joint_velocity + i - 6] - model[velocity_start + i]) / elapsed
+    return acceleration
+
+
+@njit(cache=True)
+def no_slip_condition(
+    model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, places: tuple[int, ...], v: int, gravity: Vector
+) -> tuple[np.ndarray, np.ndarray]:
+    """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
+
+    The base's acceleration in `a` is its specific force, so a foot at rest accelerates with minus gravity.
+
+    Args:
+        model, attitude: posteriors of `FloatingBaseModel` where the tick began, and of `AttitudeEstimator`.
+        stands: the feet that stand, shape (feet,), bool.
+        places: of what is read, see the first line.
+        gravity: in world axes [m/s^2].
+    """
+    foot_jacobian, foot_bias, foot_rotation, rotation = places
+    J, y = np.empty((6 * stands.sum(), v)), np.empty(6 * stands.sum())
+    gravity_B = rotate_back(rotation_at(attitude, rotation), gravity)
+    row = 0
+    for foot in range(len(stands)):
+        if stands[foot]:
+            start = foot_jacobian + 6 * v * foot
+            J[row : row + 6] = model[start : start + 6 * v].reshape(6, v)
+            y[row : row + 6] = -model[foot_bias + 6 * foot : foot_bias + 6 * foot + 6]
+            gravity_F = rotate_back(rotation_at(model, foot_rotation + 9 * foot), gravity_B)
+            for i in range(3):
+                y[row + 3 + i] -= gravity_F[i]
+            row += 6
+    return J, y
+
+
+@njit(cache=True)
+def standing_feet(support: np.ndarray, measured: np.ndarray, trust: int) -> np.ndarray:
+    """Feet that stand and whose sensors are trusted, shape (feet,), bool; trust: where in `measured`."""
+    stands = np.empty(len(support), dtype=np.bool_)
+    for foot in range(len(support)):
+        stands[foot] = support[foot] > 0 and measured[trust + 2 + foot] == 0
+    return stands
+
+
+@njit(cache=True)
+def _begin(posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray, trust: int, places: tuple[int, ...]) -> bool:
+    """Sets a posterior to zero but for its status; says whether there is something to estimate from.
+
+    Args:
+        trust: where in `measured`; places: see `measured_acceleration`.
+    """
+    posterior[:] = 0.0
+    posterior[STATUS] = max(measured[trust], measured[trust + 1])
+    if math.isnan(elapsed):
+        return False
+    # Where the tick began there may have been no measurement yet.
+    return posterior[STATUS] == 0 and model[places[3] : places[4]].any()
+
+
+@njit(cache=True)
+def _fuse_accelerations(
+    posterior: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    attitude: np.ndarray,
+    model: np.ndarray,
+    support: np.ndarray,
+    trust: int,
+    sensor_places: tuple[int, ...],
+    no_slip_places: tuple[int, ...],
+    places: tuple[int, ...],
+    frames: tuple[Rotation, Vector, Vector],
+    noise: tuple[float, ...],
+) -> None:
+    """One tick of `JointAccelerationEstimator` by the fused method; fills the posterior.
+
+    Args:
+        trust: where in `measured`; sensor_places: see `measured_acceleration`; no_slip_places: see `no_slip_condition`.
+        places: of the fields, see the first line.
+        frames: rotation and lever arm of the IMU, gravity.
+        noise: standard deviations, see `JointAccelerationConfig`.
+    """
+    acceleration_at, known, sensitivity_at, innovation_at, variance_at = places
+    acceleration_noise, angular_velocity_noise, joint_velocity_noise, foot_angular_acceleration, foot_acceleration = noise
+    R_BI, p_BI, gravity = frames
+    if not _begin(posterior, elapsed, measured, model, trust, sensor_places):
+        return
+    stands = standing_feet(support, measured, trust)
+    raw = measured_acceleration(measured, model, elapsed, sensor_places, R_BI, p_BI)
+    v = len(raw)
+    # Differences of velocities have their noise twice.
+    variance = np.full(v, 2 * (joint_velocity_noise / elapsed) ** 2)
+    variance[:3], variance[3:6] = 2 * (angular_velocity_noise / elapsed) ** 2, acceleration_noise**2
+    J, y = no_slip_condition(model, attitude, stands, no_slip_places, v, gravity)
+    foot_variance = np.full(len(y), foot_acceleration**2)
+    for row in range(0, len(y), 6):
+        foot_variance[row : row + 3] = foot_angular_acceleration**2
+    acceleration, sensitivity, innovation, innovation_variance = fuse(raw, variance, J, y, foot_variance)
+    posterior[acceleration_at : acceleration_at + v], posterior[known : known + v - 6] = acceleration, 1.0
+    posterior[sensitivity_at : sensitivity_at + v * v] = sensitivity.ravel()
+    row = 0
+    for foot in range(len(stands)):
+        if stands[foot]:
+            for i in range(6):
+                posterior[innovation_at + 6 * foot + i] = innovation[row + i]
+                posterior[variance_at + 6 * foot + i] = innovation_variance[row + i]
+            row += 6
 
 
 class JointAccelerationEstimator(RecursiveEstimator):
@@ -82,8 +246,8 @@ class JointAccelerationEstimator(RecursiveEstimator):
         output_ports:
         - posterior
 
-    Inputs: posteriors of `SensorMonitor` and `AttitudeEstimator`, a support estimate (feet,), and the terms of `FloatingBaseModel` where the
-    tick began. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `AttitudeEstimator`, a support estimate (feet,), and the terms of `FloatingBaseModel` where
+    the tick began. Fields of the posterior:
 
         base_angular_acceleration, base_specific_force   (3,)  in base axes [rad/s^2, m/s^2]
         joint_acceleration    (n,)  [rad/s^2]
@@ -105,6 +269,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
         v = 6 + n
         super().__init__(
             {
+                "status": 1,
                 "base_angular_acceleration": 3,
                 "base_specific_force": 3,
                 "joint_acceleration": n,
@@ -115,90 +280,76 @@ class JointAccelerationEstimator(RecursiveEstimator):
             },
             clock,
         )
-        # All accelerations together.
-        self.acceleration = slice(self.fields["base_angular_acceleration"].start, self.fields["joint_acceleration"].stop)
-        self._config, self._measured, self._attitude, self._model = config, measurements, attitude, model
-        self._mount, self._n, self._v, self._feet = ImuMount(robot), n, v, feet
-        self._gravity = robot.plant.gravity_field().gravity_vector()
+        self._method, self._n, self._v = config.method, n, v
+        mount = ImuMount(robot)
+        gravity: Vector = tuple(robot.plant.gravity_field().gravity_vector().tolist())
+        self._frames = (mount.rotation, mount.lever_arm, gravity)
+        self._noise = (
+            float(config.acceleration_noise),
+            float(config.angular_velocity_noise),
+            float(config.joint_velocity_noise),
+            float(config.foot_angular_acceleration),
+            float(config.foot_acceleration),
+        )
+        self._trust, self._velocity = measurements["trust"].start, model["velocity"]
+        self._sensor_places = (
+            *starts(measurements, "joint_velocity", "specific_force", "angular_velocity"),
+            self._velocity.start,
+            self._velocity.stop,
+        )
+        self._no_slip_places = (*starts(model, "foot_jacobian", "foot_bias", "foot_rotation"), *starts(attitude, "rotation"))
+        self._places = starts(self.fields.slices, "base_angular_acceleration", "known", "sensitivity", "innovation", "innovation_variance")
         legs = [leg.joints for leg in robot.description.legs.values()]
         self._legs = [np.array([robot.joint_names.index(name) for name in joints]) for joints in legs]
-        # Noise of accelerations: differences of velocities have it twice, over the tick (see _tick).
-        self._velocity_variance = np.zeros(v)
-        self._velocity_variance[:3] = 2 * config.angular_velocity_noise**2
-        self._velocity_variance[6:] = 2 * config.joint_velocity_noise**2
-        self._acceleration_variance = np.zeros(v)
-        self._acceleration_variance[3:6] = config.acceleration_noise**2
-        self._foot_variance = np.repeat([config.foot_angular_acceleration**2, config.foot_acceleration**2], 3)
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model_at_step_start", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         self.DeclareVectorInputPort("support", feet)
         names = ("measurements", "attitude", "model_at_step_start", "support")
-        self._ports = [self.GetInputPort(name) for name in names]
+        self._measurements, self._attitude, self._model, self._support = (self.GetInputPort(name) for name in names)
         self._declare_posterior(*names)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        if math.isnan(elapsed):
-            return np.zeros(self.fields.size)
-        measured, attitude, model, support = (port.Eval(context) for port in self._ports)
-        config, fields = self._config, self.fields
-        posterior = np.zeros(fields.size)
-        trust = measured[self._measured["trust"]].tolist()
-        posterior[0] = max(trust[:2])
-        if trust[0] or trust[1]:
-            return posterior
-        v_start = model[self._model["velocity"]]
-        if not v_start.any():
-            return posterior
-        w = self._mount.R_BI @ measured[self._measured["angular_velocity"]]
-        raw = np.empty(self._v)
-        w_start = v_start[:3]
-        raw[:3] = w_dot = (w - w_start) / elapsed
-        raw[3:6] = self._mount.base_specific_force(measured[self._measured["specific_force"]], w_start, w_dot)
-        raw[6:] = (measured[self._measured["joint_velocity"]] - v_start[6:]) / elapsed
-        stands = [k for k in range(self._feet) if support[k] > 0 and not trust[2 + k]]
-        if config.method == "fused":
-            acceleration, sensitivity = raw, np.eye(self._v)
-            if stands:
-                J, y = self._no_slip(model, attitude, stands)
-                variance = self._velocity_variance / elapsed**2 + self._acceleration_variance
-                acceleration, sensitivity, innovation, innovation_variance = fuse(
-                    raw, variance, J, y, np.tile(self._foot_variance, len(stands))
-                )
-                for row, k in enumerate(stands):
-                    part, to = slice(6 * row, 6 * row + 6), slice(6 * k, 6 * k + 6)
-                    posterior[fields["innovation"]][to] = innovation[part]
-                    posterior[fields["innovation_variance"]][to] = innovation_variance[part]
-            known = np.ones(self._n)
-        else:
-            acceleration, sensitivity = raw, np.eye(self._v)
-            acceleration[6:] = sensitivity[6:] = 0.0
-            known = np.zeros(self._n)
-            if stands:
-                J, y = self._no_slip(model, attitude, stands)
-                joints = np.concatenate([self._legs[k] for k in stands])
-                known[joints] = 1.0
-                columns = 6 + joints
-                if config.method == "minimum_norm":
-                    unknown = np.concatenate([np.arange(3), columns])
-                    acceleration[unknown] = minimum_norm(J[:, unknown], y - J[:, 3:6] @ raw[3:6])
-                else:
-                    acceleration[columns] = np.linalg.solve(J[:, columns], y - J[:, :6] @ raw[:6])
-        posterior[self.acceleration] = acceleration
-        posterior[fields["known"]] = known
-        posterior[fields["sensitivity"]] = sensitivity.ravel()
-        return posterior
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
+        model, support = self._model.Eval(context), self._support.Eval(context)
+        if last.item(STATUS):
+            elapsed = math.nan  # Velocities are differentiated: both ends of the tick must be trusted.
+        if self._method != "fused":
+            self._solve_no_slip(posterior, elapsed, measured, attitude, model, support)
+            return
+        _fuse_accelerations(
+            posterior,
+            elapsed,
+            measured,
+            attitude,
+            model,
+            support,
+            self._trust,
+            self._sensor_places,
+            self._no_slip_places,
+            self._places,
+            self._frames,
+            self._noise,
+        )
 
-    def _no_slip(self, model: np.ndarray, attitude: np.ndarray, stands: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """J and y of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
-
-        The base's acceleration in `a` is its specific force, so a foot at rest accelerates with minus gravity.
-        """
-        J = model[self._model["foot_jacobian"]].reshape(self._feet, 6, self._v)
-        bias = model[self._model["foot_bias"]].reshape(self._feet, 6)
-        R_FB = model[self._model["foot_rotation"]].reshape(self._feet, 3, 3).transpose(0, 2, 1)
-        gravity_B = attitude[self._attitude["rotation"]].reshape(3, 3).T @ self._gravity
-        y = -bias
-        y[:, 3:] -= R_FB @ gravity_B
-        if len(stands) == self._feet:
-            return J.reshape(-1, self._v), y.ravel()
-        return J[stands].reshape(-1, self._v), y[stands].ravel()
+    def _solve_no_slip(
+        self, posterior: np.ndarray, elapsed: float, measured: np.ndarray, attitude: np.ndarray, model: np.ndarray, support: np.ndarray
+    ) -> None:
+        """One tick by one of the paper's methods, which have the joints of the feet that stand from the other sensors."""
+        if not _begin(posterior, elapsed, measured, model, self._trust, self._sensor_places):
+            return
+        stands = standing_feet(support, measured, self._trust)
+        R_BI, p_BI, gravity = self._frames
+        acceleration = measured_acceleration(measured, model, elapsed, self._sensor_places, R_BI, p_BI)
+        sensitivity, known = np.eye(self._v), np.zeros(self._n)
+        acceleration[6:] = sensitivity[6:] = 0.0
+        if stands.any():
+            J, y = no_slip_condition(model, attitude, stands, self._no_slip_places, self._v, gravity)
+            joints = np.concatenate([self._legs[k] for k in np.flatnonzero(stands)])
+            known[joints] = 1.0
+            columns = 6 + joints
+            if self._method == "minimum_norm":
+                unknown = np.concatenate([np.arange(3), columns])
+                acceleration[unknown] = minimum_norm(J[:, unknown], y - J[:, 3:6] @ acceleration[3:6])
+            else:
+                acceleration[columns] = np.linalg.solve(J[:, columns], y - J[:, :6] @ acceleration[:6])
+        posterior[STATUS + 1 : self.fields["innovation"].start] = np.concatenate([acceleration, known, sensitivity.ravel()])

@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import Context, State
 
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches, leg_of_joint
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.robot.plant import Robot, grasp_map
 
 
@@ -25,6 +27,74 @@ class LinkTorqueConfig:
         for name in ("acceleration_noise", "angular_velocity_noise", "joint_velocity_noise", "force_noise"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+
+
+@njit(cache=True)
+def _estimate_link_torque(
+    posterior: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    model: np.ndarray,
+    acceleration: np.ndarray,
+    torque_command: np.ndarray,
+    pad_position: np.ndarray,
+    pad_foot: np.ndarray,
+    wrench_variance: np.ndarray,
+    smallest_load: np.ndarray,
+    joint_leg: np.ndarray,
+    places: tuple[int, ...],
+    noise: tuple[float, float, float],
+) -> None:
+    """One tick of `LinkTorqueEstimator`; fills the posterior.
+
+    Args:
+        torque_command: where the tick began, shape (n,) [Nm].
+        wrench_variance: of each foot's measured wrench, shape (feet, 6) [(Nm)^2, N^2].
+        smallest_load: that counts, shape (feet,) [N].
+        joint_leg: which leg each joint belongs to, shape (n,).
+        places: of what is read, see the first line.
+        noise: standard deviations of accelerometer, gyro and joint velocities, see `LinkTorqueConfig`.
+    """
+    trust, pad_force, mass_matrix, bias, foot_jacobian, acceleration_at, known, sensitivity_at = places
+    acceleration_noise, angular_velocity_noise, joint_velocity_noise = noise
+    n, feet = len(torque_command), len(smallest_load)
+    v = 6 + n
+    posterior[STATUS] = measured[trust : trust + 2 + feet].max()
+    if math.isnan(elapsed):
+        posterior[STATUS + 1 :] = 0.0
+        return
+    sensitivity = acceleration[sensitivity_at : sensitivity_at + v * v].reshape(v, v)
+    wrench = foot_wrenches(measured[pad_force:], pad_position, pad_foot, feet)
+    to_sensors = np.empty(v)
+    for i in range(n):
+        # Inertia and bias forces, (35) without the wrenches; and what the sensors' noise makes of them.
+        link_torque, row = model[bias + i], mass_matrix + i * v
+        to_sensors[:] = 0.0
+        for k in range(v):
+            inertia = model[row + k]
+            link_torque += inertia * acceleration[acceleration_at + k]
+            for j in range(v):
+                to_sensors[j] += inertia * sensitivity[k, j]
+        torque_variance, impulse_variance = 0.0, 0.0
+        for j in range(v):
+            if j < 3:
+                impulse_variance += (to_sensors[j] * angular_velocity_noise) ** 2
+            elif j < 6:
+                torque_variance += (to_sensors[j] * acceleration_noise) ** 2
+            else:
+                impulse_variance += (to_sensors[j] * joint_velocity_noise) ** 2
+        for foot in range(feet):
+            if wrench[foot, 5] > smallest_load[foot]:
+                for k in range(6):
+                    lever = model[foot_jacobian + (6 * foot + k) * v + 6 + i]
+                    link_torque -= wrench[foot, k] * lever
+                    torque_variance += wrench_variance[foot, k] * lever * lever
+        trusted = measured[trust] == 0 and measured[trust + 1] == 0 and measured[trust + 2 + joint_leg[i]] == 0
+        # Field by field in the posterior's order.
+        fields = posterior[STATUS + 1 + i :: n]
+        fields[0], fields[1] = link_torque, torque_command[i] - link_torque
+        fields[2], fields[3] = torque_variance, impulse_variance
+        fields[4] = acceleration[known + i] if trusted else 0.0
 
 
 class LinkTorqueEstimator(RecursiveEstimator):
@@ -63,71 +133,48 @@ class LinkTorqueEstimator(RecursiveEstimator):
         acceleration: dict[str, slice],
         clock: Clock,
     ):
-        n = len(robot.joint_names)
-        v = 6 + n
-        super().__init__({"link_torque": n, "residual": n, "torque_variance": n, "impulse_variance": n, "valid": n}, clock)
-        self._measured, self._model, self._acceleration = measurements, model, acceleration
-        self._n, self._v, self._feet = n, v, len(robot.description.sides)
-        self._all = slice(acceleration["base_angular_acceleration"].start, acceleration["joint_acceleration"].stop)
-        self._impulse_noise = np.zeros(v)
-        self._impulse_noise[:3] = config.angular_velocity_noise**2
-        self._impulse_noise[6:] = config.joint_velocity_noise**2
-        self._torque_noise = np.zeros(v)
-        self._torque_noise[3:6] = config.acceleration_noise**2
-        self._grasp, self._pads, self._wrench_noise, self._legs = [], [], [], []
-        start = measurements["pad_force"].start
-        for side, leg in robot.description.legs.items():
-            grasp = grasp_map(robot.pad_positions(side))
-            self._grasp.append(grasp)
-            self._pads.append(slice(start, start + grasp.shape[1]))
-            start += grasp.shape[1]
-            self._wrench_noise.append(config.force_noise**2 * (grasp**2).sum(axis=1))
-            self._legs.append([robot.joint_names.index(name) for name in leg.joints])
-        self._smallest_load = [config.force_noise * math.sqrt(len(leg.pads)) for leg in robot.description.legs.values()]
+        n, legs = len(robot.joint_names), robot.description.legs
+        super().__init__({"status": 1, "link_torque": n, "residual": n, "torque_variance": n, "impulse_variance": n, "valid": n}, clock)
+        self._pads = FootPads(robot)
+        grasp = [grasp_map(robot.pad_positions(side)) for side in legs]
+        self._wrench_variance = np.array([config.force_noise**2 * (G**2).sum(axis=1) for G in grasp])
+        self._smallest_load = np.array([config.force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()])
+        self._joint_leg = leg_of_joint(robot)
+        self._places = (
+            *starts(measurements, "trust", "pad_force"),
+            *starts(model, "mass_matrix", "bias", "foot_jacobian"),
+            *starts(acceleration, "base_angular_acceleration", "known", "sensitivity"),
+        )
+        self._noise = (float(config.acceleration_noise), float(config.angular_velocity_noise), float(config.joint_velocity_noise))
         for name, parts in (("measurements", measurements), ("model_at_step_start", model), ("joint_acceleration", acceleration)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         names = ("measurements", "model_at_step_start", "joint_acceleration")
-        self._ports = [self.GetInputPort(name) for name in names]
+        self._measurements, self._model, self._acceleration = (self.GetInputPort(name) for name in names)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
         self._last_command = self.DeclareDiscreteState(n)
         self._declare_posterior(*names)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        fields = self.fields
-        posterior = np.zeros(fields.size)
-        measured, model, acceleration = (port.Eval(context) for port in self._ports)
-        trust = measured[self._measured["trust"]].tolist()
-        posterior[0] = max(trust)
-        if math.isnan(elapsed):
-            return posterior
-        tau = context.get_discrete_state(self._last_command).value()
-        M = model[self._model["mass_matrix"]].reshape(self._n, self._v)
-        J = model[self._model["foot_jacobian"]].reshape(self._feet, 6, self._v)
-        link_torque = M @ acceleration[self._all] + model[self._model["bias"]]
-        sensitivity = (M @ acceleration[self._acceleration["sensitivity"]].reshape(self._v, self._v)) ** 2
-        torque_variance = sensitivity @ self._torque_noise
-        valid = acceleration[self._acceleration["known"]].copy()
-        for k in range(self._feet):
-            wrench = self._grasp[k] @ measured[self._pads[k]]
-            if wrench[5] > self._smallest_load[k]:
-                J_joints = J[k][:, 6:]
-                link_torque -= wrench @ J_joints
-                torque_variance += self._wrench_noise[k] @ (J_joints * J_joints)
-            if trust[2 + k]:
-                valid[self._legs[k]] = 0.0
-        if trust[0] or trust[1]:
-            valid[:] = 0.0
-        posterior[fields["link_torque"]] = link_torque
-        posterior[fields["residual"]] = tau - link_torque
-        posterior[fields["torque_variance"]] = torque_variance
-        posterior[fields["impulse_variance"]] = sensitivity @ self._impulse_noise
-        posterior[fields["valid"]] = valid
-        return posterior
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
+        command = context.get_discrete_state(1).value()
+        if not math.isfinite(command.dot(command)):
+            posterior[STATUS], posterior[STATUS + 1 :] = Status.NOT_FINITE, 0.0
+            return
+        _estimate_link_torque(
+            posterior,
+            elapsed,
+            self._measurements.Eval(context),
+            self._model.Eval(context),
+            self._acceleration.Eval(context),
+            command,
+            self._pads.position,
+            self._pads.foot,
+            self._wrench_variance,
+            self._smallest_load,
+            self._joint_leg,
+            self._places,
+            self._noise,
+        )
 
     def _remember(self, context: Context, state: State) -> None:
         super()._remember(context, state)
-        command = self._torque_command.Eval(context)
-        if not math.isfinite(command.sum()):
-            state.get_mutable_discrete_state(self._last)[0] = Status.NOT_FINITE
-            return
-        state.get_mutable_discrete_state(self._last_command).set_value(command)
+        state.get_mutable_discrete_state().set_value(self._last_command, self._torque_command.Eval(context))

@@ -10,6 +10,9 @@ from functools import cached_property
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+# Place of the status in the posterior of every estimator.
+STATUS = 1
+
 
 class Status(IntEnum):
     """What an estimator says of its inputs."""
@@ -53,6 +56,11 @@ class Fields:
         return {name: vectors[..., part] for name, part in self.slices.items()}
 
 
+def starts(parts: Mapping[str, slice], *names: str) -> tuple[int, ...]:
+    """Where these parts of a vector start; kernels get them as a tuple."""
+    return tuple(parts[name].start for name in names)
+
+
 @dataclass(frozen=True)
 class Clock:
     """When an estimator ticks."""
@@ -69,17 +77,20 @@ class RecursiveEstimator(LeafSystem):
 
     The output port `posterior` holds the estimator's posterior of the present tick, made from the posterior of the tick before (the
     discrete state) and the inputs of this tick; so a chain of estimators adds no delay. The state takes it over in an unrestricted update,
-    see `fbse_drake.sampling`. The first field of every posterior is `status`, see `Status`; a posterior that would not be finite is not
-    taken: the last one is held and the status says so.
+    see `fbse_drake.sampling`. The first field of every posterior is `time`, that of its tick [s], NaN before the first; the second one of
+    an estimator is `status`, see `Status`. A posterior that would not be finite is not taken: the last one is held and the status says so.
     """
 
     def __init__(self, fields: Mapping[str, int], clock: Clock):
+        """Declares the state.
+
+        Args:
+            fields: of the posterior, besides `time`.
+        """
         super().__init__()
-        self.fields = Fields({"status": 1, **fields})
-        self._shortest = clock.shortest
-        self._last = self.DeclareDiscreteState(self.fields.size)
-        # Time of the last tick; NaN before the first.
-        self._last_time = self.DeclareDiscreteState([math.nan])
+        self.fields = Fields({"time": 1, **fields})
+        self._has_status, self._shortest = "status" in fields, clock.shortest
+        self._last = self.DeclareDiscreteState([math.nan, *np.zeros(self.fields.size - 1)])
         self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, self._remember)
         self.DeclareForcedUnrestrictedUpdateEvent(self._remember)
 
@@ -95,33 +106,33 @@ class RecursiveEstimator(LeafSystem):
         )
 
     @abstractmethod
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        """The posterior of this tick.
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        """Makes the posterior of this tick.
 
         Args:
-            last: posterior of the tick before; zeros at the first.
+            last: posterior of the tick before, not to be written; zeros at the first.
             elapsed: time since then [s]; NaN at the first tick.
+            posterior: to be filled but for its `time`; what it holds before means nothing.
         """
 
     def _calc_posterior(self, context: Context, output: BasicVector) -> None:
-        last = context.get_discrete_state(self._last).value()
-        elapsed = context.get_time() - context.get_discrete_state(self._last_time).value()[0]
+        last, time = context.get_discrete_state(0).value(), context.get_time()
+        elapsed = time - last.item(0)
         if elapsed < self._shortest:
             output.SetFromVector(last)
             return
-        posterior = self._tick(context, last, elapsed)
-        if not math.isfinite(posterior.sum()):
-            posterior = last.copy()
-            posterior[0] = Status.NOT_FINITE
-        output.SetFromVector(posterior)
+        posterior = output.get_mutable_value()
+        self._tick(context, last, elapsed, posterior)
+        posterior[0] = time
+        # Is it finite? The square is the cheapest sum over all.
+        if not math.isfinite(posterior.dot(posterior)):
+            posterior[1:] = last[1:]
+            if self._has_status:
+                posterior[STATUS] = Status.NOT_FINITE
+        if math.isnan(elapsed) and self._has_status and posterior[STATUS] == Status.NOT_FINITE:
+            posterior[0] = math.nan  # Nothing to start from yet.
 
     def _remember(self, context: Context, state: State) -> None:
-        time = context.get_time()
-        discrete = state.get_mutable_discrete_state()
-        last_time = discrete.get_mutable_value(self._last_time)
-        if not time - last_time[0] < self._shortest:
-            posterior = self._posterior.Eval(context)
-            if math.isnan(last_time[0]) and posterior[0] == Status.NOT_FINITE:
-                return  # Nothing to start from yet.
-            discrete.set_value(self._last, posterior)
-            last_time[0] = time
+        posterior = self._posterior.Eval(context)
+        if not math.isnan(posterior.item(0)):
+            state.get_mutable_discrete_state().set_value(self._last, posterior)

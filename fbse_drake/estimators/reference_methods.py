@@ -9,8 +9,9 @@ from pydrake.systems.framework import Context, State
 from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
 from fbse_drake.effects.joint_torque import JointMotion
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
-from fbse_drake.robot.plant import Robot, grasp_map
+from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
+from fbse_drake.robot.plant import Robot
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,13 @@ class TrueFrictionSource(RecursiveEstimator):
     """
 
     def __init__(self, joints: int, clock: Clock):
-        super().__init__({"friction": joints}, clock)
+        super().__init__({"status": 1, "friction": joints}, clock)
         self._torque_loss = self.DeclareVectorInputPort("torque_loss", joints)
         self._last_loss = self.DeclareDiscreteState(joints)
         self._declare_posterior()
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
-        return np.concatenate([[0.0], context.get_discrete_state(self._last_loss).value()])
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
+        posterior[STATUS], posterior[STATUS + 1 :] = 0.0, context.get_discrete_state(self._last_loss).value()
 
     def _remember(self, context: Context, state: State) -> None:
         super()._remember(context, state)
@@ -98,19 +99,21 @@ class TorqueSensorEstimator(RecursiveEstimator):
     """
 
     def __init__(self, config: TorqueSensor, joints: int, clock: Clock):
-        super().__init__({"friction": joints}, clock)
+        super().__init__({"status": 1, "friction": joints}, clock)
         self._rate = 2 * math.pi * config.cutoff
         self._measured = self.DeclareVectorInputPort("measured_torque", joints)
         self._torque_command = self.DeclareVectorInputPort("torque_command", joints)
         self._last_command = self.DeclareDiscreteState(joints)
         self._declare_posterior("measured_torque")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        posterior[:] = last
         if math.isnan(elapsed):
-            return last.copy()
+            return
         residual = context.get_discrete_state(self._last_command).value() - self._measured.Eval(context)
         keep = math.exp(-self._rate * elapsed)
-        return np.concatenate([[0.0], keep * last[1:] + (1 - keep) * residual])
+        friction = self.fields["friction"]
+        posterior[STATUS], posterior[friction] = 0.0, keep * last[friction] + (1 - keep) * residual
 
     def _remember(self, context: Context, state: State) -> None:
         super()._remember(context, state)
@@ -132,16 +135,16 @@ class FixedFrictionModel(RecursiveEstimator):
     """
 
     def __init__(self, config: FixedFriction, robot: Robot, measurements: dict[str, slice], clock: Clock):
-        super().__init__({"friction": len(robot.joint_names)}, clock)
+        super().__init__({"status": 1, "friction": len(robot.joint_names)}, clock)
         self._model = config.model.resolve(robot.description, key="estimator.model")
         self._inputs = measurements
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
         measured = self._measurements.Eval(context)
         torque, _ = self._model.torque_and_slope(JointMotion(measured[self._inputs["joint_velocity"]]))
-        return np.concatenate([[measured[self._inputs["trust"]][0]], torque])
+        posterior[STATUS], posterior[STATUS + 1 :] = measured[self._inputs["trust"]][0], torque
 
 
 class MomentumObserver(RecursiveEstimator):
@@ -161,8 +164,8 @@ class MomentumObserver(RecursiveEstimator):
         - posterior
 
     Posteriors as for FBSE; the base's velocity is the estimated one, accelerations are not used at all. The observer integrates
-    u_dot = K (tau + J^T F + beta - p_dot - u), with beta = H_dot v - C v - g, so that u is the friction behind a low-pass of first order. Fields: `friction` (n,) [Nm], `momentum`
-    (n,) [Nm s].
+    u_dot = K (tau + J^T F + beta - p_dot - u), with beta = H_dot v - C v - g, so that u is the friction behind a low-pass of first order.
+    Fields: `friction` (n,) [Nm], `momentum` (n,) [Nm s].
     """
 
     def __init__(
@@ -176,12 +179,12 @@ class MomentumObserver(RecursiveEstimator):
         clock: Clock,
     ):
         n = len(robot.joint_names)
-        super().__init__({"friction": n, "momentum": n}, clock)
+        super().__init__({"status": 1, "friction": n, "momentum": n}, clock)
         self._parts = {"measurements": measurements, "attitude": attitude, "base_state": base_state, "model": model}
         self._parts["model_at_step_start"] = model
         self._gain, self._n = 2 * math.pi * config.bandwidth, n
         self._gravity = robot.plant.gravity_field().gravity_vector()
-        self._grasp = [grasp_map(robot.pad_positions(side)) for side in robot.description.sides]
+        self._pads, self._feet = FootPads(robot), len(robot.description.sides)
         for name, parts in self._parts.items():
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
@@ -189,7 +192,7 @@ class MomentumObserver(RecursiveEstimator):
         self._ports = {name: self.GetInputPort(name) for name in self._parts}
         self._declare_posterior(*self._parts)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         values = {
             name: {part: vector[place] for part, place in self._parts[name].items()}
             for name, vector in ((name, port.Eval(context)) for name, port in self._ports.items())
@@ -202,23 +205,22 @@ class MomentumObserver(RecursiveEstimator):
         velocity[3:6] = v_B
         M, M_start = (terms["mass_matrix"].reshape(n, 6 + n) for terms in (model, start))
         momentum = M @ velocity
-        trust = max(measured["trust"].tolist())
-        if math.isnan(elapsed) or trust:
-            return self.fields.pack(status=trust, friction=last[self.fields["friction"]], momentum=momentum)
+        applied = context.get_discrete_state(self._last_command).value().copy()
+        trust = max(measured["trust"].tolist()) if math.isfinite(applied.dot(applied)) else float(Status.NOT_FINITE)
+        # The momentum is differentiated: both ends of the tick must be trusted.
+        if math.isnan(elapsed) or trust or last.item(STATUS):
+            posterior[:] = self.fields.pack(status=trust, friction=last[self.fields["friction"]], momentum=momentum)
+            return
         # Components in base axes, which turn: their rate has -w x v besides the acceleration.
         turning = np.cross(velocity[:3], v_B)
         gravity = M_start[:, 3:6] @ (R_WB.T @ self._gravity)
         beta = (M - M_start) @ velocity / elapsed - M_start[:, 3:6] @ turning - start["bias"] + gravity
-        applied = context.get_discrete_state(self._last_command).value().copy()
-        J = start["foot_jacobian"].reshape(len(self._grasp), 6, 6 + n)[:, :, 6:]
-        pads, place = measured["pad_force"], 0
-        for grasp, J_foot in zip(self._grasp, J, strict=True):
-            applied += (grasp @ pads[place : place + grasp.shape[1]]) @ J_foot
-            place += grasp.shape[1]
+        J = start["foot_jacobian"].reshape(6 * self._feet, 6 + n)[:, 6:]
+        applied += foot_wrenches(measured["pad_force"], self._pads.position, self._pads.foot, self._feet).ravel() @ J
         rate = (momentum - last[self.fields["momentum"]]) / elapsed
         keep = math.exp(-self._gain * elapsed)
         friction = keep * last[self.fields["friction"]] + (1 - keep) * (applied + beta - rate)
-        return self.fields.pack(status=0.0, friction=friction, momentum=momentum)
+        posterior[:] = self.fields.pack(status=0.0, friction=friction, momentum=momentum)
 
     def _remember(self, context: Context, state: State) -> None:
         super()._remember(context, state)

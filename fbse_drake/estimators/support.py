@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
+from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.robot.plant import Robot
 
 
@@ -36,6 +38,39 @@ class MeasuredSupport:
 SupportConfig = PlannedSupport | MeasuredSupport
 
 
+@njit(cache=True)
+def _detect_support(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    pad_foot: np.ndarray,
+    places: tuple[int, int],
+    thresholds: tuple[float, float, float],
+) -> None:
+    """One tick of `SupportDetector`; fills the posterior.
+
+    Args:
+        places: of what is read, see the first line.
+        thresholds: loads that begin and end a stance [N], and the debounce [s].
+    """
+    trust, pad_force = places
+    on, off, debounce = thresholds
+    feet = (len(posterior) - STATUS - 1) // 2
+    load = vertical_loads(measured[pad_force:], pad_foot, feet)
+    posterior[STATUS] = measured[trust + 2 : trust + 2 + feet].max()
+    for foot in range(feet):
+        support, waiting = STATUS + 1 + foot, STATUS + 1 + feet + foot
+        if math.isnan(elapsed):
+            posterior[support], posterior[waiting] = 1.0 if load[foot] > on else 0.0, 0.0
+            continue
+        posterior[support] = last[support]
+        beyond = load[foot] < off if last[support] > 0 else load[foot] > on
+        posterior[waiting] = last[waiting] + elapsed if beyond and measured[trust + 2 + foot] == 0 else 0.0
+        if posterior[waiting] > debounce:
+            posterior[support], posterior[waiting] = 1.0 - last[support], 0.0
+
+
 class SupportDetector(RecursiveEstimator):
     """Which feet stand, from their vertical load.
 
@@ -47,34 +82,19 @@ class SupportDetector(RecursiveEstimator):
         output_ports:
         - posterior
 
-    `measurements` is the posterior of a `SensorMonitor`. Fields: `support` (feet,), 1 for a foot that stands, else 0; `waiting` (feet,), for
-    how long [s] each load has been beyond its threshold. A foot whose sensors are not trusted stays what it was.
+    `measurements` is the posterior of a `SensorMonitor`. Fields: `support` (feet,), 1 for a foot that stands, else 0; `waiting` (feet,),
+    for how long [s] each load has been beyond its threshold. A foot whose sensors are not trusted stays what it was.
     """
 
     def __init__(self, config: MeasuredSupport, robot: Robot, measurements: dict[str, slice], clock: Clock):
         feet = len(robot.description.sides)
-        super().__init__({"support": feet, "waiting": feet}, clock)
-        self._config, self._inputs = config, measurements
+        super().__init__({"status": 1, "support": feet, "waiting": feet}, clock)
         weight = 9.81 * robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-        self._on, self._off = config.on * weight, config.off * weight
-        counts = [len(leg.pads) for leg in robot.description.legs.values()]
-        starts = measurements["pad_force"].start + 3 * np.cumsum([0, *counts])
-        self._vertical = [slice(int(start) + 2, int(end), 3) for start, end in zip(starts, starts[1:], strict=False)]
+        self._thresholds = (config.on * weight, config.off * weight, float(config.debounce))
+        self._pad_foot, self._places = FootPads(robot).foot, starts(measurements, "trust", "pad_force")
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float) -> np.ndarray:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured = self._measurements.Eval(context)
-        trust = measured[self._inputs["trust"]].tolist()[2:]
-        loads = [float(measured[part].sum()) for part in self._vertical]
-        if math.isnan(elapsed):
-            return np.array([max(trust), *(float(load > self._on) for load in loads), *(0.0 for _ in loads)])
-        feet = len(loads)
-        previous = last.tolist()
-        support, waiting = previous[1 : 1 + feet], previous[1 + feet :]
-        for k, load in enumerate(loads):
-            beyond = load < self._off if support[k] else load > self._on
-            waiting[k] = waiting[k] + elapsed if beyond and not trust[k] else 0.0
-            if waiting[k] > self._config.debounce:
-                support[k], waiting[k] = 1.0 - support[k], 0.0
-        return np.array([max(trust), *support, *waiting])
+        _detect_support(posterior, last, elapsed, measured, self._pad_foot, self._places, self._thresholds)

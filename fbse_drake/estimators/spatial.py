@@ -1,0 +1,153 @@
+"""Three-dimensional vectors, rotations and quaternions as tuples of floats: in compiled code they stay in registers.
+
+The estimators' numerics are compiled by numba and cached next to the source. A cached function is compiled again when its own file changes,
+not when a function that it calls from another file does: after a change here delete `fbse_drake/estimators/__pycache__`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+Vector = tuple[float, float, float]
+# [w, x, y, z].
+Quaternion = tuple[float, float, float, float]
+# Rotation matrix, row by row.
+Rotation = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@njit(cache=True)
+def vector_at(x: np.ndarray, start: int) -> Vector:
+    """The three components that start at a place of x."""
+    return x[start], x[start + 1], x[start + 2]
+
+
+@njit(cache=True)
+def rotation_at(x: np.ndarray, start: int) -> Rotation:
+    """The rotation matrix that starts at a place of x."""
+    return x[start], x[start + 1], x[start + 2], x[start + 3], x[start + 4], x[start + 5], x[start + 6], x[start + 7], x[start + 8]
+
+
+@njit(cache=True)
+def put(x: np.ndarray, start: int, values: tuple[float, ...]) -> int:
+    """Writes values to a place of x; returns the place behind them."""
+    for i in range(len(values)):
+        x[start + i] = values[i]
+    return start + len(values)
+
+
+@njit(cache=True)
+def add(a: Vector, b: Vector) -> Vector:
+    """a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(cache=True)
+def subtract(a: Vector, b: Vector) -> Vector:
+    """a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
+def scale(factor: float, a: Vector) -> Vector:
+    """Factor times a."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@njit(cache=True)
+def dot(a: Vector, b: Vector) -> float:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def cross(a: Vector, b: Vector) -> Vector:
+    """a x b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def rotate(R: Rotation, a: Vector) -> Vector:
+    """R a."""
+    return (
+        R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
+        R[3] * a[0] + R[4] * a[1] + R[5] * a[2],
+        R[6] * a[0] + R[7] * a[1] + R[8] * a[2],
+    )
+
+
+@njit(cache=True)
+def rotate_back(R: Rotation, a: Vector) -> Vector:
+    """R^T a."""
+    return (
+        R[0] * a[0] + R[3] * a[1] + R[6] * a[2],
+        R[1] * a[0] + R[4] * a[1] + R[7] * a[2],
+        R[2] * a[0] + R[5] * a[1] + R[8] * a[2],
+    )
+
+
+@njit(cache=True)
+def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """a * b of quaternions [w, x, y, z]."""
+    w, x, y, z = a
+    s, i, j, k = b
+    return w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i, w * k + x * j - y * i + z * s
+
+
+@njit(cache=True)
+def rotation_vector_to_quaternion(r: Vector) -> Quaternion:
+    """Quaternion of a rotation by |r| [rad] about r."""
+    half = 0.5 * math.sqrt(dot(r, r))
+    factor = 0.5 if half < 1e-8 else math.sin(half) / (2.0 * half)
+    return math.cos(half), factor * r[0], factor * r[1], factor * r[2]
+
+
+@njit(cache=True)
+def normalized(q: Quaternion) -> Quaternion:
+    """The norm correction: the quaternion of unit length in q's direction."""
+    factor = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return q[0] * factor, q[1] * factor, q[2] * factor, q[3] * factor
+
+
+@njit(cache=True)
+def yaw_of(q: Quaternion) -> float:
+    """z-Euler angle of a quaternion (z-y-x order) [rad]."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+@njit(cache=True)
+def quaternion_from_gravity(up: Vector, yaw: float) -> Quaternion:
+    """Quaternion with the x- and y-Euler angles that make `up` vertical, and this z-Euler angle.
+
+    Args:
+        up: direction of the specific force at rest, in the rotated frame, any length.
+    """
+    roll = math.atan2(up[1], up[2])
+    pitch = math.atan2(-up[0], math.hypot(up[1], up[2]))
+    cr, sr = math.cos(0.5 * roll), math.sin(0.5 * roll)
+    cp, sp = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    cy, sy = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@njit(cache=True)
+def rotation_matrix(q: Quaternion) -> Rotation:
+    """Matrix of a unit quaternion."""
+    w, x, y, z = q
+    return (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )

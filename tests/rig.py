@@ -1,0 +1,162 @@
+"""Drives estimators by hand: a LeafSystem with made-up inputs, or a whole EstimatorDiagram with the samples of a log."""
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.systems.framework import System
+
+from fbse_drake import Log, Scenario, resources
+from fbse_drake.estimate import estimate
+from fbse_drake.estimators.estimator import EstimatorConfig, EstimatorDiagram, make_estimator
+from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
+from fbse_drake.robot.plant import Robot, make_robot
+from fbse_drake.walking.reference import make_reference
+
+TICK = 1e-3
+CLOCK = Clock(TICK, TICK * (1 - 1e-6))
+BENT = np.tile([0.0, 0.0, -0.4, 0.8, -0.4, 0.0], 2)
+
+
+class Rig:
+    """One system with values on its input ports, ticked by hand."""
+
+    def __init__(self, system: System):
+        self.system, self.context = system, system.CreateDefaultContext()
+        self._ticks = 0
+
+    def fix(self, **inputs: np.ndarray) -> None:
+        for name, value in inputs.items():
+            self.system.GetInputPort(name).FixValue(self.context, np.asarray(value, dtype=float))
+
+    def tick(self, **inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """Fields of the posterior of the next tick."""
+        assert isinstance(self.system, RecursiveEstimator)
+        self.fix(**inputs)
+        self.context.SetTime(self._ticks * TICK)
+        self._ticks += 1
+        posterior = self.system.GetOutputPort("posterior").Eval(self.context).copy()
+        self.system.ExecuteForcedEvents(self.context, publish=False)
+        return self.system.fields.unpack(posterior)
+
+
+def pack(system: RecursiveEstimator, **values: np.ndarray | float) -> np.ndarray:
+    """A posterior as another system would send it."""
+    return system.fields.pack(**values)
+
+
+@dataclass(frozen=True)
+class Base:
+    """The systems that every other one is fed by."""
+
+    robot: Robot
+    monitor: SensorMonitor
+    model: FloatingBaseModel
+
+    @staticmethod
+    def of(description: str = "biped") -> "Base":
+        robot, _ = make_robot(description)
+        monitor = SensorMonitor(SensorMonitorConfig(), robot, CLOCK)
+        return Base(robot, monitor, FloatingBaseModel(robot, monitor.fields.slices, CLOCK))
+
+    def measurements(self, **values: np.ndarray | float) -> np.ndarray:
+        """Trusted readings of a robot that stands on level ground, but for the values given."""
+        pads = sum(len(leg.pads) for leg in self.robot.description.legs.values())
+        standing = np.tile([0.0, 0.0, 87.0 * 9.81 / pads], pads)
+        return pack(self.monitor, **{"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, **values})
+
+    def model_of(self, **values: np.ndarray | float) -> dict[str, np.ndarray]:
+        """Fields of the model for such readings."""
+        return Rig(self.model).tick(measurements=self.measurements(**values))
+
+
+def robot_copy(folder: Path, edit: Callable[[str], str]) -> str:
+    """Description of a copy of the biped with another URDF."""
+    shutil.copytree(resources.folder("models"), folder)
+    urdf = folder / "biped.urdf"
+    before = urdf.read_text()
+    urdf.write_text(edit(before))
+    assert urdf.read_text() != before
+    return str(folder / "biped.yaml")
+
+
+def part(log: Log, seconds: float) -> Log:
+    """The beginning of a log."""
+    rows = round(seconds / log.meta["period"]) + 1
+    return dataclasses.replace(log, channels={name: channel[:rows] for name, channel in log.channels.items()})
+
+
+def estimated(log: Log, scenario: Scenario, config: EstimatorConfig, **changes: object) -> Log:
+    """The log with the estimates of another estimator."""
+    return estimate(dataclasses.replace(scenario, estimator=config, **changes), log).log
+
+
+def inputs_of(log: Log) -> dict[str, np.ndarray]:
+    """Samples for the input ports of an EstimatorDiagram, (N, size) each."""
+    pads = [log[f"foot/{side}/pad_force"].reshape(len(log.time), -1) for side in log.sides]
+    return {
+        "measured_joint_state": np.hstack([log["joint/position"], log["joint/velocity"]]),
+        "measured_imu": np.hstack([log["imu/linear_acceleration"], log["imu/angular_velocity"]]),
+        "measured_pad_force": np.hstack(pads),
+        "torque_command": log["joint/torque_command"],
+    }
+
+
+def diagram(config: EstimatorConfig, scenario: Scenario) -> EstimatorDiagram:
+    """The estimator as the scenario's station has it."""
+    believed = scenario.believed
+    robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia)
+    plan = make_reference(scenario.reference, robot, np.arange(round(scenario.duration / TICK) + 1) * TICK).plan
+    estimator = make_estimator(config, robot, period=TICK, plan=plan)
+    assert estimator is not None
+    return estimator
+
+
+class Replay:
+    """Feeds a diagram with samples, which need not be finite, and keeps its outputs."""
+
+    def __init__(self, estimator: EstimatorDiagram):
+        self.estimator, self.context = estimator, estimator.CreateDefaultContext()
+
+    def fork(self) -> "Replay":
+        """A copy that goes on from here."""
+        copy = Replay.__new__(Replay)
+        copy.estimator, copy.context = self.estimator, self.context.Clone()
+        return copy
+
+    def run(self, time: np.ndarray, inputs: Mapping[str, np.ndarray], *channels: str) -> dict[str, np.ndarray]:
+        """Outputs for each sample; by default all.
+
+        A name of the form `system.field` is a field of that system's posterior.
+        """
+        outputs = {name: [] for name in channels or ("friction_estimate", *self.estimator.channels)}
+        for k, now in enumerate(time):
+            self.fix({name: values[k] for name, values in inputs.items()}, now)
+            for name, values in outputs.items():
+                values.append(self._value(name))
+            self.estimator.ExecuteForcedEvents(self.context, publish=False)
+        return {name: np.array(values) for name, values in outputs.items()}
+
+    def fix(self, inputs: Mapping[str, np.ndarray], now: float) -> None:
+        """Puts samples on the input ports."""
+        self.context.SetTime(now)
+        for i in range(self.estimator.num_input_ports()):
+            port = self.estimator.get_input_port(i)
+            port.FixValue(self.context, inputs[port.get_name()])
+
+    def _value(self, name: str) -> np.ndarray:
+        if "." not in name:
+            return self.estimator.GetOutputPort(name).Eval(self.context).copy()
+        system_name, field = name.split(".")
+        system = self.estimator.GetSubsystemByName(system_name)
+        posterior = system.GetOutputPort("posterior").Eval(system.GetMyContextFromRoot(self.context))
+        return posterior[system.fields[field]].copy()
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

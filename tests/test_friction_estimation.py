@@ -1,0 +1,254 @@
+"""From measured friction to its estimate, against textbook filters and the truth of simulated motions."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import scenario
+from rig import CLOCK, TICK, Base, Rig, estimated, pack, part, rms
+
+from fbse_drake import Log, load_scenario
+from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
+from fbse_drake.estimators.friction import (
+    ModelAided,
+    ModelAidedEstimator,
+    RecursiveLeastSquares,
+    RecursiveLeastSquaresEstimator,
+    recursive_least_squares,
+)
+from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
+from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+
+GRAVITY = 9.81
+BASE = Base.of()
+PARTS, MODEL = BASE.monitor.fields.slices, BASE.model.fields.slices
+ACCELERATION = JointAccelerationEstimator(
+    JointAccelerationConfig(),
+    BASE.robot,
+    PARTS,
+    AttitudeEstimator(AttitudeConfig(), BASE.robot, PARTS, MODEL, CLOCK).fields.slices,
+    MODEL,
+    CLOCK,
+)
+PAPER = load_scenario("paper_walk_fbse", "paper_method").estimator
+Run = Callable[..., Log]
+WALK = scenario("paper_walk_fbse", "duration=3")
+
+
+def regressor(velocity: np.ndarray, transition: float = 0.01) -> np.ndarray:
+    """[tanh(w / transition), w], shape (n, 2)."""
+    return np.stack([np.tanh(velocity / transition), velocity], axis=-1)
+
+
+@pytest.mark.parametrize("forgetting", [1.0, 0.995])
+def test_recursive_least_squares_of_all_parameters_at_once(forgetting: float):
+    """Equations (64)-(67) with the paper's 12 parameters of a leg in one covariance, and batch least squares (63)."""
+    generator = np.random.default_rng(2)
+    truth, ticks = generator.uniform(0.5, 5, size=12), 300
+    theta, P = np.zeros(12), 10 * np.eye(12)
+    parameters, covariance = np.zeros((6, 2)), np.tile(10 * np.eye(2), (6, 1, 1))
+    information, weighted = np.eye(12) / 10, np.zeros(12)
+    for _ in range(ticks):
+        phi = regressor(generator.normal(scale=0.1, size=6))
+        Phi = np.zeros((12, 6))
+        for joint in range(6):
+            Phi[2 * joint : 2 * joint + 2, joint] = phi[joint]
+        u = Phi.T @ truth + generator.normal(scale=0.3, size=6)
+        S = forgetting * np.eye(6) + Phi.T @ P @ Phi
+        K = P @ Phi @ np.linalg.inv(S)
+        e = u - Phi.T @ theta
+        theta, P = theta + K @ e, (P - K @ Phi.T @ P) / forgetting
+        parameters, covariance, innovation, variance = recursive_least_squares(parameters, covariance, phi, u, forgetting)
+        np.testing.assert_allclose(parameters.ravel(), theta, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(innovation, e, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(variance, np.diag(S), rtol=1e-8)
+        information, weighted = forgetting * information + Phi @ Phi.T, forgetting * weighted + Phi @ u
+    np.testing.assert_allclose(covariance[3], P[6:8, 6:8], rtol=1e-8)
+    np.testing.assert_allclose(theta, np.linalg.solve(information, weighted), rtol=1e-6)
+    assert np.abs(theta - truth).max() < 1.5
+
+
+class Friction(Rig):
+    """A friction estimator under made-up velocities and residuals."""
+
+    def __init__(self, config: RecursiveLeastSquares | ModelAided):
+        kind = ModelAidedEstimator if isinstance(config, ModelAided) else RecursiveLeastSquaresEstimator
+        self._link = LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, PARTS, MODEL, ACCELERATION.fields.slices, CLOCK)
+        super().__init__(kind(config, BASE.robot, PARTS, self._link.fields.slices, CLOCK))
+        self.fix(support=np.ones(2))
+
+    def see(
+        self,
+        velocity: np.ndarray,
+        residual: np.ndarray,
+        torque: float = 0.01,
+        impulse: float = 1e-8,
+        valid: float = 1,
+        **inputs: np.ndarray,
+    ):
+        noise = {"torque_variance": np.full(12, torque), "impulse_variance": np.full(12, impulse), "valid": np.full(12, valid)}
+        link = pack(self._link, residual=residual, **noise)
+        return self.tick(measurements=BASE.measurements(joint_velocity=velocity), link_torque=link, **inputs)
+
+
+def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_in_swing():
+    generator = np.random.default_rng(3)
+    estimator = Friction(RecursiveLeastSquares(model=CoulombViscousFriction(transition={"all": 1e-6})))
+    truth = generator.uniform(1, 5, size=(12, 2))
+    for _ in range(400):
+        velocity = generator.normal(scale=0.3, size=12)
+        phi = np.stack([np.sign(velocity), velocity], axis=1)
+        residual = (phi * truth).sum(axis=1) + generator.normal(scale=0.05, size=12)
+        posterior = estimator.see(velocity, residual)
+        np.testing.assert_allclose(posterior["friction"], residual, atol=1e-12)
+    parameters = posterior["parameters"].reshape(12, 2)
+    np.testing.assert_allclose(parameters, truth, atol=0.08)
+    # Now the right leg swings, and what is measured there is nonsense.
+    posterior = estimator.see(velocity, np.full(12, 77.0), support=np.array([1.0, 0.0]))
+    np.testing.assert_allclose(posterior["friction"][:6], 77.0)
+    np.testing.assert_allclose(posterior["friction"][6:], (phi * parameters).sum(axis=1)[6:], rtol=1e-9)
+    np.testing.assert_array_equal(posterior["parameters"].reshape(12, 2)[6:], parameters[6:])
+
+
+def test_model_aided_filter_is_the_textbook_kalman_filter():
+    """State [impulse s, parameters, disturbance] with s' = s + T (phi^T parameters + d); measured is s with white noise.
+
+    The measured impulse is the sum of T times the residuals; what the estimator keeps of it is its difference from s.
+    """
+    generator, T = np.random.default_rng(4), TICK
+    config = ModelAided(velocity_smoothing=0.0, parameter_walk=0.05)
+    torque, impulse = 0.02, 3e-7
+    estimator = Friction(config)
+    last = generator.normal(scale=0.1, size=12)
+    estimator.see(last, np.zeros(12), torque, impulse)
+    P = np.tile(np.diag([0, *[config.parameter_uncertainty**2] * 2, config.disturbance_uncertainty**2]), (12, 1, 1))
+    X, y, H = np.zeros((12, 4)), np.zeros(12), np.array([[1.0, 0, 0, 0]])
+    Q = np.diag([T**2 * torque, *[config.parameter_walk**2 * T] * 2, config.disturbance_walk**2 * T])
+    for _ in range(300):
+        velocity, residual = last + generator.normal(scale=0.02, size=12), generator.normal(scale=2, size=12)
+        y += T * residual
+        phi = regressor(0.5 * (velocity + last))
+        last = velocity
+        posterior = estimator.see(velocity, residual, torque, impulse)
+        for j in range(12):
+            F = np.eye(4)
+            F[0, 1:] = T * phi[j, 0], T * phi[j, 1], T
+            X[j], P[j] = F @ X[j], F @ P[j] @ F.T + Q
+            S = (H @ P[j] @ H.T)[0, 0] + impulse
+            K, e = P[j] @ H[0] / S, y[j] - X[j, 0]
+            X[j], P[j] = X[j] + K * e, P[j] - np.outer(K, H @ P[j])
+            assert posterior["innovation"][j] == pytest.approx(e, rel=1e-6, abs=1e-9)
+            assert posterior["innovation_variance"][j] == pytest.approx(S, rel=1e-6)
+        np.testing.assert_allclose(posterior["parameters"].reshape(12, 2), X[:, 1:3], rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(posterior["disturbance"], X[:, 3], rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(posterior["impulse"], y - X[:, 0], rtol=1e-6, atol=1e-10)
+        np.testing.assert_allclose(posterior["friction"], (phi * X[:, 1:3]).sum(axis=1) + X[:, 3], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(posterior["covariance"].reshape(12, 4, 4), P, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(posterior["parameter_variance"].reshape(12, 2), P[:, [1, 2], [1, 2]], rtol=1e-6)
+
+
+def believed_world(believed: float) -> tuple[float, float]:
+    """Mean normalized innovation squared of the model-aided filter, and the friction's rms error over that of the residual.
+
+    Args:
+        believed: the filter's noise over the true one.
+    """
+    generator, T, ticks = np.random.default_rng(5), TICK, 1500
+    config = ModelAided(velocity_smoothing=0.0)
+    estimator = Friction(config)
+    sigma_torque, sigma_impulse = 0.2, 1e-3
+    parameters = generator.normal(scale=config.parameter_uncertainty, size=(12, 2))
+    d = generator.normal(scale=config.disturbance_uncertainty, size=12)
+    time = np.arange(ticks) * T
+    velocity = 0.2 * np.sin(2 * np.pi * np.outer(time, np.linspace(1, 3, 12)))
+    noise, nis, error, raw = np.zeros(12), [], [], []
+    estimator.see(velocity[0], np.zeros(12))
+    for k in range(1, ticks):
+        friction = (regressor(0.5 * (velocity[k] + velocity[k - 1])) * parameters).sum(axis=1) + d
+        previous, noise = noise, generator.normal(scale=sigma_impulse, size=12)
+        residual = friction + generator.normal(scale=sigma_torque, size=12) + (noise - previous) / T
+        posterior = estimator.see(velocity[k], residual, (believed * sigma_torque) ** 2, (believed * sigma_impulse) ** 2)
+        nis.append(posterior["innovation"] ** 2 / posterior["innovation_variance"])
+        error.append(posterior["friction"] - friction)
+        raw.append(residual - friction)
+        d = d + generator.normal(scale=config.disturbance_walk * math.sqrt(T), size=12)
+    np.testing.assert_allclose(posterior["parameters"].reshape(12, 2), parameters, atol=1.0)
+    return float(np.mean(nis)), rms(error[500:]) / rms(raw[500:])
+
+
+def test_model_aided_filter_is_consistent():
+    nis, ratio = believed_world(1.0)
+    # 18000 values of chi-square with one degree of freedom, 4 sigma.
+    assert nis == pytest.approx(1, abs=4 * math.sqrt(2 / 18000))
+    assert ratio < 0.2
+    # The negative case: it believes in a third of the noise.
+    assert believed_world(1 / 3)[0] > 5
+
+
+def test_model_aided_filter_leaves_an_unmeasured_joint_to_its_model():
+    generator = np.random.default_rng(6)
+    estimator = Friction(ModelAided(velocity_smoothing=0.0, disturbance_uncertainty=0.0, disturbance_walk=0.0))
+    truth = np.array([3.0, 2.0])
+    last = np.zeros(12)
+    for _ in range(1000):
+        velocity = generator.normal(scale=0.1, size=12)
+        mean = 0.5 * (velocity + last)
+        last = velocity
+        estimator.see(velocity, regressor(mean) @ truth)
+    for _ in range(50):
+        velocity = generator.normal(scale=0.1, size=12)
+        mean = 0.5 * (velocity + last)
+        last = velocity
+        posterior = estimator.see(velocity, np.full(12, 77.0), valid=0)
+        np.testing.assert_allclose(posterior["friction"], regressor(mean) @ truth, atol=0.05)
+
+
+def friction_error(log: Log, result: Log) -> np.ndarray:
+    """Root mean square error of the friction estimate by joint [Nm], without the first 0.3 s."""
+    error = result["estimate/joint/friction_torque"][1:] - log["truth/joint/friction_torque"][:-1]
+    return np.sqrt(np.mean(error[300:] ** 2, axis=0))
+
+
+def test_friction_of_a_walk_is_estimated(run: Run):
+    """Measured, mean over the joints: 12 % of the friction by the best variant, 36 % by the disturbance observer, 93 % by the paper's."""
+    log = run("paper_walk_fbse", "duration=3")
+    truth = np.sqrt(np.mean(log["truth/joint/friction_torque"][300:] ** 2, axis=0))
+    best = friction_error(log, log)
+    assert np.all(best < 0.12 * truth + 0.06)
+    for config in (DisturbanceObserver(), PAPER):
+        other = friction_error(log, estimated(log, WALK, config))
+        assert other.mean() > 2 * best.mean()
+
+
+def test_no_friction_no_estimate(run: Run):
+    """The negative case: the robot has no friction. Measured at most 0.06 Nm, 0.40 Nm by the observer."""
+    log = part(run("paper_walk", "duration=3", "robot.effects=null"), 2.0)
+    assert np.all(log["truth/joint/friction_torque"] == 0)
+    for config, largest in ((Fbse(), 0.12), (DisturbanceObserver(), 0.8)):
+        result = estimated(log, WALK, config)
+        assert friction_error(log, result).max() < largest
+        # No bias either.
+        assert np.abs(result["estimate/joint/friction_torque"][300:].mean(axis=0)).max() < 0.04
+
+
+def test_nothing_is_identified_while_nothing_moves(run: Run):
+    log = run("squat", "duration=2", "reference.amplitude=0")
+    squat = scenario("squat", "duration=2", "reference.amplitude=0")
+    for config, largest in ((Fbse(), 2.0), (PAPER, 5.0)):
+        result = estimated(log, squat, config)
+        parameters = result["estimate/friction/parameters"]
+        # They settle near zero.
+        assert np.abs(parameters[1000:]).max() < largest
+        assert np.all(result["estimate/friction/parameter_variance"][1:] > 0)
+        variance = result["estimate/friction/parameter_variance"]
+        assert np.all(variance[-1] <= variance[1])
+        if config != PAPER:
+            assert friction_error(log, result).max() < 0.1
+    # The negative case: an estimator that forgets is less and less sure of what does not show.
+    winding_up = dataclasses.replace(PAPER, friction=RecursiveLeastSquares(forgetting=0.99))
+    variance = estimated(log, squat, winding_up)["estimate/friction/parameter_variance"]
+    assert np.all(variance[-1, :, 1] > 10 * variance[1, :, 1])
