@@ -22,7 +22,7 @@ from fbse_drake.estimators.recursive import RecursiveEstimator
 from fbse_drake.robot.plant import make_robot
 
 _DURATION = 8.0
-_STRETCH = 100
+_STRETCH = 1
 # Times a sample of the log, in order; returns durations [s].
 Timer = Callable[[int], list[float]]
 
@@ -108,7 +108,7 @@ def main() -> None:
         for timer, values in zip(timers, durations, strict=True):
             values.extend(timer(sample) for sample in range(start, min(start + _STRETCH, len(log.time))))
     # The first stretch compiles and warms up.
-    bare, tick, shares = (1e6 * np.array(values[_STRETCH:]) for values in durations)
+    bare, tick, shares = (1e6 * np.array(values[100:]) for values in durations)
     print(f"{name}, {len(tick)} ticks [us]")
     print(f"bare Drake calls   median {np.median(bare):6.1f}")
     p99, ratio = np.percentile(tick, 99), np.median(tick) / np.median(bare)

@@ -67,25 +67,29 @@ def _plant_state(
 
 
 @njit(cache=True)
-def _put_dynamics(
+def _put_terms(
     posterior: np.ndarray,
+    state: np.ndarray,
     M: np.ndarray,
     bias: np.ndarray,
-    state: np.ndarray,
+    feet: tuple[tuple[np.ndarray, np.ndarray], ...],
     order: np.ndarray,
     v_index: np.ndarray,
     places: tuple[int, ...],
 ) -> None:
-    """Puts the joint rows of mass matrix and bias, the centre of mass and the velocity into a posterior of `FloatingBaseModel`.
+    """Fills a posterior of `FloatingBaseModel` from what Drake says of the plant.
 
     Args:
-        M, bias: of the whole plant, in its order of velocities.
         state: [positions, velocities] of the plant.
+        M, bias: mass matrix and bias of the whole plant, in its order of velocities.
+        feet: Jacobian (6, velocities of the plant) and bias acceleration (6,) of each sole.
         order: place of each of our velocities in the plant's, shape (6 + n,); v_index: in its state.
         places: of the fields, see the first line.
     """
-    mass_matrix, bias_at, com, velocity = places
+    mass_matrix, bias_at, com, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = places
     v, posterior[STATUS] = len(order), 0.0
+    for i in range(v):
+        posterior[velocity + i] = state[v_index[i]]
     for i in range(6, v):
         row = mass_matrix + (i - 6) * v
         for j in range(v):
@@ -94,32 +98,24 @@ def _put_dynamics(
     # The base's block of H is [[I, m [c]x], [-m [c]x, m]], for the base stands upright.
     x, y, z, mass = order[0], order[1], order[2], M[order[3], order[3]]
     put(posterior, com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
-    for i in range(v):
-        posterior[velocity + i] = state[v_index[i]]
-
-
-@njit(cache=True)
-def _put_foot(
-    posterior: np.ndarray, foot: int, J: np.ndarray, bias: np.ndarray, X_BF: np.ndarray, order: np.ndarray, places: tuple[int, ...]
-) -> None:
-    """Puts the kinematics of a foot into a posterior of `FloatingBaseModel`.
-
-    Args:
-        J: (6, velocities of the plant), bias: (6,), X_BF: (3, 4), see `FloatingBaseModel`.
-        order: place of each of our velocities in the plant's, shape (6 + n,).
-        places: of the fields, see the first line.
-    """
-    foot_jacobian, foot_bias, foot_position, foot_rotation = places
-    v = len(order)
-    for i in range(6):
-        row = foot_jacobian + (6 * foot + i) * v
-        for j in range(v):
-            posterior[row + j] = J[i, order[j]]
-        posterior[foot_bias + 6 * foot + i] = bias[i]
-    for i in range(3):
-        for j in range(3):
-            posterior[foot_rotation + 9 * foot + 3 * i + j] = X_BF[i, j]
-        posterior[foot_position + 3 * foot + i] = X_BF[i, 3]
+    for foot in range(len(feet)):
+        J, acceleration = feet[foot]
+        for i in range(6):
+            row = foot_jacobian + (6 * foot + i) * v
+            for j in range(v):
+                posterior[row + j] = J[i, order[j]]
+            posterior[foot_bias + 6 * foot + i] = acceleration[i]
+        # The base's columns of J hold the foot's pose: in the rows of linear velocity they are [-R_FB [p_BF]x, R_FB].
+        R_BF = posterior[foot_rotation + 9 * foot : foot_rotation + 9 * foot + 9].reshape(3, 3)
+        for i in range(3):
+            for j in range(3):
+                R_BF[j, i] = J[3 + i, order[3 + j]]
+        p = posterior[foot_position + 3 * foot :]
+        p[0] = p[1] = p[2] = 0.0
+        for k in range(3):
+            p[0] -= R_BF[2, k] * J[3 + k, y]
+            p[1] -= R_BF[0, k] * J[3 + k, z]
+            p[2] -= R_BF[1, k] * J[3 + k, x]
 
 
 class FloatingBaseModel(RecursiveEstimator):
@@ -175,8 +171,8 @@ class FloatingBaseModel(RecursiveEstimator):
         self._q_index, self._v_index = robot.position_index, robot.plant.num_positions() + self._order
         self._state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(robot.plant.num_velocities())])
         self._measured_places = starts(measurements, "joint_position", "joint_velocity", "angular_velocity")
-        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "velocity")
-        self._foot_places = starts(self.fields.slices, "foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
+        feet = ("foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
+        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "velocity", *feet)
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
         self.DeclareStateOutputPort("at_step_start", self._last)
@@ -189,10 +185,15 @@ class FloatingBaseModel(RecursiveEstimator):
             return
         _plant_state(state, measured, self._q_index, self._v_index, self._measured_places, self._R_BI)
         plant.SetPositionsAndVelocities(now, state)
+        world, wrt = self._world, JacobianWrtVariable.kV
+        feet = tuple(
+            [
+                (
+                    plant.CalcJacobianSpatialVelocity(now, wrt, sole, _ORIGIN, world, sole),
+                    plant.CalcBiasSpatialAcceleration(now, wrt, sole, _ORIGIN, world, sole).get_coeffs(),
+                )
+                for sole in self._soles
+            ]
+        )
         M, bias = plant.CalcMassMatrix(now), plant.CalcBiasTerm(now)
-        _put_dynamics(posterior, M, bias, state, order, self._v_index, self._places)
-        for foot, sole in enumerate(self._soles):
-            J = plant.CalcJacobianSpatialVelocity(now, JacobianWrtVariable.kV, sole, _ORIGIN, self._world, sole)
-            A = plant.CalcBiasSpatialAcceleration(now, JacobianWrtVariable.kV, sole, _ORIGIN, self._world, sole)
-            X_BF = sole.CalcPoseInWorld(now).GetAsMatrix34()
-            _put_foot(posterior, foot, J, A.get_coeffs(), X_BF, order, self._foot_places)
+        _put_terms(posterior, state, M, bias, feet, order, self._v_index, self._places)

@@ -133,6 +133,4 @@ class RecursiveEstimator(LeafSystem):
             posterior[0] = math.nan  # Nothing to start from yet.
 
     def _remember(self, context: Context, state: State) -> None:
-        posterior = self._posterior.Eval(context)
-        if not math.isnan(posterior.item(0)):
-            state.get_mutable_discrete_state().set_value(self._last, posterior)
+        state.get_mutable_discrete_state().set_value(self._last, self._posterior.Eval(context))
