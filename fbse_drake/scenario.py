@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from fbse_drake import resources, schema
 from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
+from fbse_drake.effects.friction import FrictionModel
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
@@ -29,7 +29,7 @@ from fbse_drake.sensors.joint_torque import JointTorqueConfig
 from fbse_drake.walking.reference import ReferenceConfig
 from fbse_drake.walking.walk import Walk
 
-JointEffectConfig = StribeckFriction | CoulombViscousFriction
+JointEffectConfig = FrictionModel
 
 
 @dataclass(frozen=True)

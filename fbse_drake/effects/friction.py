@@ -66,3 +66,7 @@ class CoulombViscousFriction(JointTorqueEffect):
         (transition,) = nonlinear
         tanh = np.tanh(motion.velocity / transition)
         return (tanh, motion.velocity), ((1.0 - tanh * tanh) / transition, 1.0)
+
+
+# The friction laws that a scenario can name.
+FrictionModel = StribeckFriction | CoulombViscousFriction

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.foot_pads import leg_of_joint
@@ -27,8 +27,9 @@ def _adopted_model() -> CoulombViscousFriction:
 class RecursiveLeastSquares:
     """Recursive least squares (64)-(67), one joint at a time: the covariance of the paper's 12 parameters never couples joints."""
 
-    # Adopted friction model, linear in what is identified; by default (57) with a sharp sign. Its linear values are where it starts.
-    model: CoulombViscousFriction = field(default_factory=_adopted_model)
+    # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are identified, from their values here on; the others
+    # stay as they are.
+    model: FrictionModel = field(default_factory=_adopted_model)
     # Initial covariance of every parameter, Table II.
     covariance: float = 10.0
     # Weight that a tick of 1 ms keeps after the next; 1 never forgets.
@@ -61,8 +62,8 @@ class ModelAided:
     features come from the model without delay, and the measurement decides over everything slower.
     """
 
-    # Friction model, linear in what is identified; its linear values are where it starts.
-    model: CoulombViscousFriction = field(default_factory=CoulombViscousFriction)
+    # Friction model, of which the linear parameters are identified, from their values here on; the others stay as they are.
+    model: FrictionModel = field(default_factory=CoulombViscousFriction)
     # Initial standard deviation of every parameter [its unit].
     parameter_uncertainty: float = 3.0
     # Random walk of d [Nm/sqrt(s)], and its initial standard deviation [Nm].

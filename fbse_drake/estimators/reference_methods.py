@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import Context, State
 
-from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
+from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
@@ -52,7 +52,7 @@ class DisturbanceObserver:
 class FixedFriction:
     """A friction model with parameters identified beforehand, evaluated at the measured velocity."""
 
-    model: CoulombViscousFriction | StribeckFriction = field(default_factory=CoulombViscousFriction)
+    model: FrictionModel = field(default_factory=CoulombViscousFriction)
 
 
 class TrueFrictionSource(RecursiveEstimator):
