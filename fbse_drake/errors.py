@@ -15,3 +15,17 @@ def located(where: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{where}{error}") from None
+
+
+def require_positive(config: object, *names: str) -> None:
+    """Refuses a configuration in which one of these numbers is not > 0."""
+    for name in names:
+        if not getattr(config, name) > 0:
+            raise InputError(f"{name}: expected a number > 0, found {getattr(config, name):g}")
+
+
+def require_not_negative(config: object, *names: str) -> None:
+    """Refuses a configuration in which one of these numbers is < 0."""
+    for name in names:
+        if not getattr(config, name) >= 0:
+            raise InputError(f"{name}: expected a number >= 0, found {getattr(config, name):g}")

@@ -17,7 +17,7 @@ from fbse_drake import resources, schema
 from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.friction import FrictionModel
-from fbse_drake.errors import InputError, located
+from fbse_drake.errors import InputError, located, require_positive
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import load_description
@@ -115,8 +115,7 @@ class Scenario:
     log: LogConfig = field(default_factory=LogConfig)
 
     def __post_init__(self) -> None:
-        if self.duration <= 0:
-            raise InputError(f"duration: expected a number > 0, found {self.duration:g}")
+        require_positive(self, "duration")
         if self.seed < 0:
             raise InputError(f"seed: expected a whole number >= 0, found {self.seed}")
         for key in ("time_step", "stiction_tolerance", "penetration_allowance"):

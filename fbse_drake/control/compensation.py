@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.description import RobotDescription
 
@@ -50,9 +50,7 @@ class FeedforwardCompensation:
     limit: float = 50.0
 
     def __post_init__(self) -> None:
-        for name in ("cutoff", "limit"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "cutoff", "limit")
         if not 0 <= self.share <= 1:
             raise InputError(f"share: expected a number in [0, 1], found {self.share:g}")
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_positive
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.sampling import is_tick
 
@@ -36,8 +36,7 @@ class PositionLoopConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        if self.period <= 0:
-            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+        require_positive(self, "period")
         for name in ("kp", "kd", "torque_limit"):
             values: Mapping[str, Any] = getattr(self, name)
             for joint, value in values.items():

@@ -9,7 +9,7 @@ from numba import njit
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.estimators.spatial import (
@@ -63,19 +63,16 @@ class AttitudeConfig:
     stance_time: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in (
+        require_not_negative(
+            self,
             "acceleration_bias",
             "angular_velocity_bias",
             "angular_velocity_noise",
             "standing_time",
             "standing_acceleration",
             "level_feet",
-        ):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
-        for name in ("acceleration_noise", "motion_acceleration", "motion_time", "stance_time"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        )
+        require_positive(self, "acceleration_noise", "motion_acceleration", "motion_time", "stance_time")
 
 
 class GravityEstimate(NamedTuple):

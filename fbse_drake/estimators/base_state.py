@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
@@ -42,9 +42,7 @@ class AdaptiveLipm:
     process_memory: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("process_noise", "measurement_noise", "covariance", "measurement_memory", "process_memory"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "process_noise", "measurement_noise", "covariance", "measurement_memory", "process_memory")
 
 
 @dataclass(frozen=True)
@@ -63,11 +61,8 @@ class ContactAided:
     acceleration_error_time: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("acceleration_noise", "position_noise", "velocity_noise", "acceleration_error_time"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
-        if self.acceleration_error < 0:
-            raise InputError(f"acceleration_error: expected a number >= 0, found {self.acceleration_error:g}")
+        require_positive(self, "acceleration_noise", "position_noise", "velocity_noise", "acceleration_error_time")
+        require_not_negative(self, "acceleration_error")
 
 
 BaseStateConfig = AdaptiveLipm | ContactAided
@@ -435,28 +430,21 @@ def predict_contact_aided(
 
 
 @njit(cache=True)
-def update_position(x: ContactAidedEstimate, innovation: Vector, S: float) -> ContactAidedEstimate:
-    """Kalman update with a measured position; S: variance of the innovation per axis [m^2]."""
+def update_contact_aided(x: ContactAidedEstimate, innovation: Vector, covariance: Vector, S: float) -> ContactAidedEstimate:
+    """Kalman update with a measured position or velocity.
+
+    Args:
+        covariance: of position, velocity and acceleration error with what is measured, per axis.
+        S: variance of the innovation per axis.
+    """
     pp, pv, pa, vv, va, aa = x.covariance
-    kp, kv, ka = pp / S, pv / S, pa / S
+    cp, cv, ca = covariance
+    kp, kv, ka = scale(1.0 / S, covariance)
     return ContactAidedEstimate(
         add(x.position, scale(kp, innovation)),
         add(x.velocity, scale(kv, innovation)),
         add(x.acceleration_error, scale(ka, innovation)),
-        ContactAidedCovariance(pp - kp * pp, pv - kp * pv, pa - kp * pa, vv - kv * pv, va - kv * pa, aa - ka * pa),
-    )
-
-
-@njit(cache=True)
-def update_velocity(x: ContactAidedEstimate, innovation: Vector, S: float) -> ContactAidedEstimate:
-    """Kalman update with a measured velocity; S: variance of the innovation per axis [(m/s)^2]."""
-    pp, pv, pa, vv, va, aa = x.covariance
-    kp, kv, ka = pv / S, vv / S, va / S
-    return ContactAidedEstimate(
-        add(x.position, scale(kp, innovation)),
-        add(x.velocity, scale(kv, innovation)),
-        add(x.acceleration_error, scale(ka, innovation)),
-        ContactAidedCovariance(pp - kp * pv, pv - kp * vv, pa - kp * va, vv - kv * vv, va - kv * va, aa - ka * va),
+        ContactAidedCovariance(pp - kp * cp, pv - kp * cv, pa - kp * ca, vv - kv * cv, va - kv * ca, aa - ka * ca),
     )
 
 
@@ -510,12 +498,14 @@ def _estimate_base_state(
             noise = acceleration_noise
         x = predict_contact_aided(x, acceleration, noise, acceleration_error, acceleration_error_time, elapsed)
         if legs.stands:
-            innovation, S = subtract(legs.position, x.position), x.covariance.pp + position_noise**2
-            x = update_position(x, innovation, S)
+            P, innovation = x.covariance, subtract(legs.position, x.position)
+            S = P.pp + position_noise**2
+            x = update_contact_aided(x, innovation, (P.pp, P.pv, P.pa), S)
             put(posterior, innovation_at, innovation)
             posterior[variance_at] = S
-            innovation, S = subtract(legs.velocity, x.velocity), x.covariance.vv + velocity_noise**2
-            x = update_velocity(x, innovation, S)
+            P, innovation = x.covariance, subtract(legs.velocity, x.velocity)
+            S = P.vv + velocity_noise**2
+            x = update_contact_aided(x, innovation, (P.pv, P.vv, P.va), S)
             put(posterior, innovation_at + 3, innovation)
             posterior[variance_at + 1] = S
     end = put(posterior, base_position, x.position)

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.foot_pads import leg_of_joint
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.robot.plant import Robot
@@ -44,11 +44,8 @@ class RecursiveLeastSquares:
     def __post_init__(self) -> None:
         if not 0 < self.forgetting <= 1:
             raise InputError(f"forgetting: expected a number in (0, 1], found {self.forgetting:g}")
-        if self.covariance <= 0:
-            raise InputError(f"covariance: expected a number > 0, found {self.covariance:g}")
-        for name in ("reset_period", "cutoff"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        require_positive(self, "covariance")
+        require_not_negative(self, "reset_period", "cutoff")
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
 
@@ -77,9 +74,9 @@ class ModelAided:
     swing: str = "measurement"
 
     def __post_init__(self) -> None:
-        for name in ("parameter_uncertainty", "disturbance_walk", "disturbance_uncertainty", "parameter_walk", "velocity_smoothing"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        require_not_negative(
+            self, "parameter_uncertainty", "disturbance_walk", "disturbance_uncertainty", "parameter_walk", "velocity_smoothing"
+        )
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
 

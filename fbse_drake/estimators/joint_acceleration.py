@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.estimators.spatial import Rotation, Vector, put, rotate, rotate_back, rotation_at, scale, subtract, vector_at
@@ -32,15 +32,9 @@ class JointAccelerationConfig:
     def __post_init__(self) -> None:
         if self.method not in ("minimum_norm", "gyro", "fused"):
             raise InputError(f"method: expected minimum_norm, gyro or fused, found {self.method}")
-        for name in (
-            "acceleration_noise",
-            "angular_velocity_noise",
-            "joint_velocity_noise",
-            "foot_angular_acceleration",
-            "foot_acceleration",
-        ):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(
+            self, "acceleration_noise", "angular_velocity_noise", "joint_velocity_noise", "foot_angular_acceleration", "foot_acceleration"
+        )
 
 
 def minimum_norm(J: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context, State
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_positive
 from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches, leg_of_joint
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.robot.plant import Robot, grasp_map
@@ -24,9 +24,7 @@ class LinkTorqueConfig:
     force_noise: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("acceleration_noise", "angular_velocity_noise", "joint_velocity_noise", "force_noise"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "acceleration_noise", "angular_velocity_noise", "joint_velocity_noise", "force_noise")
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, State
 
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_positive
 from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot
@@ -32,8 +32,7 @@ class TorqueSensor:
     cutoff: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.cutoff <= 0:
-            raise InputError(f"cutoff: expected a number > 0, found {self.cutoff:g}")
+        require_positive(self, "cutoff")
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,7 @@ class DisturbanceObserver:
     bandwidth: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.bandwidth <= 0:
-            raise InputError(f"bandwidth: expected a number > 0, found {self.bandwidth:g}")
+        require_positive(self, "bandwidth")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot
@@ -28,9 +28,7 @@ class SensorMonitorConfig:
     lost_after: float = 0.5e-3
 
     def __post_init__(self) -> None:
-        for name in ("stuck_after", "lost_after"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "stuck_after", "lost_after")
         if not 0 <= self.smallest_load_share < 1:
             raise InputError(f"smallest_load_share: expected a number in [0, 1), found {self.smallest_load_share:g}")
 

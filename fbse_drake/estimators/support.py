@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative
 from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.robot.plant import Robot
@@ -31,8 +31,7 @@ class MeasuredSupport:
     def __post_init__(self) -> None:
         if not 0 < self.off <= self.on < 0.5:
             raise InputError(f"on, off: expected 0 < off <= on < 0.5, found on {self.on:g}, off {self.off:g}")
-        if self.debounce < 0:
-            raise InputError(f"debounce: expected a number >= 0, found {self.debounce:g}")
+        require_not_negative(self, "debounce")
 
 
 SupportConfig = PlannedSupport | MeasuredSupport

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.robot.description import RobotDescription, load_description
 
 
@@ -29,11 +29,8 @@ class Ground:
     dissipation: float = 100.0
 
     def __post_init__(self) -> None:
-        if self.stiffness <= 0:
-            raise InputError(f"stiffness: expected a number > 0, found {self.stiffness:g}")
-        for name in ("friction", "dissipation"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        require_positive(self, "stiffness")
+        require_not_negative(self, "friction", "dissipation")
 
 
 @dataclass(frozen=True)

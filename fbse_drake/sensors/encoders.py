@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 
@@ -26,13 +26,10 @@ class EncoderConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        for name in ("resolution", "noise", "velocity_noise"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        require_not_negative(self, "resolution", "noise", "velocity_noise")
         if self.velocity not in ("exact", "differenced"):
             raise InputError(f"velocity: expected exact or differenced, found {self.velocity}")
-        if self.period <= 0:
-            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+        require_positive(self, "period")
 
 
 def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:

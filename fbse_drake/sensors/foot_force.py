@@ -8,7 +8,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Adder, DiscreteTimeDelay, Gain, Saturation
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
@@ -29,12 +29,8 @@ class FootForceConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        for name in ("noise", "delay"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
-        for name in ("gain", "range", "period"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_not_negative(self, "noise", "delay")
+        require_positive(self, "gain", "range", "period")
 
 
 class PadForces(LeafSystem):

@@ -9,7 +9,7 @@ from pydrake.systems.sensors import Accelerometer, Gyroscope
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
@@ -33,14 +33,11 @@ class ImuConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        for name in ("acceleration_noise", "angular_velocity_noise", "acceleration_bias_walk", "angular_velocity_bias_walk"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected a number >= 0, found {getattr(self, name):g}")
+        require_not_negative(self, "acceleration_noise", "angular_velocity_noise", "acceleration_bias_walk", "angular_velocity_bias_walk")
         for name in ("acceleration_bias", "angular_velocity_bias", "misalignment"):
             if len(getattr(self, name)) != 3:
                 raise InputError(f"{name}: expected three numbers, found {getattr(self, name)}")
-        if self.period <= 0:
-            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+        require_positive(self, "period")
 
 
 def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:

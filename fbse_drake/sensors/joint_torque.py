@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 
@@ -19,10 +19,8 @@ class JointTorqueConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        if self.noise < 0:
-            raise InputError(f"noise: expected a number >= 0, found {self.noise:g}")
-        if self.period <= 0:
-            raise InputError(f"period: expected a number > 0, found {self.period:g}")
+        require_not_negative(self, "noise")
+        require_positive(self, "period")
 
 
 class TransmittedTorque(LeafSystem):

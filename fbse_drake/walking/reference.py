@@ -9,7 +9,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_positive
 from fbse_drake.robot.plant import Robot
 from fbse_drake.walking.leg_kinematics import LegKinematics, LegMotion, UnreachableError
 from fbse_drake.walking.plan import PointMotion, TaskPlan
@@ -37,8 +37,7 @@ class JointSines:
     ramp: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.ramp <= 0:
-            raise InputError(f"ramp: expected a number > 0, found {self.ramp:g}")
+        require_positive(self, "ramp")
 
 
 ReferenceConfig = Walk | Squat | Sway | JointSines

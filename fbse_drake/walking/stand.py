@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import require_positive
 from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
 
 
@@ -44,9 +44,7 @@ class _Stand:
     zmp_margin: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("frequency", "ramp", "com_height", "foot_spacing"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "frequency", "ramp", "com_height", "foot_spacing")
 
     def _plan(
         self, axis: int, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PPoly
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.walking.lipm import LipmTrajectory, solve_lipm
 from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
 
@@ -43,13 +43,10 @@ class Walk:
     start: float = -0.025
 
     def __post_init__(self) -> None:
-        for name in ("initial_double_support", "single_support", "double_support", "com_height", "foot_spacing"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name}: expected a number > 0, found {getattr(self, name):g}")
+        require_positive(self, "initial_double_support", "single_support", "double_support", "com_height", "foot_spacing")
         if self.single_supports < 1:
             raise InputError(f"single_supports: expected a whole number >= 1, found {self.single_supports}")
-        if self.step_height < 0:
-            raise InputError(f"step_height: expected a number >= 0, found {self.step_height:g}")
+        require_not_negative(self, "step_height")
 
     def phases(self, sides: tuple[str, str], duration: float) -> list[Phase]:
         """Double and single supports in turn, up to the end of the last double support or `duration`, whichever is later.
