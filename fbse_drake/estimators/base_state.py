@@ -17,7 +17,6 @@ from fbse_drake.estimators.spatial import (
     Rotation,
     Vector,
     add,
-    cross,
     put,
     rotate,
     rotate_back,
@@ -467,7 +466,7 @@ def _estimate_base_state(
     """One tick of `ContactAidedEstimator`; fills the posterior.
 
     Args:
-        leg_places: see `_follow_legs`; places: of what is read and written besides, see the first lines.
+        leg_places: see `_follow_legs`; places: of what is read and written besides, see the first lines; after `com` comes `com_velocity`.
         frames: where the middle of the soles is at the start, rotation and lever arm of the IMU, gravity.
         config: the values of `ContactAided`.
     """
@@ -476,15 +475,20 @@ def _estimate_base_state(
     origin, R_BI, p_BI, gravity = frames
     R_WB, w_B = rotation_at(attitude, rotation), vector_at(attitude, angular_velocity)
     legs = _follow_legs(posterior, last, elapsed, measured, R_WB, model, support, pad_position, pad_foot, leg_places, origin)
-    offset = scale(-1.0, rotate(R_WB, vector_at(model, com)))  # c_offset: from CoM to base
     w_W = rotate(R_WB, w_B)
     covariance_at, innovation_at, variance_at, rate_at = further + 3, further + 9, further + 15, further + 17
-    P = covariance_at
     x = ContactAidedEstimate(
         vector_at(posterior, base_position),
         vector_at(posterior, base_position + 3),
         vector_at(posterior, further),
-        ContactAidedCovariance(last[P], last[P + 1], last[P + 2], last[P + 3], last[P + 4], last[P + 5]),
+        ContactAidedCovariance(
+            last[covariance_at],
+            last[covariance_at + 1],
+            last[covariance_at + 2],
+            last[covariance_at + 3],
+            last[covariance_at + 4],
+            last[covariance_at + 5],
+        ),
     )
     if math.isnan(elapsed):
         P_first = ContactAidedCovariance(position_noise**2, 0.0, 0.0, velocity_noise**2, 0.0, acceleration_error**2)
@@ -510,8 +514,9 @@ def _estimate_base_state(
             posterior[variance_at + 1] = S
     end = put(posterior, base_position, x.position)
     end = put(posterior, end, x.velocity)
-    end = put(posterior, end, subtract(x.position, offset))
-    put(posterior, end, subtract(x.velocity, cross(w_W, offset)))
+    # Posture and leg motion take the base to the centre of mass.
+    end = put(posterior, end, add(x.position, rotate(R_WB, vector_at(model, com))))
+    put(posterior, end, add(x.velocity, rotate(R_WB, vector_at(model, com + 3))))
     put(posterior, further, x.acceleration_error)
     put(posterior, covariance_at, x.covariance)
     put(posterior, rate_at, w_W)

@@ -86,7 +86,7 @@ def _put_terms(
         order: place of each of our velocities in the plant's, shape (6 + n,); v_index: in its state.
         places: of the fields, see the first line.
     """
-    mass_matrix, bias_at, com, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = places
+    mass_matrix, bias_at, com, com_velocity, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = places
     v, posterior[STATUS] = len(order), 0.0
     for i in range(v):
         posterior[velocity + i] = state[v_index[i]]
@@ -98,6 +98,11 @@ def _put_terms(
     # The base's block of H is [[I, m [c]x], [-m [c]x, m]], for the base stands upright.
     x, y, z, mass = order[0], order[1], order[2], M[order[3], order[3]]
     put(posterior, com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
+    # Its rows of linear velocity give the momentum.
+    for i in range(3):
+        posterior[com_velocity + i] = 0.0
+        for j in range(v):
+            posterior[com_velocity + i] += M[order[3 + i], order[j]] * posterior[velocity + j] / mass
     for foot in range(len(feet)):
         J, acceleration = feet[foot]
         for i in range(6):
@@ -142,6 +147,7 @@ class FloatingBaseModel(RecursiveEstimator):
         foot_position   (f, 3)     p_BF_B [m]
         foot_rotation   (f, 3, 3)  R_BF
         com             (3,)       p_BC_B, of the centre of mass [m]; minus c_offset of the paper
+        com_velocity    (3,)       of the centre of mass while the base's origin rests [m/s]
         velocity        (v,)       [angular velocity, 0, joint velocities]
     """
 
@@ -158,6 +164,7 @@ class FloatingBaseModel(RecursiveEstimator):
                 "foot_position": f * 3,
                 "foot_rotation": f * 9,
                 "com": 3,
+                "com_velocity": 3,
                 "velocity": v,
             },
             clock,
@@ -172,7 +179,7 @@ class FloatingBaseModel(RecursiveEstimator):
         self._state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(robot.plant.num_velocities())])
         self._measured_places = starts(measurements, "joint_position", "joint_velocity", "angular_velocity")
         feet = ("foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
-        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "velocity", *feet)
+        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "com_velocity", "velocity", *feet)
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
         self.DeclareStateOutputPort("at_step_start", self._last)
