@@ -28,7 +28,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop
 	$(VENV)/bin/python -m benchmarks.estimator_tick
 
-# How good the friction estimate is, in tables: ten seeds of every walk, some ten minutes.
+# How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores.
 fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.fbse
 
