@@ -5,24 +5,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Parameter
-
-
-@njit(cache=True)
-def _smooth_sign(velocity: np.ndarray, transition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """tanh(velocity / transition) and its slope."""
-    tanh = np.tanh(velocity / transition)
-    return tanh, (1.0 - tanh * tanh) / transition
-
-
-@njit(cache=True)
-def _stribeck(velocity: np.ndarray, gamma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Static and Coulomb parts of eq. (56) per unit, then their slopes; rows of gamma: gamma2, gamma3, gamma5."""
-    tanh = np.tanh(gamma * velocity)
-    slope = gamma * (1.0 - tanh * tanh)
-    return tanh[0] - tanh[1], tanh[2], slope[0] - slope[1], slope[2]
 
 
 @dataclass(frozen=True)
@@ -54,8 +38,10 @@ class StribeckFriction(JointTorqueEffect):
 
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
-        static, coulomb, static_slope, coulomb_slope = _stribeck(motion.velocity, nonlinear)
-        return (static, coulomb, motion.velocity), (static_slope, coulomb_slope, 1.0)
+        # Rows: gamma2, gamma3, gamma5.
+        tanh = np.tanh(nonlinear * motion.velocity)
+        slope = nonlinear * (1.0 - tanh * tanh)
+        return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
 
 
 @dataclass(frozen=True)
@@ -77,8 +63,9 @@ class CoulombViscousFriction(JointTorqueEffect):
 
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
-        sign, slope = _smooth_sign(motion.velocity, nonlinear[0])
-        return (sign, motion.velocity), (slope, 1.0)
+        (transition,) = nonlinear
+        tanh = np.tanh(motion.velocity / transition)
+        return (tanh, motion.velocity), ((1.0 - tanh * tanh) / transition, 1.0)
 
 
 # The friction laws that a scenario can name.
