@@ -100,10 +100,14 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, capsys: pyte
 def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
     command = [sys.executable, "-m", "fbse_drake", "simulate", "squat", "--set", "duration=20", "--set", "plant.time_step=1e-4"]
     process = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, env={**os.environ})
-    # By now it has planned the motion and runs, which takes a minute.
-    time.sleep(12)
+    # An interruption while modules are being loaded can be lost in one of them; the folder is made when all are there.
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "out").is_dir() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    # By now it plans the motion, or runs, which takes a minute.
+    time.sleep(6)
     process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=60)
+    _, message = process.communicate(timeout=120)
     assert process.returncode == FAILED
     assert "interrupted" in message
     assert message.count("\n") == 1
