@@ -9,8 +9,8 @@ import numpy as np
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import make_estimator
 from fbse_drake.log import Log
-from fbse_drake.robot.plant import Robot, make_robot
-from fbse_drake.scenario import Scenario
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.walking.reference import make_reference
 
 # Time constant of the smoothing of joint velocities that are differentiated from angles [s].
@@ -98,9 +98,8 @@ class Replay:
     """A scenario's estimator and a log that it runs over; see `estimate`."""
 
     def __init__(self, scenario: Scenario, log: Log):
-        believed = scenario.believed
         with located("model: "):
-            robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
+            robot = build_robot(scenario.believed)
         inputs = _inputs(robot, log)
         ticks = np.arange(round(scenario.duration / scenario.control.period) + 1) * scenario.control.period
         with located("reference: "):

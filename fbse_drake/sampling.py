@@ -2,8 +2,7 @@
 
 Drake's discrete plant with sampled output ports steps in an *unrestricted* update, which comes before all *discrete* updates of the same
 time. So a discrete update of another system sees the plant's state of the next tick, an unrestricted one that of the present tick.
-Systems here that remember something from tick to tick do so in unrestricted updates; the exception, `JointTorqueEffects`, makes
-use of the order.
+Systems here that remember something from tick to tick do so in unrestricted updates.
 """
 
 

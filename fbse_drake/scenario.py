@@ -16,20 +16,20 @@ from pydrake.systems.framework import DiagramBuilder
 from fbse_drake import resources, schema
 from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.effects.friction import FrictionModel
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import inertia_changes
+from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_positive
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import load_description
-from fbse_drake.robot.plant import Ground
+from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
 from fbse_drake.walking.reference import ReferenceConfig
 from fbse_drake.walking.walk import Walk
-
-JointEffectConfig = FrictionModel
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RobotConfig:
     # Reflected rotor inertia by joint [kg m^2].
     rotor_inertia: dict[str, float] = field(default_factory=dict)
     # Physical effects, each under a name of your choice.
-    effects: dict[str, JointEffectConfig] = field(default_factory=dict)
+    effects: dict[str, Effect] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for joint, value in self.rotor_inertia.items():
@@ -95,6 +95,8 @@ class Scenario:
     seed: int = 0
     # Length of the experiment [s].
     duration: float = 11.5
+    # Python files (relative to the scenario's) or modules with physical effects of your own.
+    effect_modules: list[str] = field(default_factory=list)
     # What really happens.
     robot: RobotConfig = field(default_factory=RobotConfig)
     # What is believed of it (feed-forward, estimators, predictions); by default the robot's body without its effects.
@@ -153,6 +155,36 @@ class Scenario:
         return RobotConfig(self.robot.description, self.robot.gantry_height, self.robot.rotor_inertia)
 
 
+def build_robot(
+    config: RobotConfig,
+    *,
+    builder: DiagramBuilder | None = None,
+    plant: MultibodyPlantConfig | None = None,
+    ground: Ground | None = None,
+) -> Robot:
+    """A robot's plant, with the inertia effects that the robot has.
+
+    Args:
+        builder, plant, ground: see `make_robot`.
+
+    Raises:
+        InputError: see `make_robot`; also a joint or body of an effect that the robot has not.
+    """
+    bare, _ = make_robot(config.description)
+    added, point_masses = inertia_changes(config.effects, bare)
+    rotor_inertia = added + bare.description.per_joint(config.rotor_inertia, key="rotor_inertia", default=0.0)
+    robot, _ = make_robot(
+        config.description,
+        rotor_inertia=dict(zip(bare.joint_names, rotor_inertia, strict=True)),
+        point_masses=point_masses,
+        gantry_height=config.gantry_height,
+        builder=builder,
+        config=plant,
+        ground=ground,
+    )
+    return robot
+
+
 def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> Scenario:
     """Reads a scenario.
 
@@ -180,8 +212,13 @@ def read_scenario(scenario: str | Path, name: str | None = None, overrides: Sequ
     for override in overrides:
         tree = schema.merge(tree, _override(override))
         source = f"{path} with {', '.join(overrides)}"
-    result = schema.build(Scenario, tree, file=f"{source}: {name}")
-    with located(f"{source}: {name}: "):
+    where = f"{source}: {name}"
+    if isinstance(tree, dict) and "effect_modules" in tree:
+        entries = schema.build(list[str], tree["effect_modules"], file=where, key="effect_modules")
+        with located(f"{where}: "):
+            tree = {**tree, "effect_modules": import_effect_modules(entries, path.parent)}
+    result = schema.build(Scenario, tree, file=where)
+    with located(f"{where}: "):
         check_joints(result)
     return name, result
 

@@ -101,7 +101,7 @@ _Dumper.add_representer(_Tagged, lambda dumper, value: dumper.represent_mapping(
 def _tree(schema: Any, value: Any) -> Any:
     """The plain tree of a value: what is None is left out, alternatives are tagged."""
     origin, args = typing.get_origin(schema), typing.get_args(schema)
-    if origin in (typing.Union, types.UnionType):
+    if origin in (typing.Union, types.UnionType) or _alternatives(schema):
         tree = _tree(type(value), value)
         optional = len(args) == 2 and type(None) in args
         return tree if optional else _Tagged(f"!{type(value).__name__}", tree)
@@ -121,6 +121,8 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         return _scalar(schema, value, file, key)
     if origin in (typing.Union, types.UnionType):
         return _alternative(args, value, default, file, key)
+    if _alternatives(schema):
+        return _alternative(_alternatives(schema), value, default, file, key)
     if origin is list:
         if not isinstance(value, list):
             raise InputError(f"{file}{key}: expected a list, found {_describe(value)}")
@@ -132,6 +134,11 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         items = {str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()}
         return {**old, **items}
     return _mapping(schema, value, default, file, key)
+
+
+def _alternatives(schema: Any) -> tuple[Any, ...]:
+    """What an open class can be: its own static method `alternatives` says so. A union says it by itself."""
+    return schema.alternatives() if "alternatives" in vars(schema) else ()
 
 
 def _scalar(schema: type, value: Any, file: str, key: str) -> Any:

@@ -8,12 +8,15 @@ from pydrake.systems.primitives import Demultiplexer, MatrixGain
 
 from fbse_drake.control.compensation import FrictionCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoop
+from fbse_drake.effects.contact import contact_with_effects
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorEffects
 from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
-from fbse_drake.robot.plant import Robot, make_robot
-from fbse_drake.scenario import Scenario
+from fbse_drake.robot.plant import Ground, Robot
+from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.sensors.encoders import Encoders
 from fbse_drake.sensors.foot_force import FootForceSensors
 from fbse_drake.sensors.imu import Imu
@@ -58,17 +61,10 @@ class Station(Diagram):
         builder = DiagramBuilder()
         config = scenario.robot
         with located("robot: "):
-            self.robot, scene_graph = make_robot(
-                config.description,
-                rotor_inertia=config.rotor_inertia,
-                gantry_height=config.gantry_height,
-                builder=builder,
-                config=scenario.plant,
-                ground=scenario.ground,
-            )
+            ground, settings = contact_with_effects(config.effects.values(), scenario.ground, scenario.plant, config.description)
+            self.robot = build_robot(config, builder=builder, plant=settings, ground=ground)
         with located("model: "):
-            believed = scenario.believed
-            self.model, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia, gantry_height=believed.gantry_height)
+            self.model = build_robot(scenario.believed)
             if self.model.joint_names != self.robot.joint_names:
                 raise InputError(f"expected the robot's joints {self.robot.joint_names}, found {self.model.joint_names}")
         with located("reference: "):
@@ -76,7 +72,7 @@ class Station(Diagram):
             self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)
         robot, names, time_step = self.robot, self.robot.description, scenario.plant.time_step
         n, plant = len(robot.joint_names), self.robot.plant
-        _set_initial_state(robot, self.reference, scenario)
+        _set_initial_state(robot, self.reference, ground)
 
         joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
         builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
@@ -84,10 +80,14 @@ class Station(Diagram):
         # Physical effects.
         context = plant.CreateDefaultContext()
         inertia = conservative_inertia(robot.joint_compliance(context))
-        resolved = [effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items()]
+        resolved = [
+            effect.resolve(names, key=f"robot.effects.{key}")
+            for key, effect in config.effects.items()
+            if isinstance(effect, JointTorqueEffect)
+        ]
         effects = builder.AddNamedSystem("effects", JointTorqueEffects(resolved, inertia, time_step))
         loss_to_force = builder.AddNamedSystem("torque_loss_to_force", MatrixGain(-robot.joint_force_selector))
-        builder.Connect(joint_state.get_output_port(), effects.get_input_port())
+        builder.Connect(joint_state.get_output_port(), effects.GetInputPort("joint_state"))
         builder.Connect(effects.get_output_port(), loss_to_force.get_input_port())
         builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
 
@@ -100,28 +100,40 @@ class Station(Diagram):
             builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
         foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, time_step, *draw))
         builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
+        available = {
+            "measured_joint_state": encoders.get_output_port(),
+            "measured_imu": imu.get_output_port(),
+            "measured_pad_force": foot_force.GetOutputPort("measured_pad_force"),
+        }
+        distorting = [
+            effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items() if isinstance(effect, SensorEffect)
+        ]
+        if distorting:
+            sensor_effects = builder.AddNamedSystem("sensor_effects", SensorEffects(distorting, robot, scenario.control.period))
+            split = builder.AddNamedSystem("distorted", Demultiplexer([port.size() for port in available.values()]))
+            builder.Connect(sensor_effects.get_output_port(), split.get_input_port())
+            for i, (name, port) in enumerate(available.items()):
+                builder.Connect(port, sensor_effects.GetInputPort(name.removeprefix("measured_")))
+                available[name] = split.get_output_port(i)
 
         # Reference and controller.
         source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))
         controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names, time_step))
         command = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
-        builder.Connect(encoders.get_output_port(), controller.GetInputPort("estimated_state"))
+        builder.Connect(available["measured_joint_state"], controller.GetInputPort("estimated_state"))
         builder.Connect(source.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))
         if scenario.control.feedforward:
             builder.Connect(source.GetOutputPort("feedforward_torque"), controller.GetInputPort("feedforward_torque"))
         builder.Connect(controller.get_output_port(), command.get_input_port())
+        builder.Connect(controller.get_output_port(), effects.GetInputPort("torque_command"))
         builder.Connect(command.get_output_port(), plant.get_actuation_input_port())
+        if distorting:
+            builder.Connect(controller.get_output_port(), sensor_effects.GetInputPort("torque_command"))
 
         # Estimator and compensation.
         period = scenario.control.period
         self.estimator = make_estimator(scenario.estimator, self.model, period=period, plan=self.reference.plan)
-        available = {
-            "measured_joint_state": encoders.get_output_port(),
-            "measured_imu": imu.get_output_port(),
-            "measured_pad_force": foot_force.GetOutputPort("measured_pad_force"),
-            "torque_command": controller.get_output_port(),
-            "torque_loss": effects.get_output_port(),
-        }
+        available |= {"torque_command": controller.get_output_port(), "torque_loss": effects.get_output_port()}
         if scenario.sensors.joint_torque is not None:
             sensors = JointTorqueSensors(scenario.sensors.joint_torque, n, time_step, *draw)
             torque_sensors = builder.AddNamedSystem("joint_torque_sensors", sensors)
@@ -146,9 +158,8 @@ class Station(Diagram):
         else:
             builder.ExportInput(controller.GetInputPort("friction_estimate"), "friction_estimate")
 
-        builder.ExportOutput(encoders.get_output_port(), "measured_joint_state")
-        builder.ExportOutput(imu.get_output_port(), "measured_imu")
-        builder.ExportOutput(foot_force.GetOutputPort("measured_pad_force"), "measured_pad_force")
+        for name in ("measured_joint_state", "measured_imu", "measured_pad_force"):
+            builder.ExportOutput(available[name], name)
         builder.ExportOutput(controller.get_output_port(), "torque_command")
         builder.ExportOutput(source.GetOutputPort("desired_state"), "desired_state")
         builder.ExportOutput(source.GetOutputPort("feedforward_torque"), "feedforward_torque")
@@ -158,7 +169,7 @@ class Station(Diagram):
         builder.ExportOutput(effects.get_output_port(), "torque_loss")
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(publish_period=1 / 32)
-            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+            MeshcatVisualizer.AddToBuilder(builder, builder.GetSubsystemByName("scene_graph"), meshcat, parameters)
         builder.BuildInto(self)
 
 
@@ -174,14 +185,14 @@ def build_station(scenario: Scenario, *, meshcat: Meshcat | None = None) -> Stat
     return Station(scenario, meshcat)
 
 
-def _set_initial_state(robot: Robot, reference: Reference, scenario: Scenario) -> None:
+def _set_initial_state(robot: Robot, reference: Reference, ground: Ground) -> None:
     """Makes the plant's default state the start of the reference, standing where the ground carries the weight."""
     plant = robot.plant
     context = plant.CreateDefaultContext()
     if robot.has_floating_base:
         pads = sum(len(leg.pads) for leg in robot.description.legs.values())
         weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
-        penetration = weight / (pads * scenario.ground.stiffness)
+        penetration = weight / (pads * ground.stiffness)
         p_WB = reference.base.position[0] - [0.0, 0.0, penetration]
         plant.SetPositions(context, robot.base_pose_positions(RigidTransform(p_WB)))
     robot.set_joint_positions(context, reference.joint_position[0])

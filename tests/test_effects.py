@@ -4,13 +4,15 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, MatrixGain, Multiplexer
+from pydrake.systems.primitives import LogVectorOutput, MatrixGain, Multiplexer, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from fbse_drake.effects.friction import CoulombViscousFriction, StribeckFriction
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedEffect
+from fbse_drake.effects.friction import CoulombViscousFriction, DirectionalFriction, StribeckFriction
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedJointTorque
 from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia, solve_implicit_step
+from fbse_drake.effects.transmission import Backlash, PreslidingHysteresis
 from fbse_drake.errors import InputError
 from fbse_drake.robot.description import load_description
 from fbse_drake.robot.plant import make_robot
@@ -21,9 +23,9 @@ TABLE_1 = StribeckFriction(gamma1={"all": 0.7}, gamma4={"all": 0.6}, gamma6={"al
 HARMONIC_DRIVE = CoulombViscousFriction(coulomb={"all": 40.0}, viscous={"all": 20.0}, transition={"all": 40.0 / 4980.0})
 
 
-def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedEffect:
+def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedJointTorque:
     whole = effect.resolve(NAMES)
-    return ResolvedEffect(type(effect), whole.linear[:, :joints], whole.nonlinear[:, :joints])
+    return ResolvedJointTorque(type(effect), whole.targets[:joints], whole.linear[:, :joints], whole.nonlinear[:, :joints])
 
 
 def test_equation_56_at_table_1():
@@ -78,15 +80,17 @@ def test_implicit_step_solves_its_equation(effect: JointTorqueEffect):
     for _ in range(300):
         free = generator.normal(scale=10 ** generator.uniform(-4, 1), size=1)
         exact = brentq(lambda v, free=free: v + mobility[0] * torque_at(v) - free[0], -abs(free[0]), abs(free[0]), xtol=1e-14)
-        torque = solve_implicit_step([law], free, mobility, generator.normal(size=1)).torque
+        torque = solve_implicit_step(lambda v: law.torque_and_slope(JointMotion(v)), free, mobility, generator.normal(size=1)).torque
         assert torque[0] == pytest.approx(torque_at(exact), abs=1e-3 * largest)
         assert torque[0] * exact >= 0
 
 
 class Flywheel:
-    """A wheel on a revolute joint with friction, a constant torque, and nothing else."""
+    """A wheel on a revolute joint with an effect, a commanded torque, and nothing else."""
 
-    def __init__(self, effect: JointTorqueEffect, inertia: float, time_step: float, drive: float, believed: float = 1.0):
+    def __init__(
+        self, effect: JointTorqueEffect, inertia: float, time_step: float, drive: float | PiecewisePolynomial, believed: float = 1.0
+    ):
         builder = DiagramBuilder()
         self.plant = builder.AddSystem(MultibodyPlant(time_step))
         body = self.plant.AddRigidBody("wheel", SpatialInertia.SolidBoxWithMass(6.0 * inertia, 1.0, 1.0, 1.0))
@@ -94,9 +98,11 @@ class Flywheel:
         self.plant.Finalize()
         effects = builder.AddSystem(JointTorqueEffects([resolved(effect, 1)], np.array([believed * inertia]), time_step))
         total = builder.AddSystem(MatrixGain(np.array([[1.0, -1.0]])))
-        source = builder.AddSystem(ConstantVectorSource([drive]))
+        drive = drive if isinstance(drive, PiecewisePolynomial) else PiecewisePolynomial([[drive]])
+        source = builder.AddSystem(TrajectorySource(drive))
         torques = builder.AddSystem(Multiplexer(2))
-        builder.Connect(self.plant.get_state_output_port(), effects.get_input_port())
+        builder.Connect(self.plant.get_state_output_port(), effects.GetInputPort("joint_state"))
+        builder.Connect(source.get_output_port(), effects.GetInputPort("torque_command"))
         builder.Connect(source.get_output_port(), torques.get_input_port(0))
         builder.Connect(effects.get_output_port(), torques.get_input_port(1))
         builder.Connect(torques.get_output_port(), total.get_input_port())
@@ -180,3 +186,39 @@ def test_unknown_joint_and_bad_value_are_refused():
         StribeckFriction(gamma1={"hip_yw": 1.0}).resolve(NAMES)
     with pytest.raises(InputError, match=r"gamma4: expected values in \[0, inf\] Nm"):
         StribeckFriction(gamma4={"all": -1.0}).resolve(NAMES, key="f")
+
+
+@pytest.mark.parametrize("time_step", [2e-3, 1e-3, 5e-4])
+@pytest.mark.parametrize("displacement", [2e-4, 5e-3])
+@pytest.mark.parametrize("believed", [1.0, 0.3])
+def test_bristles_hold_a_joint_without_ringing(time_step: float, displacement: float, believed: float):
+    """40 Nm over 0.2 mrad is a spring that is stiffer than a plant step can follow."""
+    effect = PreslidingHysteresis(coulomb={"all": 40.0}, displacement={"all": displacement})
+    ramp = PiecewisePolynomial.FirstOrderHold([0.0, 1.0, 2.0], np.array([[0.0, 30.0, 30.0]]))
+    velocity, loss = Flywheel(effect, 0.05, time_step, ramp, believed).run(0.0, 1.2)
+    assert loss[-1] == pytest.approx(30.0, rel=1e-2)
+    # Dahl's law at rest: the torque is coulomb (1 - exp(-angle / displacement)). What is too stiff for the step gives way by h^2/I more.
+    angle, exact = velocity.sum() * time_step, -displacement * np.log(1 - 30.0 / 40.0)
+    assert 0.98 * exact < angle < 1.05 * exact + 30.0 * time_step**2 / (0.05 * believed)
+
+
+def test_motor_crosses_the_gap_before_the_link_feels_it():
+    gap, inertia, drive = 0.01, 0.25, 5.0
+    effect = Backlash(gap={"all": gap}, rotor_inertia={"all": inertia})
+    turned = PiecewisePolynomial.ZeroOrderHold([0.0, 0.1, 1.0], np.array([[drive, -drive, -drive]]))
+    velocity, loss = Flywheel(effect, 0.05, 1e-3, turned).run(0.0, 0.3)
+    crossing = np.sqrt(2 * gap * inertia / drive)
+    assert np.all(loss[:100] == 0)
+    assert loss[101] == -drive
+    # The impulse that never arrives is the drive's over the crossing.
+    assert -loss.sum() * 1e-3 == pytest.approx(drive * crossing, rel=0.03)
+    assert np.all(loss[100 + round(crossing / 1e-3) + 2 :] == 0)
+    assert velocity[-1] == pytest.approx(drive / 0.05 * (0.1 - 0.2 + crossing), rel=0.02)
+
+
+def test_directional_friction_alone_stays_bounded():
+    """It drives the joint one way, up to its own size, and the step has more than one solution there."""
+    effect = DirectionalFriction(asymmetry={"all": -5.0}, transition={"all": 1e-3})
+    velocity, loss = Flywheel(effect, 0.05, 1e-3, drive=1.0).run(0.0, 0.1)
+    assert np.all((loss <= 0) & (loss >= -5.0 - 1e-9))
+    assert velocity[-1] == pytest.approx(0.1 * 6.0 / 0.05, rel=0.03)

@@ -89,7 +89,7 @@ def test_the_model_is_the_robot_without_its_effects():
         ("mine: {plant: {time_stp: 0}}", r"plant\.time_stp: unknown key, did you mean time_step\?"),
         ("mine: {robot: {description: nobody}}", r"nobody: no such file, and no such name in models/ \(there are: biped"),
         ("mine: {robot: {rotor_inertia: {knee: 1}}}", r"robot\.rotor_inertia\.knee: unknown joint"),
-        ("mine: {robot: {effects: {f: {gamma1: {all: 1}}}}}", r"robot\.effects\.f: expected one of !StribeckFriction"),
+        ("mine: {robot: {effects: {f: {gamma1: {all: 1}}}}}", r"robot\.effects\.f: expected one of .*!StribeckFriction"),
         ("mine: {robot: {effects: {f: !StribeckFriction {gamma4: {all: -1}}}}}", r"robot\.effects\.f\.gamma4: expected values in"),
         ("mine: {sensors: {imu: {acceleration_bias: 1}}}", r"sensors\.imu\.acceleration_bias: expected a list, found 1"),
         ("mine: [1, 2]", r"expected a mapping, found a list"),

@@ -6,9 +6,62 @@ from typing import ClassVar
 
 import numpy as np
 
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Parameter
+from fbse_drake.effects.effect import Parameter, in_library
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+
+_COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
+_VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
+# Velocity at which the smoothed sign has grown to tanh(1) = 0.76.
+_TRANSITION = Parameter("rad/s", linear=False, plausible=(1e-3, 5e-2), bounds=(1e-9, np.inf))
 
 
+def _sharp() -> dict[str, float]:
+    return {"all": 0.01}
+
+
+def smooth_sign(velocity: np.ndarray, transition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """tanh(velocity / transition) and its derivative with respect to the velocity."""
+    tanh = np.tanh(velocity / transition)
+    return tanh, (1.0 - tanh * tanh) / transition
+
+
+@in_library
+@dataclass(frozen=True)
+class CoulombFriction(JointTorqueEffect):
+    """Coulomb friction with the sign smoothed: u = coulomb tanh(w / transition)."""
+
+    description: ClassVar[str] = "Friction of constant size against the motion."
+    signature: ClassVar[str] = "Torque jumps when the velocity changes sign and is constant otherwise."
+    experiment: ClassVar[str] = "Move each joint to and fro."
+    parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "transition": _TRANSITION}
+
+    coulomb: dict[str, float] = field(default_factory=dict)
+    transition: dict[str, float] = field(default_factory=_sharp)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (sign,), (slope,)
+
+
+@in_library
+@dataclass(frozen=True)
+class ViscousFriction(JointTorqueEffect):
+    """Viscous friction: u = viscous w."""
+
+    description: ClassVar[str] = "Friction in proportion to speed, as of grease and of the motor's own damping."
+    signature: ClassVar[str] = "Torque rises linearly with the velocity, without a jump at rest."
+    experiment: ClassVar[str] = "Move each joint at several constant speeds."
+    parameters: ClassVar[dict[str, Parameter]] = {"viscous": _VISCOUS}
+
+    viscous: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:  # noqa: ARG004
+        return (motion.velocity,), (1.0,)
+
+
+@in_library
 @dataclass(frozen=True)
 class StribeckFriction(JointTorqueEffect):
     """Continuously differentiable friction with static, Stribeck, Coulomb and viscous parts (Makkar et al. 2005, paper eq. 56):
@@ -44,6 +97,7 @@ class StribeckFriction(JointTorqueEffect):
         return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
 
 
+@in_library
 @dataclass(frozen=True)
 class CoulombViscousFriction(JointTorqueEffect):
     """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb tanh(w / transition) + viscous w."""
@@ -51,22 +105,110 @@ class CoulombViscousFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction of constant size against the motion, plus a part that grows with speed."
     signature: ClassVar[str] = "Torque jumps when the velocity changes sign and rises linearly with it."
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
-    parameters: ClassVar[dict[str, Parameter]] = {
-        "coulomb": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
-        "viscous": Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0)),
-        "transition": Parameter("rad/s", linear=False, plausible=(1e-3, 5e-2), bounds=(1e-9, np.inf)),
-    }
+    parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "viscous": _VISCOUS, "transition": _TRANSITION}
+    composite: ClassVar[bool] = True
 
     coulomb: dict[str, float] = field(default_factory=dict)
     viscous: dict[str, float] = field(default_factory=dict)
-    transition: dict[str, float] = field(default_factory=lambda: {"all": 0.01})
+    transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
-        (transition,) = nonlinear
-        tanh = np.tanh(motion.velocity / transition)
-        return (tanh, motion.velocity), ((1.0 - tanh * tanh) / transition, 1.0)
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (sign, motion.velocity), (slope, 1.0)
 
 
-# The friction laws that a scenario can name.
+@in_library
+@dataclass(frozen=True)
+class DirectionalFriction(JointTorqueEffect):
+    """What friction has more in one direction than in the other: u = asymmetry tanh(w / transition)^2.
+
+    Beside Coulomb friction, whose size is then coulomb + asymmetry forwards and coulomb - asymmetry backwards.
+    """
+
+    description: ClassVar[str] = "Friction is larger in one direction of motion than in the other."
+    signature: ClassVar[str] = "Torque of the same sign in both directions, none at rest."
+    experiment: ClassVar[str] = "Move each joint to and fro, with stops between."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "asymmetry": Parameter("Nm", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
+        "transition": _TRANSITION,
+    }
+
+    asymmetry: dict[str, float] = field(default_factory=dict)
+    transition: dict[str, float] = field(default_factory=_sharp)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (sign * sign,), (2.0 * sign * slope,)
+
+
+@in_library
+@dataclass(frozen=True)
+class LoadDependentFriction(JointTorqueEffect):
+    """Coulomb friction in proportion to what the gear transmits: u = coefficient |command| tanh(w / transition)."""
+
+    description: ClassVar[str] = "Friction that grows with the torque through the gear."
+    signature: ClassVar[str] = "Torque against the motion that is large in stance and small in swing."
+    experiment: ClassVar[str] = "Move each joint to and fro with and without load."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "coefficient": Parameter("1", linear=True, plausible=(0.0, 0.5), bounds=(0.0, 1.0)),
+        "transition": _TRANSITION,
+    }
+
+    coefficient: dict[str, float] = field(default_factory=dict)
+    transition: dict[str, float] = field(default_factory=_sharp)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        load = np.abs(motion.command)
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (load * sign,), (load * slope,)
+
+
+@in_library
+@dataclass(frozen=True)
+class QuadraticDrag(JointTorqueEffect):
+    """Drag of a fluid, as in a flooded or fast turning joint: u = drag w |w|."""
+
+    description: ClassVar[str] = "Drag that grows with the square of the speed."
+    signature: ClassVar[str] = "Torque against the motion that only shows at high speed."
+    experiment: ClassVar[str] = "Move each joint slowly and as fast as it can."
+    parameters: ClassVar[dict[str, Parameter]] = {"drag": Parameter("Nm s^2/rad^2", linear=True, plausible=(0.0, 10.0))}
+
+    drag: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:  # noqa: ARG004
+        speed = np.abs(motion.velocity)
+        return (motion.velocity * speed,), (2.0 * speed,)
+
+
+@in_library
+@dataclass(frozen=True)
+class ThermalDrift(JointTorqueEffect):
+    """Coulomb friction that changes while the joint warms up: u = change (1 - exp(-t / warm_up)) tanh(w / transition)."""
+
+    description: ClassVar[str] = "Friction that changes over minutes as the joint warms up."
+    signature: ClassVar[str] = "Torque against (or with) the motion that is not there at first and settles slowly."
+    experiment: ClassVar[str] = "Repeat one motion from a cold start for longer than the warm-up takes."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "change": Parameter("Nm", linear=True, plausible=(-20.0, 20.0), bounds=(-np.inf, np.inf)),
+        "warm_up": Parameter("s", linear=False, plausible=(1.0, 1000.0), bounds=(1e-9, np.inf), grid=5),
+        "transition": _TRANSITION,
+    }
+
+    change: dict[str, float] = field(default_factory=dict)
+    warm_up: dict[str, float] = field(default_factory=lambda: {"all": 60.0})
+    transition: dict[str, float] = field(default_factory=_sharp)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        warm_up, transition = nonlinear
+        warmth = -np.expm1(-motion.time / warm_up)
+        sign, slope = smooth_sign(motion.velocity, transition)
+        return (warmth * sign,), (warmth * slope,)
+
+
+# The friction laws that an estimator can adopt: those that depend on the velocity alone, with all that friction has at least.
 FrictionModel = StribeckFriction | CoulombViscousFriction

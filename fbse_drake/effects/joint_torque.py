@@ -4,92 +4,95 @@ An effect is a torque loss u in `tau_command = u + tau_link` (paper eq. 34), pos
 
     u(motion) = sum over linear parameters k of  theta_k * basis_k(motion; nonlinear parameters)
 
-so that the same lines simulate it, predict it over a whole log and give the regressor to identify it.
+so that the same lines simulate it, predict it over a whole log and give the regressor to identify it. An effect without linear parameters
+is one basis torque as it stands.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 
-from fbse_drake.errors import InputError
+from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.robot.description import RobotDescription
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect, per joint."""
-
-    unit: str
-    # Does the torque depend on it linearly?
-    linear: bool
-    # What it plausibly is on a legged robot.
-    plausible: tuple[float, float]
-    # What it can be at all.
-    bounds: tuple[float, float] = (0.0, np.inf)
-
-
-@dataclass(frozen=True)
 class JointMotion:
-    """What a joint torque effect can depend on; any leading axes (time), the last one is the joints."""
+    """A plant step, or many, as joint torque effects see it: arrays that broadcast to (..., n), the last axis is the joints.
 
-    # Joint velocity [rad/s], shape (..., n).
-    velocity: np.ndarray
-
-
-@dataclass(frozen=True)
-class JointTorqueEffect(ABC):
-    """Base of the joint torque effects: a frozen dataclass with one field per parameter, each a value by joint
-    (see `RobotDescription.per_joint`); a joint that is not named has the value 0 for linear parameters.
-
-    A subclass gives the class variables below and the basis.
+    An effect that depends on the velocity alone can be given the velocity alone.
     """
 
-    # One sentence each: what it is, what it looks like in data, which experiment shows it.
-    description: ClassVar[str]
-    signature: ClassVar[str]
-    experiment: ClassVar[str]
-    parameters: ClassVar[dict[str, Parameter]]
+    # At the end of the step [rad/s].
+    velocity: np.ndarray
+    # At its start [rad].
+    position: np.ndarray | float = 0.0
+    # Commanded torque during the step [Nm].
+    command: np.ndarray | float = 0.0
+    # When it starts [s], and how long it is [s].
+    time: np.ndarray | float = 0.0
+    time_step: float = 0.0
+    # What the effect remembers at its start, (rows, ..., n).
+    memory: np.ndarray | tuple[()] = ()
+
+
+@dataclass(frozen=True)
+class JointTorqueEffect(Effect):
+    """Base of the joint torque effects.
+
+    A subclass gives the class variables of `Effect` and the basis; one with memory also `has_memory`, `start` and `advance`.
+    """
+
+    has_memory: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray | float], Sequence[np.ndarray | float]]:
         """Torque per unit of each linear parameter, and its derivative with respect to the joint velocity.
 
         Args:
             nonlinear: values of the nonlinear parameters in the order of `parameters`, shape (parameters, ..., n).
 
         Returns:
-            Two sequences in the order of the linear parameters, items of shape (..., n).
+            Two sequences in the order of the linear parameters (one item if there are none), items that broadcast to (..., n).
         """
 
-    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedEffect":
-        """This effect with its values as arrays in joint order.
+    @staticmethod
+    def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        """Memory at the start of the first step, shape (rows, ..., n). Everything about the step is known but its velocity."""
+        raise NotImplementedError
 
-        Raises:
-            InputError: unknown joint, a value out of bounds, or a nonlinear parameter without a value.
+    @staticmethod
+    def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        """Memory at the end of the step, shape (rows, ..., n)."""
+        raise NotImplementedError
+
+    @staticmethod
+    def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
+        """Memory at the start of each of N steps that follow each other, (rows, ..., N, n), where that can be had faster than step by step.
+
+        Args:
+            motion: arrays (N, n).
+            nonlinear: shape (m, ..., 1, n).
         """
-        linear, nonlinear = [], []
-        for name, parameter in self.parameters.items():
-            default = 0.0 if parameter.linear else None
-            values = names.per_joint(getattr(self, name), key=f"{key}.{name}".lstrip("."), default=default)
-            low, high = parameter.bounds
-            if not np.all((low <= values) & (values <= high)):
-                raise InputError(f"{key}.{name}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}")
-            (linear if parameter.linear else nonlinear).append(values)
-        return ResolvedEffect(type(self), np.array(linear), np.array(nonlinear).reshape(-1, len(names.joint_names)))
+        return None
+
+    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedJointTorque":
+        """See `Effect.resolve`."""
+        resolved = super().resolve(names, key=key)
+        linear = resolved.linear if len(resolved.linear) else np.ones((1, len(resolved.targets)))
+        return ResolvedJointTorque(type(self), resolved.targets, linear, resolved.nonlinear)
 
 
 @dataclass(frozen=True)
-class ResolvedEffect:
-    """A joint torque effect with values per joint."""
+class ResolvedJointTorque(ResolvedEffect):
+    """A joint torque effect with values per joint; without linear parameters `linear` is one row of ones."""
 
     effect: type[JointTorqueEffect]
-    # In the order of the effect's `parameters`; each of shape (parameters, n).
-    linear: np.ndarray
-    nonlinear: np.ndarray
 
     def torque_and_slope(self, motion: JointMotion) -> tuple[np.ndarray, np.ndarray]:
         """Torque loss u [Nm] and its derivative with respect to the joint velocity [Nm s/rad], each of shape (..., n)."""
@@ -104,12 +107,54 @@ class ResolvedEffect:
         return torque, slope
 
 
-def total_torque_and_slope(effects: Sequence[ResolvedEffect], motion: JointMotion) -> tuple[np.ndarray, np.ndarray]:
-    """Torque loss of several effects together [Nm] and its slope [Nm s/rad], each of shape (..., n)."""
-    if not effects:
-        return np.zeros_like(motion.velocity), np.zeros_like(motion.velocity)
-    torque, slope = effects[0].torque_and_slope(motion)
-    for effect in effects[1:]:
-        more_torque, more_slope = effect.torque_and_slope(motion)
-        torque, slope = torque + more_torque, slope + more_slope
-    return torque, slope
+def basis_over_time(effect: type[JointTorqueEffect], motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+    """Basis torques of an effect over N steps that follow each other, memory included.
+
+    Args:
+        motion: arrays that broadcast to (N, n); the memory is made here.
+        nonlinear: values of the nonlinear parameters, shape (m, n), or (m, G, n) for G sets of values.
+
+    Returns:
+        Shape (p, N, n), or (p, G, N, n), for the p linear parameters, or one basis torque if there are none.
+    """
+    samples, n = motion.velocity.shape
+    sets = nonlinear.shape[1:-1]
+    memory = effect.memory_over_time(motion, nonlinear[..., None, :]) if effect.has_memory else ()
+    if memory is not None:
+        basis, _ = effect.basis(replace(motion, memory=memory), nonlinear[..., None, :])
+        return np.stack([np.broadcast_to(b, (*sets, samples, n)) for b in basis])
+    names = ("velocity", "position", "command", "time")
+    columns = [np.broadcast_to(getattr(motion, name), (samples, n)) for name in names]
+    result: list[list[np.ndarray]] = []
+    for step in zip(*columns, strict=True):
+        if memory is None:
+            memory = effect.start(JointMotion(*step, motion.time_step), nonlinear)
+        now = JointMotion(*step, motion.time_step, memory)
+        basis, _ = effect.basis(now, nonlinear)
+        result.append([np.broadcast_to(b, (*sets, n)) for b in basis])
+        memory = effect.advance(now, nonlinear)
+    return np.moveaxis(np.array(result), 0, -2)
+
+
+def affine_recursion(start: np.ndarray | float, keep: np.ndarray, add: np.ndarray) -> np.ndarray:
+    """Memory z of each step with z[0] = start and z[k + 1] = keep[k] z[k] + add[k]; time is the last axis but one.
+
+    Args:
+        start: broadcasts to (..., n).
+        keep, add: broadcast to each other, (..., N, n).
+    """
+    keep, add = (np.ascontiguousarray(values) for values in np.broadcast_arrays(keep, add))
+    first = np.broadcast_to(start, (*add.shape[:-2], add.shape[-1]))
+    result = np.empty(add.shape)
+    rows = (-1, *add.shape[-2:])
+    _fill_recursion(result.reshape(rows), np.ascontiguousarray(first).reshape(-1, add.shape[-1]), keep.reshape(rows), add.reshape(rows))
+    return result
+
+
+@njit(cache=True)
+def _fill_recursion(result: np.ndarray, start: np.ndarray, keep: np.ndarray, add: np.ndarray) -> None:
+    for row in range(result.shape[0]):
+        result[row, 0] = start[row]
+        for k in range(result.shape[1] - 1):
+            for j in range(result.shape[2]):
+                result[row, k + 1, j] = keep[row, k, j] * result[row, k, j] + add[row, k, j]

@@ -1,16 +1,20 @@
 """Joint torque effects in a diagram, stable at any slope."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State, ValueProducer
 
-from fbse_drake.effects.joint_torque import JointMotion, ResolvedEffect, total_torque_and_slope
+from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 
 # Newton's method stops at a step of this size [rad/s]; its last step is still taken. A plant step changes velocities by far more.
 _LAST_STEP = 3e-4
 _MAX_ITERATIONS = 60
+# Rows of the state before those of the effects' memories, see `JointTorqueEffects`.
+_ROWS = 7
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,10 @@ class ImplicitStep:
 
 
 def solve_implicit_step(
-    effects: Sequence[ResolvedEffect], free_velocity: np.ndarray, mobility: np.ndarray, guess: np.ndarray
+    torque_and_slope: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    free_velocity: np.ndarray,
+    mobility: np.ndarray,
+    guess: np.ndarray,
 ) -> ImplicitStep:
     """Solves v + mobility * u(v) = free_velocity, for each joint by itself.
 
@@ -35,11 +42,12 @@ def solve_implicit_step(
     bisection.
 
     Args:
+        torque_and_slope: u(v) [Nm] and its derivative [Nm s/rad], each (n,), for v (n,).
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
     """
     v, low, high, last_step = guess, -np.inf, np.inf, np.inf
     for _ in range(_MAX_ITERATIONS):
-        torque, slope = total_torque_and_slope(effects, JointMotion(v))
+        torque, slope = torque_and_slope(v)
         gain = 1.0 / (1.0 + mobility * slope)
         excess = v + mobility * torque - free_velocity
         step = excess * gain
@@ -66,22 +74,26 @@ class JointTorqueEffects(LeafSystem):
     and u[k] = u(v_hat[k+1]) with v_hat + h/I u(v_hat) equal to that. Where I is the joint's inertia this is implicit Euler exactly;
     linear analysis for an inertia wrong by the factor r gives poles inside the unit circle for every slope if 0 < r < 4/3, so I is
     chosen on the small side (`conservative_inertia`). In the limit of small steps u[k] = u(v[k]). A sudden change of the motor's torque is
-    felt one tick late.
+    felt one tick late by what depends on the velocity.
 
     .. pydrake_system::
 
         name: JointTorqueEffects
         input_ports:
         - joint_state
+        - torque_command
         output_ports:
         - torque_loss
 
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `torque_loss` is u [Nm], shape (n,), that acts from the tick on.
-    Discrete state: the torque loss, (n,), and for the next tick the velocity and the free, final velocity and gain of the step, (4, n).
-    The state of a tick is made in a discrete update, which sees the velocities of that tick (see `fbse_drake.sampling`).
+    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `torque_command` and `torque_loss` u have shape (n,) [Nm] and act
+    from the tick on. Discrete state, rows of (n,): position, velocity, command, torque loss, free and final velocity and gain of the last
+    tick's step, and the memories of the effects at its start.
+
+    Memories follow the joint's true velocity, but where the slope exceeds I/h they follow more and more the final velocity that was solved
+    for: a bristle must not be stiffer than a step can follow, or an inertia that is chosen too small lets it ring.
     """
 
-    def __init__(self, effects: Sequence[ResolvedEffect], inertia: np.ndarray, time_step: float):
+    def __init__(self, effects: Sequence[ResolvedJointTorque], inertia: np.ndarray, time_step: float):
         """Declares ports, state and updates.
 
         Args:
@@ -91,33 +103,64 @@ class JointTorqueEffects(LeafSystem):
         """
         super().__init__()
         n = len(inertia)
-        self._effects = list(effects)
-        self._mobility = time_step / inertia
+        self._n, self._time_step, self._mobility = n, time_step, time_step / inertia
+        self._effects, rows = [], _ROWS
+        for effect in effects:
+            start = rows
+            if effect.effect.has_memory:
+                rows += len(effect.effect.start(JointMotion(np.zeros(n), time_step=time_step), effect.nonlinear))
+            self._effects.append((effect, slice(start, rows)))
+        self._remembering = [(effect, rows) for effect, rows in self._effects if effect.effect.has_memory]
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
-        self._torque = self.DeclareDiscreteState(n)
-        self._memory = self.DeclareDiscreteState(4 * n)
-        self.DeclareStateOutputPort("torque_loss", self._torque)
+        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
+        self._state = self.DeclareDiscreteState(np.full(rows * n, math.nan))
+        sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
+        step = ValueProducer(allocate=lambda: Value[object](), calc=self._calc_step)
+        self._step = self.DeclareCacheEntry("step", step, sources)
+        self.DeclareVectorOutputPort("torque_loss", n, self._calc_torque, {self._step.ticket()})
         if effects:
-            self.DeclareInitializationDiscreteUpdateEvent(self._start)
-            self.DeclarePeriodicDiscreteUpdateEvent(time_step, 0.0, self._step)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
 
-    def _start(self, context: Context, state: DiscreteValues) -> None:
-        v = self._joint_state.Eval(context)[len(self._mobility) :]
-        torque, slope = total_torque_and_slope(self._effects, JointMotion(v))
-        state.set_value(self._torque, torque)
-        # As if the joint had been moving on like this.
-        state.set_value(self._memory, np.concatenate([v, v + self._mobility * torque, v, 1.0 / (1.0 + self._mobility * slope)]))
+    def _calc_step(self, context: Context, output: Value) -> None:
+        """The next state."""
+        n, mobility, time, time_step = self._n, self._mobility, context.get_time(), self._time_step
+        joint_state, command = self._joint_state.Eval(context), self._torque_command.Eval(context)
+        position, v = joint_state[:n], joint_state[n:]
+        last = context.get_discrete_state(self._state).value().reshape(-1, n)
+        last_position, last_v, last_command, last_torque, last_free, last_end, last_gain = last[:_ROWS]
+        state = np.empty_like(last)
+        first = math.isnan(last_v[0])
+        for effect, rows in self._remembering:
+            if first:
+                now = JointMotion(v, position, command, time, time_step)
+                state[rows] = effect.effect.start(now, effect.nonlinear)
+            else:
+                velocity = last_end + np.clip(2.0 * last_gain, 0.0, 1.0) * (v - last_end)
+                step = JointMotion(velocity, last_position, last_command, time - time_step, time_step, last[rows])
+                state[rows] = effect.effect.advance(step, effect.nonlinear)
 
-    def _step(self, context: Context, state: DiscreteValues) -> None:
-        n = len(self._mobility)
-        v = self._joint_state.Eval(context)[n:]
-        memory = state.get_mutable_value(self._memory)
-        last_v, last_free, last_end, last_gain = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n], memory[3 * n :]
-        free_velocity = v + (v - last_v) + self._mobility * state.get_value(self._torque)
-        guess = last_end + last_gain * (free_velocity - last_free)
-        solution = solve_implicit_step(self._effects, free_velocity, self._mobility, guess)
-        state.set_value(self._torque, solution.torque)
-        last_v[:], last_free[:], last_end[:], last_gain[:] = v, free_velocity, solution.velocity, solution.gain
+        def torque_and_slope(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            torque = slope = np.zeros(n)
+            for effect, rows in self._effects:
+                more = effect.torque_and_slope(JointMotion(velocity, position, command, time, time_step, state[rows]))
+                torque, slope = torque + more[0], slope + more[1]
+            return torque, slope
+
+        if first:
+            # As if the joint had been moving on like this.
+            free_velocity, guess = v + mobility * torque_and_slope(v)[0], v
+        else:
+            free_velocity = v + (v - last_v) + mobility * last_torque
+            guess = last_end + last_gain * (free_velocity - last_free)
+        solution = solve_implicit_step(torque_and_slope, free_velocity, mobility, guess)
+        state[:_ROWS] = position, v, command, solution.torque, free_velocity, solution.velocity, solution.gain
+        output.set_value(state)
+
+    def _calc_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._step.Eval(context)[3])
+
+    def _remember(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._state).set_value(self._step.Eval(context).ravel())
 
 
 def conservative_inertia(compliance: np.ndarray) -> np.ndarray:

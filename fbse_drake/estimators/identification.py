@@ -25,8 +25,7 @@ class IdentifiedEffect:
 
     def config(self) -> JointTorqueEffect:
         """The effect as it stands in a scenario."""
-        arguments: dict[str, Any] = {name: dict(zip(self.joints, values.tolist(), strict=True)) for name, values in self.values.items()}
-        return self.effect(**arguments)
+        return self.effect.from_values(self.joints, self.values)
 
 
 def batch_least_squares(phi: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

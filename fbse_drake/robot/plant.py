@@ -1,7 +1,8 @@
 """Plants: a robot's model in Drake, with the names of its description resolved."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -10,16 +11,20 @@ from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, Scene
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, RigidBody
+from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context, DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.robot.description import RobotDescription, load_description
 
+# Between a body's name and the number in the names of the bodies that carry its point masses.
+_POINT_MASS = "_point_mass_"
+
 
 @dataclass(frozen=True)
 class Ground:
-    """Level ground with point contact."""
+    """Flat ground with point contact. The world's frame is fixed to it: its surface is z = 0 also where it slopes."""
 
     # Coulomb friction coefficient of the ground's surface; the pads' own is in the robot's model.
     friction: float = 0.8
@@ -27,10 +32,25 @@ class Ground:
     # bounces for a tenth of a second below some 20 s/m, and then slips; 100 s/m is a rubber sole.
     stiffness: float = 1.0e6
     dissipation: float = 100.0
+    # Rotation vector, about world x and y, that tilts it from level [rad]. A robot in a gantry hangs level all the same.
+    slope: list[float] = field(default_factory=lambda: [0.0, 0.0])
 
     def __post_init__(self) -> None:
+        if len(self.slope) != 2:
+            raise InputError(f"slope: expected two numbers, found {self.slope}")
         require_positive(self, "stiffness")
         require_not_negative(self, "friction", "dissipation")
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A mass fixed to a body B at one point, beside the mass that the robot's model gives the body."""
+
+    body: str
+    # May be negative [kg].
+    mass: float
+    # p_BoP_B, shape (3,) [m].
+    position: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -55,6 +75,18 @@ class Robot:
     @cached_property
     def imu(self) -> Frame:
         return self.plant.GetFrameByName(self.description.imu)
+
+    @cached_property
+    def body_names(self) -> list[str]:
+        """Model names of all bodies with a mass, but for point masses."""
+        bodies = [self.plant.get_body(index) for index in self.plant.GetBodyIndices(self.base.model_instance())]
+        return [body.name() for body in bodies if body.default_mass() > 0 and _POINT_MASS not in body.name()]
+
+    def body(self, name: str) -> RigidBody:
+        """Raises InputError where there is none of this name that has a mass."""
+        if name not in self.body_names:
+            raise InputError(f"{name}: the model has no body of this name with a mass (there are: {', '.join(self.body_names)})")
+        return self.plant.GetBodyByName(name)
 
     def sole(self, side: str) -> Frame:
         return self.plant.GetFrameByName(self.description.legs[side].sole)
@@ -155,6 +187,7 @@ def make_robot(
     description: str | Path,
     *,
     rotor_inertia: Mapping[str, float] | None = None,
+    point_masses: Sequence[PointMass] = (),
     gantry_height: float | None = None,
     builder: DiagramBuilder | None = None,
     config: MultibodyPlantConfig | None = None,
@@ -165,14 +198,15 @@ def make_robot(
     Args:
         description: name or path of a robot description (`models/*.yaml`).
         rotor_inertia: reflected rotor inertia [kg m^2] by joint, see `RobotDescription.per_joint`.
+        point_masses: further masses on bodies of the model.
         gantry_height: hangs the base in a gantry: welds it to the world at this height [m], upright.
         builder: the diagram that gets the plant and its scene graph; by default one that is thrown away, which is what a
             model needs that is only computed with.
         config: Drake's plant settings.
-        ground: level ground at z = 0; without it there is none.
+        ground: ground at z = 0; without it there is none.
 
     Raises:
-        InputError: unknown file, joint, frame, body or pad.
+        InputError: unknown file, joint, frame, body or pad; point masses that leave a body with an impossible inertia.
     """
     names, path = load_description(description)
     plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), builder or DiagramBuilder())
@@ -189,10 +223,14 @@ def make_robot(
     for joint, value in zip(names.joint_names, inertia, strict=True):
         actuators[joint].set_default_rotor_inertia(value)
         actuators[joint].set_default_gear_ratio(1.0)
+    _add_point_masses(plant, names, point_masses)
     if gantry_height is not None:
         plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(names.base), RigidTransform([0, 0, gantry_height]))
     if ground is not None:
         _add_ground(plant, ground)
+        if gantry_height is None:
+            gravity = plant.mutable_gravity_field()
+            gravity.set_gravity_vector(Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector()))
     plant.Finalize()
     robot = Robot(plant, names)
     for side in names.sides:
@@ -217,6 +255,27 @@ def _check_names(plant: MultibodyPlant, names: RobotDescription, path: Path) -> 
         check(f"legs.{side}.sole", leg.sole, plant.HasFrameNamed(leg.sole), "frame")
         for pad in leg.pads:
             check(f"legs.{side}.pads", pad, plant.HasJointNamed(pad), "joint")
+
+
+def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]) -> None:
+    instance = plant.GetBodyByName(names.base).model_instance()
+    inertias: dict[str, SpatialInertia] = {}
+    # What takes mass away comes last: Drake does not add to a composite without mass.
+    for number, point in enumerate(sorted(point_masses, key=lambda point: -point.mass)):
+        if not plant.HasBodyNamed(point.body, instance):
+            raise InputError(f"{point.body}: the model has no body of this name")
+        body = plant.GetBodyByName(point.body, instance)
+        added = SpatialInertia(point.mass, point.position, UnitInertia.PointMass(point.position), skip_validity_check=True)
+        # A sum in place, but not in the body's own inertia.
+        inertia = inertias.setdefault(point.body, copy(body.default_spatial_inertia()))
+        if inertia.get_mass() + point.mass <= 0:
+            raise InputError(f"{point.body}: expected a mass > 0, found {inertia.get_mass() + point.mass:g} kg")
+        inertia += added
+        carrier = plant.AddRigidBody(f"{point.body}{_POINT_MASS}{number}", instance, added)
+        plant.WeldFrames(body.body_frame(), carrier.body_frame())
+    for name, inertia in inertias.items():
+        if not inertia.IsPhysicallyValid():
+            raise InputError(f"{name}: expected the inertia of a body, found one that no distribution of mass has")
 
 
 def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:

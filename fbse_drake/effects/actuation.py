@@ -1,0 +1,144 @@
+"""Torques that the motor does not give although they are commanded, or gives although they are not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from fbse_drake.effects.effect import Parameter, in_library
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, affine_recursion
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueGain(JointTorqueEffect):
+    """The motor gives (1 - shortfall) of the commanded torque: u = shortfall * command."""
+
+    description: ClassVar[str] = "The motor gives another share of the commanded torque than believed, as from a wrong torque constant."
+    signature: ClassVar[str] = "Torque in proportion to the command."
+    experiment: ClassVar[str] = "Hold each joint under several loads."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "shortfall": Parameter("1", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf)),
+    }
+
+    shortfall: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:  # noqa: ARG004
+        return (motion.command,), (0.0,)
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueBias(JointTorqueEffect):
+    """The motor lacks a constant torque: u = bias."""
+
+    description: ClassVar[str] = "A constant torque is missing, as from the offset of a current sensor."
+    signature: ClassVar[str] = "The same torque at all times."
+    experiment: ClassVar[str] = "Hold each joint still without load."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "bias": Parameter("Nm", linear=True, plausible=(-20.0, 20.0), bounds=(-np.inf, np.inf)),
+    }
+
+    bias: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[float], Sequence[float]]:  # noqa: ARG004
+        return (1.0,), (0.0,)
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueDelay(JointTorqueEffect):
+    """The motor gives the command of some time ago: u = command(t) - command(t - delay), linear between the steps.
+
+    Before the first step the command is taken to have been what it is then.
+    """
+
+    description: ClassVar[str] = "The commanded torque comes late by a fixed time."
+    signature: ClassVar[str] = "Torque in proportion to how fast the command changes."
+    experiment: ClassVar[str] = "Command torques that change fast."
+    parameters: ClassVar[dict[str, Parameter]] = {"delay": Parameter("s", linear=False, plausible=(5e-4, 3e-2), neutral=0.0)}
+    has_memory: ClassVar[bool] = True
+
+    delay: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        # Memory: past commands, the last one first.
+        commands = np.concatenate([np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory])
+        whole = np.floor(nonlinear / motion.time_step).astype(int)
+        share = nonlinear / motion.time_step - whole
+        late = (1.0 - share) * np.take_along_axis(commands, whole, axis=0) + share * np.take_along_axis(commands, whole + 1, axis=0)
+        return (motion.command - late[0],), (0.0,)
+
+    @staticmethod
+    def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        rows = int(np.floor(nonlinear.max() / motion.time_step)) + 1
+        return np.broadcast_to(motion.command, (rows, *nonlinear.shape[1:]))
+
+    @staticmethod
+    def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
+        return np.concatenate([np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory[:-1]])
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueLag(JointTorqueEffect):
+    """The motor's torque follows the command like a low-pass y of first order: u = command - y, time_constant dy/dt = command - y.
+
+    Exact for a command that is held over the step; y is then its mean over the step. It starts at the command.
+    """
+
+    description: ClassVar[str] = "The commanded torque builds up gradually, as in a slow current loop or an elastic gear."
+    signature: ClassVar[str] = "After each change of the command a torque that fades away."
+    experiment: ClassVar[str] = "Command torques that change fast."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "time_constant": Parameter("s", linear=False, plausible=(5e-4, 5e-2), neutral=0.0),
+    }
+    has_memory: ClassVar[bool] = True
+
+    time_constant: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        change = motion.command - motion.memory[0]
+        return (change * (1.0 - _kept(motion, nonlinear)) * nonlinear[0] / motion.time_step,), (0.0,)
+
+    @staticmethod
+    def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(motion.command, (1, *nonlinear.shape[1:]))
+
+    @staticmethod
+    def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        return (motion.command + (motion.memory[0] - motion.command) * _kept(motion, nonlinear))[None]
+
+    @staticmethod
+    def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        keep = _kept(motion, nonlinear)
+        return affine_recursion(motion.command[0], keep, (1.0 - keep) * motion.command)[None]
+
+
+def _kept(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+    """How much of a deviation a low-pass keeps over the step."""
+    return np.exp(-motion.time_step / np.maximum(nonlinear[0], 1e-9))
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueSaturation(JointTorqueEffect):
+    """The motor gives no more than a limit: u = command - clip(command, -limit, limit)."""
+
+    description: ClassVar[str] = "The motor gives no torque beyond a limit."
+    signature: ClassVar[str] = "Torque only where the command is large, and then all that is beyond."
+    experiment: ClassVar[str] = "Load each joint up to its rated torque."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "limit": Parameter("Nm", linear=False, plausible=(2.0, 300.0), neutral=np.inf, grid=25),
+    }
+
+    limit: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        return (motion.command - np.clip(motion.command, -nonlinear[0], nonlinear[0]),), (0.0,)

@@ -1,0 +1,165 @@
+"""What a physical effect is, and the library of all of them.
+
+An effect is one class with one definition that serves three purposes: simulating it in a robot, predicting what it adds to every channel of
+a log, and identifying its parameters. What kind of thing it is, is said by its base class:
+
+    JointTorqueEffect   a torque loss in a joint: friction, springs, ripple; also of its actuation: gain, bias, delay   (joint_torque.py)
+    InertiaEffect       reflected inertia, masses, centres of mass                                                      (inertia.py)
+    SensorEffect        what a sensor reads beside the truth                                                            (sensor.py)
+    ContactEffect       ground and soles                                                                                (contact.py)
+
+An effect of a user's own is a subclass of one of them behind `@in_library`; from then on YAML files can name it and the diagnosis tries it.
+"""
+
+from abc import ABC
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar, Literal, TypeVar
+
+import numpy as np
+
+from fbse_drake.errors import InputError
+from fbse_drake.robot.description import RobotDescription
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect, with a value for each target (joint, body or foot)."""
+
+    unit: str
+    # Does what the effect adds depend on it linearly?
+    linear: bool
+    # What it plausibly is on a legged robot.
+    plausible: tuple[float, float]
+    # What it can be at all.
+    bounds: tuple[float, float] = (0.0, np.inf)
+    # For a nonlinear one: at how many points of its plausible range a search for it starts.
+    grid: int = 9
+    # For a nonlinear one: the value with which there is no effect; targets that are not named get it.
+    neutral: float | None = None
+
+
+@dataclass(frozen=True)
+class Effect(ABC):
+    """Base of all effects: a frozen dataclass with one field per parameter. A field holds values by target (`{all: 0.1, left_knee: 0.2}`);
+    if the effect acts on the robot as a whole, a number. A linear parameter that is not given is 0.
+    """
+
+    # One sentence each: what it is, what it looks like in data, which experiment shows it.
+    description: ClassVar[str]
+    signature: ClassVar[str]
+    experiment: ClassVar[str]
+    # By name, in the order of the fields.
+    parameters: ClassVar[dict[str, Parameter]]
+    # What its values are given for.
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "joint"
+    # Other effects can say the same together; then the diagnosis does not try it.
+    composite: ClassVar[bool] = False
+
+    @staticmethod
+    def alternatives() -> tuple[type["Effect"], ...]:
+        """What can stand for an effect in a scenario file (see `fbse_drake.schema`)."""
+        return tuple(_LIBRARY.values())
+
+    @classmethod
+    def largest_plausible(cls) -> float:
+        """Largest plausible size of its first parameter, which says how strong it is."""
+        return max(abs(bound) for bound in next(iter(cls.parameters.values())).plausible)
+
+    @classmethod
+    def from_values(cls, targets: Sequence[str], values: Mapping[str, Sequence[float]]) -> "Effect":
+        """The effect with these values of each parameter, target by target; other parameters and targets keep their defaults.
+
+        Args:
+            targets: joints, bodies or sides; one (any) name for an effect on the robot.
+        """
+        defaults, arguments = cls(), {}
+        for name, numbers in values.items():
+            given = dict(zip(targets, (float(number) for number in numbers), strict=True))
+            arguments[name] = getattr(defaults, name) | given if cls.acts_on != "robot" else next(iter(given.values()))
+        return cls(**arguments)
+
+    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedEffect":
+        """This effect with its values as arrays.
+
+        Raises:
+            InputError: unknown target, a value out of bounds, or a nonlinear parameter without a value.
+        """
+        targets = self._targets(names)
+        linear, nonlinear = [], []
+        for name, parameter in self.parameters.items():
+            where = f"{key}.{name}".lstrip(".")
+            values = self._values(name, targets, names, where, 0.0 if parameter.linear else parameter.neutral)
+            low, high = parameter.bounds
+            if not np.all((low <= values) & (values <= high)):
+                raise InputError(f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}")
+            (linear if parameter.linear else nonlinear).append(values)
+        columns = len(targets)
+        linear, nonlinear = (np.array(values, dtype=float).reshape(len(values), columns) for values in (linear, nonlinear))
+        return ResolvedEffect(type(self), targets, linear, nonlinear)
+
+    def _targets(self, names: RobotDescription) -> list[str]:
+        if self.acts_on == "joint":
+            return names.joint_names
+        if self.acts_on == "foot":
+            return names.sides
+        if self.acts_on == "robot":
+            return ["robot"]
+        # Bodies: those that are named; whether the model has them, the plant says.
+        return list(dict.fromkeys(body for name in self.parameters for body in getattr(self, name)))
+
+    def _values(self, name: str, targets: list[str], names: RobotDescription, key: str, default: float | None) -> np.ndarray:
+        values = getattr(self, name)
+        if self.acts_on == "joint":
+            return names.per_joint(values, key=key, default=default)
+        if self.acts_on == "robot":
+            return np.array([values], dtype=float)
+        for target in values:
+            if target not in targets and target != "all":
+                raise InputError(f"{key}.{target}: unknown {self.acts_on} (allowed: {', '.join(['all', *targets])})")
+        result = [values.get(target, values.get("all", default)) for target in targets]
+        if None in result:
+            raise InputError(f"{key}: no value for {targets[result.index(None)]}")
+        return np.array(result, dtype=float)
+
+
+@dataclass(frozen=True)
+class ResolvedEffect:
+    """An effect with values per target."""
+
+    effect: type[Effect]
+    targets: list[str]
+    # In the order of the effect's `parameters`; each of shape (parameters, targets).
+    linear: np.ndarray
+    nonlinear: np.ndarray
+
+
+_LIBRARY: dict[str, type[Effect]] = {}
+
+T = TypeVar("T", bound=type[Effect])
+
+
+def in_library(effect: T) -> T:
+    """Class decorator: puts an effect into the library, under its class name.
+
+    Raises:
+        InputError: it lacks one of the class variables or a method, has a field without a parameter, or another effect has its name.
+    """
+    for name in ("description", "signature", "experiment", "parameters"):
+        if not hasattr(effect, name):
+            raise InputError(f"effect {effect.__name__}: the class variable {name} is missing")
+    if effect.__abstractmethods__:
+        raise InputError(f"effect {effect.__name__}: the method {min(effect.__abstractmethods__)} is missing")
+    names = [field.name for field in fields(effect)]
+    if names != list(effect.parameters):
+        raise InputError(f"effect {effect.__name__}: expected a dataclass with the fields {list(effect.parameters)}, found {names}")
+    known = _LIBRARY.get(effect.__name__)
+    if known is not None and (known.__module__, known.__qualname__) != (effect.__module__, effect.__qualname__):
+        raise InputError(f"effect {effect.__name__}: the library has another effect of this name, in {known.__module__}")
+    _LIBRARY[effect.__name__] = effect
+    return effect
+
+
+def library() -> dict[str, type[Effect]]:
+    """All effects by class name."""
+    return dict(_LIBRARY)
