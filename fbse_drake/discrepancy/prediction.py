@@ -1,0 +1,278 @@
+"""What effects add to the residual of a log: signatures for the regression to fit, and predictions of effects whose values are known."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from fbse_drake.discrepancy.regression import Signature
+from fbse_drake.discrepancy.residual import (
+    EquationOfMotion,
+    Instants,
+    RecordedMotion,
+    Residual,
+    averaged,
+    block_means,
+    joint_velocity_noise,
+    residual_rows,
+    steps,
+)
+from fbse_drake.effects.contact import ContactEffect, GroundCompliance, PadContact, pad_contact, spring_force
+from fbse_drake.effects.effect import Effect, ResolvedEffect
+from fbse_drake.effects.inertia import InertiaEffect
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedJointTorque, basis_over_time
+from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.errors import located
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario, build_robot
+
+# Joint velocities are smoothed over this many samples, without delay, where friction laws take them.
+_SMOOTHING = 9
+# What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
+_LAW_DOUBT = 8.0
+# Most numbers that one array of columns may have before it is averaged over blocks.
+_CHUNK = 5_000_000
+
+
+class Predictor:
+    """A scenario's model over one log: its residual, and what further effects would add to it."""
+
+    def __init__(self, scenario: Scenario, log: Log):
+        """Reads the log.
+
+        Raises:
+            InputError: a log that does not fit the model.
+        """
+        self.scenario = scenario
+        with located("model: "):
+            self.robot = build_robot(scenario.believed)
+        names = self.robot.description
+        self._known = [effect.resolve(names, key=f"model.effects.{key}") for key, effect in scenario.believed.effects.items()]
+        self.motion = RecordedMotion(self.robot, scenario.sensors, log)
+        for known in self._known:
+            if issubclass(known.effect, SensorEffect):
+                # To first order, a reading is set right by the opposite error.
+                undone = replace(known, linear=-known.linear)
+                self.motion.signals = known.effect.distorted(self.motion.signals, undone, self.robot, self.motion.period)
+        self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
+
+    @property
+    def rows(self) -> int:
+        """Number of the residual's rows."""
+        return len(residual_rows(self.robot))
+
+    @cached_property
+    def residual(self) -> Residual:
+        """What the model, with its effects, leaves over."""
+        predicted = self.ground_gives_way()
+        for known in self._known:
+            predicted = predicted + self.predict(known)
+        laws = [known for known in self._known if isinstance(known, ResolvedJointTorque)]
+        return self.motion.residual.minus(predicted).noisier(self.law_variance(laws))
+
+    def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
+        """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
+
+        A law of the velocity does not say at which velocity within a step it holds: its torque is uncertain by its slope times what the
+        velocity changes in the step. This counts where a sticking joint trembles.
+        """
+        motion, joint_motion = self.motion, self.joint_motion
+        slope = np.zeros(joint_motion.velocity.shape)
+        for law in laws:
+            if not law.effect.has_memory:
+                slope += law.torque_and_slope(joint_motion)[1]
+        noise = joint_velocity_noise(motion.sensors)
+        change = np.diff(motion.signals.joint_velocity, axis=0) ** 2
+        real = np.maximum(block_means(change, motion.length) - 2 * noise**2, 0.0)
+        return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
+
+    def predict(self, effect: ResolvedEffect) -> np.ndarray:
+        """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are in the residual already."""
+        result = np.zeros((len(self.motion.time), self.rows))
+        if issubclass(effect.effect, JointTorqueEffect):
+            columns = self.joint_columns(effect.effect, effect.nonlinear, np.arange(len(effect.targets)))
+            amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
+            result[:, : len(effect.targets)] = np.einsum("pbn,pn->bn", columns, amounts)
+        elif issubclass(effect.effect, ContactEffect):
+            signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
+            result[:, signature.rows] = signature.values @ effect.linear[:, 0]
+        return result
+
+    @cached_property
+    def joint_motion(self) -> JointMotion:
+        """What joint torque effects depend on, step by step: (N - 1, n) each."""
+        motion, signals = self.motion, self.motion.signals
+        velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
+        time = motion.start + np.arange(len(velocity) - 1) * motion.period
+        return JointMotion(
+            velocity=velocity[1:],
+            position=signals.joint_position[:-1],
+            command=signals.torque_command[:-1],
+            time=time[:, None],
+            time_step=motion.period,
+        )
+
+    def joint_columns(self, effect: type[JointTorqueEffect], nonlinear: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        """Torque of a joint effect per unit of each linear parameter, averaged over blocks.
+
+        Args:
+            nonlinear: (m, T), or (m, G, T) for G sets of values, for the joints.
+            joints: places of the joints, shape (T,).
+
+        Returns:
+            Shape (p, B, T), or (p, G, B, T).
+        """
+        whole, length = self.joint_motion, self.motion.length
+        motion = replace(whole, **{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command")})
+        if nonlinear.ndim == 2:
+            return np.stack([block_means(column, length) for column in basis_over_time(effect, motion, nonlinear)])
+        sets = max(1, _CHUNK // motion.velocity.size)
+        parts = []
+        for start in range(0, nonlinear.shape[1], sets):
+            columns = basis_over_time(effect, motion, nonlinear[:, start : start + sets])
+            parts.append([[block_means(column, length) for column in group] for group in columns])
+        return np.concatenate([np.array(part) for part in parts], axis=1)
+
+    def signature(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> Signature:
+        """What an effect on one target adds to the residual per unit of each linear parameter.
+
+        Args:
+            nonlinear: values of the nonlinear parameters, shape (m,).
+        """
+        if issubclass(effect, JointTorqueEffect):
+            joint = self.robot.joint_names.index(target)
+            columns = self.joint_columns(effect, nonlinear[:, None], np.array([joint]))
+            return Signature(np.array([joint]), np.moveaxis(columns, 0, 2))
+        if issubclass(effect, InertiaEffect):
+            values = self._inertia_columns(effect, target)
+        elif issubclass(effect, SensorEffect):
+            values = self._sensor_columns(effect, target, nonlinear)
+        else:
+            values = self._contact_columns(effect)
+        rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
+        return Signature(rows, values[:, rows])
+
+    @cached_property
+    def _smooth_blocks(self) -> Instants:
+        """Averages at which derivatives are taken. Accelerations are smoothed further: their noise is in the residual too."""
+        blocks = self.motion.blocks
+        return replace(
+            blocks,
+            joint_acceleration=_smooth(blocks.joint_acceleration),
+            angular_acceleration=_smooth(blocks.angular_acceleration),
+        )
+
+    @cached_property
+    def _residual_at_blocks(self) -> np.ndarray:
+        return self.motion.equation.residual(self._smooth_blocks)
+
+    def _inertia_columns(self, effect: type[InertiaEffect], target: str) -> np.ndarray:
+        """By changing the model: the residual is linear in its inertias."""
+        believed, columns = self.scenario.believed, []
+        dynamic = self._residual_at_blocks.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+        for name in effect.parameters:
+            unit = _probe(effect, name)
+            changed = effect.from_values([target], {name: [unit]})
+            robot = build_robot(replace(believed, effects={**believed.effects, "_probe": changed}))
+            column = np.zeros_like(self._residual_at_blocks)
+            difference = EquationOfMotion(robot).residual(self._smooth_blocks, kinematic=False) - self._residual_at_blocks[:, :dynamic]
+            # What the robot has more than the model stays in the residual with the other sign.
+            column[:, :dynamic] = -difference / unit
+            columns.append(column)
+        return np.stack(columns, axis=2)
+
+    def _sensor_columns(self, effect: type[SensorEffect], target: str, nonlinear: np.ndarray) -> np.ndarray:
+        """By disturbing the signals."""
+        motion, columns, names = self.motion, [], list(effect.parameters)
+        fixed = [name for name in names if not effect.parameters[name].linear]
+        for name in names:
+            if not effect.parameters[name].linear:
+                continue
+            unit = _probe(effect, name)
+            values = {name: [unit], **{other: [value] for other, value in zip(fixed, nonlinear, strict=True)}}
+            resolved = effect.from_values([target], values).resolve(self.robot.description)
+            signals = effect.reading(motion.signals, self._memory(effect, resolved), resolved, self.robot)
+            blocks = averaged(steps(signals, motion.period), motion.length)
+            blocks = replace(
+                blocks,
+                joint_acceleration=_smooth(blocks.joint_acceleration),
+                angular_acceleration=_smooth(blocks.angular_acceleration),
+            )
+            columns.append((motion.equation.residual(blocks) - self._residual_at_blocks) / unit)
+        return np.stack(columns, axis=2)
+
+    def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
+        """What an effect remembers over the log. It depends on the nonlinear parameters alone."""
+        key = (effect, resolved.nonlinear.tobytes())
+        if key not in self._memories:
+            self._memories[key] = effect.memory_over_time(self.motion.signals, resolved, self.motion.period)
+        return self._memories[key]
+
+    def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
+        """By the motion of the standing soles that the effect predicts, (B, R, p)."""
+        if not self.robot.has_floating_base:
+            return np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
+        motions = [effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces]
+        return np.moveaxis(np.array([self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))]), 0, 2)
+
+    @cached_property
+    def _sample_time(self) -> np.ndarray:
+        return self.motion.start + np.arange(len(self.motion.signals.joint_position)) * self.motion.period
+
+    @cached_property
+    def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pad forces (N, P, 3), smoothed, with their springs' share as normal component, and places (P, 3) of each foot."""
+        pads = self.motion.equation.pads
+        force = savgol_filter(self.motion.signals.pad_force, _SMOOTHING, 2, axis=0)
+        force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
+        return [(force[:, pads.foot == foot], pads.position[pads.foot == foot]) for foot in range(pads.foot.max() + 1)]
+
+    def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Kinematic rows for soles that move like this.
+
+        Args:
+            motions: rotation vector and displacement of each sole against level, still ground, in its frame, (N, 3) each.
+        """
+        motion, length, period = self.motion, self.motion.length, self.motion.period
+        result = np.zeros((len(motion.time), self.rows))
+        place = result.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+        velocities = []
+        for rotation, displacement in motions:
+            angular, linear = np.gradient(rotation, period, axis=0), np.gradient(displacement, period, axis=0)
+            g = self.motion.equation.gravity
+            # R_WF^T g z for a sole turned by the rotation vector, less g z.
+            tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)
+            result[:, place : place + 3] = block_means(angular[:-1], length)
+            result[:, place + 3 : place + 6] = block_means(tilt[:-1] + np.diff(linear, axis=0) / period, length)
+            velocities.append(block_means(linear[:-1], length))
+            place += 6
+        if len(motions) == 2:
+            left, right = (np.einsum("bij,bj->bi", R_BF, v) for R_BF, v in zip(self._sole_rotations, velocities, strict=True))
+            result[:, place:] = left - right
+        return result
+
+    @cached_property
+    def _sole_rotations(self) -> list[np.ndarray]:
+        """R_BF of each sole in every block, (B, 3, 3)."""
+        return self.motion.equation.sole_rotations(self.motion.blocks)
+
+    @cached_property
+    def _contact(self) -> PadContact:
+        return pad_contact(self.scenario.believed.description, self.scenario.ground)
+
+    def ground_gives_way(self) -> np.ndarray:
+        """What the model's own ground adds: it gives way a little under the soles, (B, R)."""
+        return self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Binomial smoothing over three blocks."""
+    padded = np.concatenate([values[:1], values, values[-1:]])
+    return 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
+
+
+def _probe(effect: type[Effect], name: str) -> float:
+    """A small value of a parameter, to take derivatives with."""
+    return 0.01 * max(abs(bound) for bound in effect.parameters[name].plausible)

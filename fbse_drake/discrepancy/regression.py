@@ -1,0 +1,171 @@
+"""Linear regression of residuals on signatures of effects: noise whitened, intervals that respect what is left of correlation in time, and
+scores on held-out blocks of time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cholesky_banded, solve_banded
+from scipy.stats import t as student
+
+from fbse_drake.discrepancy.residual import Residual
+
+# Length of a stretch whose errors may be correlated in any way [s], and in how many folds these stretches are held out in turn. Folds and
+# stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
+STRETCH = 0.25
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What one effect adds to some rows of the residual: offset + values @ parameters, for p parameters."""
+
+    # Places of the rows, shape (r,).
+    rows: np.ndarray
+    # Per unit of each parameter, shape (B, r, p).
+    values: np.ndarray
+    # What it adds whatever the parameters are, shape (B, r) or 0.
+    offset: np.ndarray | float = 0.0
+    # What is believed of the parameters beforehand: that they are 0, with this inverse variance, shape (p,) or 0.
+    prior: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Regression on several signatures at once; P parameters in their order, R rows."""
+
+    parameters: np.ndarray
+    # Sandwich estimate by stretches of time, not smaller than what the noise alone gives, shape (P, P).
+    covariance: np.ndarray
+    # Degrees of freedom of each parameter's interval: stretches that bear on it, shape (P,).
+    freedom: np.ndarray
+    # Sum of squares of the whitened residual in each row: over all blocks, and with each block predicted from the other folds, (R,).
+    sse: np.ndarray
+    held_out_sse: np.ndarray
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of each parameter, shape (P,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def interval(self, confidence: float = 0.95) -> np.ndarray:
+        """Confidence interval of each parameter, shape (P, 2)."""
+        half = student.ppf((1 + confidence) / 2, self.freedom) * self.deviation
+        return np.stack([self.parameters - half, self.parameters + half], axis=1)
+
+
+class WhitenedResidual:
+    """A residual with its noise made white and of unit variance, row by row; zero where a row is not known."""
+
+    def __init__(self, residual: Residual):
+        self.residual = residual
+        self._index = [np.flatnonzero(known) for known in residual.known.T]
+        self._factor = []
+        for row, index in enumerate(self._index):
+            band = np.zeros((2, len(index)))
+            # A row without any noise, as from ideal sensors, is still told apart from rounding.
+            band[0] = np.maximum(residual.variance[index, row], 1e-18)
+            adjacent = np.diff(index) == 1
+            band[1, :-1] = np.where(adjacent, residual.covariance[index[:-1], row], 0.0) if len(index) else 0.0
+            self._factor.append(cholesky_banded(band, lower=True) if len(index) else band)
+        # Values (B, R).
+        self.y = np.stack([self.whiten(row, values) for row, values in enumerate(residual.value.T)], axis=1)
+        # Blocks that are known in each row, (R,).
+        self.count = residual.known.sum(axis=0)
+        # How many blocks' worth of each row's variance is doubt about laws rather than noise of sensors, (R,).
+        self.doubt = np.where(residual.known, residual.doubt / np.maximum(residual.variance, 1e-18), 0.0).sum(axis=0)
+        blocks = len(residual.time)
+        per_stretch = max(1, round(STRETCH / (residual.time[1] - residual.time[0])))
+        self.stretch = np.arange(blocks) // per_stretch
+        self.fold = self.stretch % FOLDS
+
+    def whiten(self, row: int, values: np.ndarray) -> np.ndarray:
+        """Values (B, ...) of a row, whitened."""
+        index = self._index[row]
+        result = np.zeros(values.shape)
+        if len(index):
+            flat = values[index].reshape(len(index), -1)
+            result[index] = solve_banded((1, 0), self._factor[row], flat, check_finite=False).reshape(values[index].shape)
+        return result
+
+    def whiten_signature(self, signature: Signature) -> Signature:
+        """A signature, whitened."""
+        values = [self.whiten(row, signature.values[:, k]) for k, row in enumerate(signature.rows)]
+        offset = signature.offset
+        if isinstance(offset, np.ndarray):
+            offset = np.stack([self.whiten(row, offset[:, k]) for k, row in enumerate(signature.rows)], axis=1)
+        return replace(signature, values=np.stack(values, axis=1), offset=offset)
+
+    @cached_property
+    def sse(self) -> np.ndarray:
+        """Sum of squares of each row, shape (R,)."""
+        return (self.y**2).sum(axis=0)
+
+    def scale(self, sse: np.ndarray) -> np.ndarray:
+        """Mean square of each row's whitened residual, not less than 1: what the sensors' noise is to be multiplied with, shape (R,)."""
+        return np.maximum(sse / np.maximum(self.count, 1), 1.0)
+
+    def deviance(self, sse: np.ndarray) -> float:
+        """Minus twice the log-likelihood of whitened residuals, whose variance is what it is but at least 1, up to a constant."""
+        scale = self.scale(sse)
+        return float((self.count * np.log(scale) + sse / scale).sum())
+
+    def fit(self, signatures: Sequence[Signature], *, iterations: int = 3) -> Fit:
+        """Fits all signatures together, each row weighted by the inverse of what is left in it.
+
+        Args:
+            signatures: whitened.
+        """
+        rows = np.unique(np.concatenate([s.rows for s in signatures]))
+        size = sum(s.values.shape[2] for s in signatures)
+        X, prior = np.zeros((len(self.y), len(rows), size)), np.zeros(size)
+        y = self.y[:, rows]
+        start = 0
+        for s in signatures:
+            stop, places = start + s.values.shape[2], np.searchsorted(rows, s.rows)
+            X[:, places, start:stop], prior[start:stop] = s.values, s.prior
+            y[:, places] -= s.offset
+            start = stop
+        # Units must not decide what counts as singular.
+        norm = np.sqrt((X**2).sum(axis=(0, 1)))
+        norm[norm == 0] = 1.0
+        X, prior = X / norm, np.diag(prior / norm**2)
+        scale = self.scale(self.sse)[rows]
+        for _ in range(iterations if len(rows) > 1 else 1):
+            grams, rights = _moments(X, y, scale)
+            theta = _solve(grams.sum(axis=0) + prior, rights.sum(axis=0))
+            scale = np.maximum(((y - X @ theta) ** 2).sum(axis=0) / np.maximum(self.count[rows], 1), 1.0)
+        grams, rights = _moments(X, y, scale)
+        gram, right = grams.sum(axis=0) + prior, rights.sum(axis=0)
+        theta = _solve(gram, right)
+        left = y - X @ theta
+
+        # Sandwich: what is left in a stretch may be correlated in any way.
+        bread = np.linalg.pinv(gram, hermitian=True)
+        edges = np.flatnonzero(np.diff(self.stretch, prepend=-1))
+        scores = np.add.reduceat(rights - grams @ theta, edges, axis=0)
+        information = np.add.reduceat(np.diagonal(grams, axis1=1, axis2=2), edges, axis=0)
+        stretches = len(edges)
+        sandwich = bread @ (scores.T @ scores) @ bread * stretches / max(1, stretches - size)
+        covariance = sandwich + np.diag(np.maximum(0.0, np.diag(bread) - np.diag(sandwich)))
+        total = information.sum(axis=0)
+        effective = np.divide(total**2, (information**2).sum(axis=0), out=np.ones(size), where=total > 0)
+
+        held_out = np.empty_like(left)
+        for fold in range(FOLDS):
+            out = self.fold == fold
+            held_out[out] = y[out] - X[out] @ _solve(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0))
+        sse, held_out_sse = self.sse.copy(), self.sse.copy()
+        sse[rows], held_out_sse[rows] = (left**2).sum(axis=0), (held_out**2).sum(axis=0)
+        return Fit(theta / norm, covariance / np.outer(norm, norm), np.maximum(effective - 1, 1.0), sse, held_out_sse)
+
+
+def _moments(X: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gram matrix (B, P, P) and right side (B, P) of every block."""
+    weighted = np.swapaxes(X / scale[:, None], 1, 2)
+    return weighted @ X, (weighted @ y[:, :, None])[:, :, 0]
+
+
+def _solve(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+    return np.linalg.lstsq(gram, right, rcond=1e-10)[0]

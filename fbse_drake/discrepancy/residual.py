@@ -1,0 +1,433 @@
+"""What the equation of motion leaves over on a log: joint, base and kinematic residuals, with the noise that the sensors put into them.
+
+Per plant step, with the base's origin at rest and the measured specific force in the place of gravity (see `estimators.floating_base`):
+
+    joint and base rows   S tau - (H v_dot + C v - J_m^T f_m)     torque that the motors gave and the links did not get [Nm];
+                                                                  six unactuated rows [Nm, N], which no joint effect can touch
+    kinematic rows        of every standing sole, in its frame: angular velocity, and specific force less that of a level resting sole;
+                          while both feet stand also the velocity of one sole relative to the other
+
+All are averaged over blocks of time. Averages of one and the same window have one group delay, telescope what is differentiated, and leave
+noise whose covariance is known: white noise (accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
+average of order one, so that each row's covariance is tridiagonal.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+
+from fbse_drake.effects.sensor import SensorSignals
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.foot_pads import FootPads
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import Robot, grasp_map
+from fbse_drake.scenario import SensorsConfig
+
+# Length of a block [s].
+BLOCK = 0.010
+# A sole stands still while it carries more than this share of the weight, and each of its pads this one.
+_STANDING = 0.15
+_STANDING_PAD = 0.01
+# Soles settle for this long at the start of a log [s].
+_SETTLING = 0.1
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One residual channel."""
+
+    # As `left_knee_pitch`, `base/force_z`, `left_sole/angular_velocity_x`.
+    name: str
+    # `joint`, `base` or `kinematic`.
+    kind: str
+    unit: str
+
+
+def residual_rows(robot: Robot) -> list[Row]:
+    """The residual's rows for a robot, in order."""
+    rows = [Row(name, "joint", "Nm") for name in robot.joint_names]
+    if not robot.has_floating_base:
+        return rows
+    rows += [Row(f"base/{kind}_{axis}", "base", unit) for kind, unit in (("moment", "Nm"), ("force", "N")) for axis in _AXES]
+    for side in robot.description.sides:
+        kinds = (("angular_velocity", "rad/s"), ("specific_force", "m/s^2"))
+        rows += [Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit) for kind, unit in kinds for axis in _AXES]
+    if len(robot.description.sides) == 2:
+        rows += [Row(f"soles/relative_velocity_{axis}", "kinematic", "m/s") for axis in _AXES]
+    return rows
+
+
+def read_signals(robot: Robot, log: Log) -> tuple[SensorSignals, np.ndarray]:
+    """Sensor channels of a log on an even grid of its nominal period.
+
+    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced.
+
+    Returns:
+        The signals, N samples, and which of them are measured (not interpolated over a gap), shape (N,).
+
+    Raises:
+        InputError: other joints than the model's, missing IMU or foot channels of a floating robot.
+    """
+    if log.joints != robot.joint_names:
+        raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
+    period, time = float(log.meta["period"]), log.time
+    grid = time[0] + np.arange(round((time[-1] - time[0]) / period) + 1) * period
+    even = len(grid) == len(time) and np.allclose(grid, time, rtol=0, atol=1e-6 * period)
+    after = np.clip(np.searchsorted(time, grid - 1e-9 * period), 1, len(time) - 1) if len(time) > 1 else np.zeros(1, dtype=int)
+    known = np.ones(len(grid), dtype=bool)
+    if not even:
+        known = (time[after] - time[after - 1] < 1.5 * period) | (time[after] - grid < 1e-3 * period)
+
+    def on_grid(values: np.ndarray) -> np.ndarray:
+        if even:
+            return values
+        share = ((grid - time[after - 1]) / (time[after] - time[after - 1])).clip(0.0, 1.0)
+        share = share.reshape(-1, *[1] * (values.ndim - 1))
+        return (1 - share) * values[after - 1] + share * values[after]
+
+    def held(values: np.ndarray) -> np.ndarray:
+        return values if even else values[np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)]
+
+    needed = ["imu/linear_acceleration", "imu/angular_velocity"] + [f"foot/{side}/pad_force" for side in robot.description.sides]
+    if robot.has_floating_base:
+        for name in needed:
+            if name not in log:
+                raise InputError(f"the log has no channel {name}, which the residual of a floating robot needs")
+    q = on_grid(log["joint/position"])
+    velocity = on_grid(log["joint/velocity"]) if "joint/velocity" in log else np.gradient(q, period, axis=0)
+    zeros = np.zeros((len(grid), 3))
+    pads = len(FootPads(robot).foot)
+    feet = [on_grid(log[name]) for name in needed[2:] if name in log]
+    for side, force in zip(robot.description.sides, feet, strict=False):
+        expected = len(robot.description.legs[side].pads)
+        if force.shape[1] != expected:
+            raise InputError(f"channel foot/{side}/pad_force: expected {expected} pads as in the model, found {force.shape[1]}")
+    signals = SensorSignals(
+        joint_position=q,
+        joint_velocity=velocity,
+        specific_force=on_grid(log[needed[0]]) if needed[0] in log else zeros,
+        angular_velocity=on_grid(log[needed[1]]) if needed[1] in log else zeros,
+        pad_force=np.concatenate(feet, axis=1) if len(feet) == len(needed) - 2 and feet else np.zeros((len(grid), pads, 3)),
+        torque_command=held(log["joint/torque_command"]),
+    )
+    return signals, known
+
+
+@dataclass(frozen=True)
+class Instants:
+    """What the equation of motion needs at M instants; IMU quantities in the IMU frame."""
+
+    joint_position: np.ndarray
+    joint_velocity: np.ndarray
+    joint_acceleration: np.ndarray
+    angular_velocity: np.ndarray
+    angular_acceleration: np.ndarray
+    specific_force: np.ndarray
+    # (M, P, 3) [N].
+    pad_force: np.ndarray
+    torque_command: np.ndarray
+
+
+def steps(signals: SensorSignals, period: float) -> Instants:
+    """Every step between two samples: posture, velocity and command where it began, accelerations and forces over it; M = N - 1."""
+    return Instants(
+        joint_position=signals.joint_position[:-1],
+        joint_velocity=signals.joint_velocity[:-1],
+        joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
+        angular_velocity=signals.angular_velocity[:-1],
+        angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
+        specific_force=signals.specific_force[1:],
+        pad_force=signals.pad_force[1:],
+        torque_command=signals.torque_command[:-1],
+    )
+
+
+def block_means(values: np.ndarray, length: int) -> np.ndarray:
+    """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at the end is dropped."""
+    blocks = len(values) // length
+    return values[: blocks * length].reshape(blocks, length, *values.shape[1:]).mean(axis=1)
+
+
+def averaged(instants: Instants, length: int) -> Instants:
+    """The instants averaged over blocks."""
+    return Instants(**{name: block_means(values, length) for name, values in vars(instants).items()})
+
+
+class EquationOfMotion:
+    """The residual's rows for one model; see the module."""
+
+    def __init__(self, robot: Robot):
+        self.robot, plant = robot, robot.plant
+        self._context = plant.CreateDefaultContext()
+        self.pads = FootPads(robot)
+        self._grasp = [grasp_map(robot.pad_positions(side)) for side in robot.description.sides]
+        self.weight = plant.CalcTotalMass(self._context) * float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+        self.gravity = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+        n = len(robot.joint_names)
+        if robot.has_floating_base:
+            mount = ImuMount(robot)
+            self.R_BI, self.p_BI = mount.R_BI, mount.p_BI
+            start = robot.base.floating_velocities_start_in_v()
+            # Place of ours, [base angular, base linear, joints], in the plant's velocities.
+            self._order = np.concatenate([np.arange(start, start + 6), robot.velocity_index])
+        else:
+            self._order = robot.velocity_index
+        self._upright = robot.base_pose_positions(RigidTransform())
+        self._joints = slice(len(self._order) - n, None)
+
+    def sole_rotations(self, at: Instants) -> list[np.ndarray]:
+        """R_BF of each sole, (M, 3, 3) each."""
+        plant, context, soles = self.robot.plant, self._context, [self.robot.sole(side) for side in self.robot.description.sides]
+        result = np.empty((len(soles), len(at.joint_position), 3, 3))
+        positions = self._upright.copy()
+        for k, q in enumerate(at.joint_position):
+            positions[self.robot.position_index] = q
+            plant.SetPositions(context, positions)
+            for foot, sole in enumerate(soles):
+                result[foot, k] = sole.CalcPoseInWorld(context).rotation().matrix()
+        return list(result)
+
+    def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
+        """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
+        parts = [pad_force[:, self.pads.foot == foot].reshape(len(pad_force), -1) for foot in range(len(self._grasp))]
+        return [part @ G.T for part, G in zip(parts, self._grasp, strict=True)]
+
+    def standing(self, pad_force: np.ndarray) -> np.ndarray:
+        """Which soles stand on all their pads, (M, feet), bool."""
+        normal = pad_force[:, :, 2]
+        feet = [normal[:, self.pads.foot == foot] for foot in range(len(self._grasp))]
+        return np.stack([(f.sum(axis=1) > _STANDING * self.weight) & (f.min(axis=1) > _STANDING_PAD * self.weight) for f in feet], axis=1)
+
+    def residual(self, at: Instants, *, kinematic: bool = True) -> np.ndarray:
+        """All rows, shape (M, rows); kinematic ones have their value whether or not a sole stands.
+
+        Args:
+            kinematic: are the kinematic rows wanted? Else they are left out.
+        """
+        robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
+        M, v = len(at.joint_position), len(order)
+        state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
+        q_index, v_index = robot.position_index, plant.num_positions() + order
+        forces = MultibodyForces(plant)
+        rates = np.zeros((M, v))
+        accelerations = np.zeros((M, plant.num_velocities()))
+        rates[:, self._joints] = at.joint_velocity
+        accelerations[:, robot.velocity_index] = at.joint_acceleration
+        floating = robot.has_floating_base
+        if floating:
+            R_BI, p_BI = self.R_BI, self.p_BI
+            w, w_dot = at.angular_velocity @ R_BI.T, at.angular_acceleration @ R_BI.T
+            # Specific force of the base's origin: less the lever arm's turning.
+            f = at.specific_force @ R_BI.T - np.cross(w_dot, p_BI) - np.cross(w, np.cross(w, p_BI))
+            rates[:, :3] = w
+            accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
+        wrenches = self.wrenches(at.pad_force) if floating else []
+        soles = [robot.sole(side) for side in robot.description.sides] if floating else []
+        extra = len(residual_rows(robot)) - v if kinematic else 0
+        result = np.empty((M, v + extra))
+        world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
+        for k in range(M):
+            state[q_index] = at.joint_position[k]
+            state[v_index] = rates[k]
+            plant.SetPositionsAndVelocities(context, state)
+            if not floating:
+                plant.CalcForceElementsContribution(context, forces)
+            generalized = plant.CalcInverseDynamics(context, accelerations[k], forces)[order]
+            place, relative = v, []
+            for sole, wrench in zip(soles, wrenches, strict=True):
+                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[:, order]
+                generalized = generalized - wrench[k] @ J
+                if extra:
+                    bias = plant.CalcBiasSpatialAcceleration(context, wrt, sole, origin, world, sole).translational()
+                    velocity = J @ rates[k]
+                    result[k, place : place + 3] = velocity[:3]
+                    result[k, place + 3 : place + 6] = J[3:] @ accelerations[k, order] + bias
+                    result[k, place + 5] -= self.gravity
+                    # The base's columns of J hold R_FB.
+                    relative.append(J[3:, 3:6].T @ velocity[3:])
+                    place += 6
+            if extra and len(soles) == 2:
+                result[k, place:] = relative[0] - relative[1]
+            result[k, :v] = -generalized
+        result[:, self._joints.start : v] += at.torque_command
+        # Joints first.
+        return np.concatenate([result[:, self._joints.start : v], result[:, : self._joints.start], result[:, v:]], axis=1)
+
+    def noise(self, at: Instants, sensors: SensorsConfig) -> tuple[np.ndarray, np.ndarray]:
+        """Variance that sensor noise puts into each row of one step, to first order.
+
+        Returns:
+            Of what is white, and of the integral over time of what is differenced white noise, each (M, rows), in the rows' units squared
+            (the second times s^2).
+        """
+        robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
+        M, n, v = len(at.joint_position), len(robot.joint_names), len(order)
+        rows = len(residual_rows(robot))
+        white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
+        velocity_noise = joint_velocity_noise(sensors)
+        gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
+        force_noise = sensors.foot_force.noise
+        floating = robot.has_floating_base
+        state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
+        soles = [robot.sole(side) for side in robot.description.sides] if floating else []
+        world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
+        wrench_variance = [force_noise**2 * (G**2).sum(axis=1) for G in self._grasp] if floating else []
+        scale = np.concatenate([np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)])
+        joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
+        lever = _skew(self.p_BI) if floating else None
+        for k in range(M):
+            state[robot.position_index] = at.joint_position[k]
+            plant.SetPositionsAndVelocities(context, state)
+            H = plant.CalcMassMatrix(context)[np.ix_(order, order)][joints_first]
+            if floating:
+                white[k, :v] = accelerometer**2 * (H[:, 3:6] ** 2).sum(axis=1)
+                H[:, :3] += H[:, 3:6] @ lever
+            differenced[k, :v] = ((H * scale) ** 2).sum(axis=1)
+            place, relative = v, []
+            for sole, variance in zip(soles, wrench_variance, strict=True):
+                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[:, order]
+                white[k, :v] += (J**2).T[joints_first] @ variance
+                white[k, place : place + 3] = ((J[:3] * scale) ** 2).sum(axis=1)
+                white[k, place + 3 : place + 6] = accelerometer**2
+                differenced[k, place + 3 : place + 6] = ((J[3:] * scale) ** 2).sum(axis=1)
+                relative.append(J[3:, 3:6].T @ J[3:])
+                place += 6
+            if len(soles) == 2:
+                white[k, place:] = (((relative[0] - relative[1]) * scale) ** 2).sum(axis=1)
+        return white, differenced
+
+
+def joint_velocity_noise(sensors: SensorsConfig) -> float:
+    """Standard deviation of a measured joint velocity [rad/s]."""
+    encoders = sensors.encoders
+    if encoders.velocity == "exact":
+        return encoders.velocity_noise
+    return float(np.sqrt(2) * np.hypot(encoders.noise, encoders.resolution / np.sqrt(12)) / encoders.period)
+
+
+def _skew(p: np.ndarray) -> np.ndarray:
+    return np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Block averages of the residual of a model over a log; B blocks, R rows."""
+
+    rows: list[Row]
+    # Centre of each block [s], shape (B,).
+    time: np.ndarray
+    # (B, R); and which are known: no gap in the log, and for kinematic rows a sole that stands.
+    value: np.ndarray
+    known: np.ndarray
+    # Noise of the sensors: variance of each average, and its covariance with the next block's, each (B, R).
+    variance: np.ndarray
+    covariance: np.ndarray
+    # Which soles stand, (B, feet).
+    standing: np.ndarray
+    # Averages of the signals, for tables and plots.
+    signals: Instants
+    # What of the variance is no noise of sensors but doubt about laws that were taken off, (B, R) or 0.
+    doubt: np.ndarray | float = 0.0
+
+    @cached_property
+    def row_index(self) -> dict[str, int]:
+        return {row.name: k for k, row in enumerate(self.rows)}
+
+    @cached_property
+    def noise_floor(self) -> np.ndarray:
+        """Root mean square of the sensors' noise in each row, shape (R,); NaN for a row that is never known."""
+        return rms(np.sqrt(self.variance), self.known)
+
+    def noisier(self, variance: np.ndarray) -> "Residual":
+        """With doubt about what was taken off the joint rows, a variance (B, n)."""
+        more = np.zeros_like(self.variance)
+        more[:, : variance.shape[1]] = variance
+        return replace(self, variance=self.variance + more, doubt=self.doubt + more)
+
+    def minus(self, predicted: np.ndarray) -> "Residual":
+        """What is left when a prediction (B, R) is taken off."""
+        return replace(self, value=self.value - predicted)
+
+
+def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Root mean square over the first axis where known; NaN where nothing is."""
+    counts = known.sum(axis=0)
+    total = (np.where(known, values, 0.0) ** 2).sum(axis=0)
+    return np.sqrt(np.divide(total, counts, out=np.full(total.shape, np.nan), where=counts > 0))
+
+
+class RecordedMotion:
+    """A log seen by a model: makes residuals, and finds how they change with the signals or the model."""
+
+    def __init__(self, robot: Robot, sensors: SensorsConfig, log: Log):
+        """Reads the log.
+
+        Args:
+            robot: the model.
+            sensors: whose noise is believed.
+
+        Raises:
+            InputError: a log that does not fit the model, or one that is too short.
+        """
+        self.robot, self.sensors, self.log = robot, sensors, log
+        self.period = float(log.meta["period"])
+        self.signals, self.measured = read_signals(robot, log)
+        self.length = max(1, round(BLOCK / self.period))
+        if len(self.signals.joint_position) < 20 * self.length:
+            raise InputError(f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed")
+        self.start = float(log.time[0])
+        self.equation = EquationOfMotion(robot)
+
+    @cached_property
+    def steps(self) -> Instants:
+        return steps(self.signals, self.period)
+
+    @cached_property
+    def blocks(self) -> Instants:
+        """Averages of the steps."""
+        return averaged(self.steps, self.length)
+
+    @cached_property
+    def time(self) -> np.ndarray:
+        """Centre of each block [s]."""
+        return self.start + (np.arange(len(self.blocks.joint_position)) + 0.5) * self.length * self.period
+
+    @cached_property
+    def standing(self) -> np.ndarray:
+        """Which soles stand throughout each block, (B, feet)."""
+        return block_means(self.equation.standing(self.steps.pad_force).astype(float), self.length) == 1.0
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """Which averages of which rows are known, (B, R)."""
+        rows = residual_rows(self.robot)
+        in_gap = block_means(1.0 - (self.measured[:-1] & self.measured[1:]), self.length) > 0
+        known = np.repeat(~in_gap[:, None], len(rows), axis=1)
+        kinematic = np.array([row.kind == "kinematic" for row in rows])
+        known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
+        for foot, side in enumerate(self.robot.description.sides):
+            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= self.standing[:, foot, None]
+        known[:, [row.name.startswith("soles/") for row in rows]] &= self.standing.all(axis=1)[:, None]
+        return known
+
+    @cached_property
+    def residual(self) -> Residual:
+        """The residual of the model's rigid bodies; what its effects explain is not taken off."""
+        value = block_means(self.equation.residual(self.steps), self.length)
+        white, differenced = self.equation.noise(self.blocks, self.sensors)
+        duration = self.length * self.period
+        variance = white / self.length + 2 * differenced / duration**2
+        covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
+        covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
+        return Residual(residual_rows(self.robot), self.time, value, self.known, variance, covariance, self.standing, self.blocks)
+
+
+def rows_of(residual: Residual, kinds: Sequence[str]) -> np.ndarray:
+    """Places of the rows of these kinds."""
+    return np.array([k for k, row in enumerate(residual.rows) if row.kind in kinds], dtype=int)

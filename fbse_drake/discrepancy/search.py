@@ -1,0 +1,466 @@
+"""Search for the effects that explain a residual: which, where, with which values."""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.regression import Fit, Signature, WhitenedResidual
+from fbse_drake.discrepancy.residual import Residual
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+# Probability of any false alarm on a log that hides nothing.
+FALSE_ALARM = 1e-3
+# Explanations whose deviances differ by less are not told apart (a likelihood ratio of some 150).
+MARGIN = 10.0
+# What a parameter must earn beyond what it costs on held-out data.
+_COMPLEXITY = 4.0
+# How often a grid of nonlinear values is narrowed down around its best point, and to how many points.
+_NARROWINGS = 2
+_POINTS = 9
+# Share of the doubt about known laws that an effect could mimic.
+_SYSTEMATIC = 0.25
+# A value may lie beyond the plausible range by this factor.
+_IMPLAUSIBLE = 3.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect on one or more targets that share its values."""
+
+    effect: type[Effect]
+    # Joints, bodies, sides or `robot`.
+    targets: tuple[str, ...]
+    # Values of its nonlinear parameters, shape (m,).
+    nonlinear: np.ndarray
+    # Whitened; columns are the linear parameters, then the change of the nonlinear ones. And as it is.
+    signature: Signature
+    raw: Signature
+
+    @property
+    def name(self) -> str:
+        return self.effect.__name__
+
+    @property
+    def has_linear(self) -> bool:
+        """Does it have an amount, or nonlinear parameters alone?"""
+        return bool(self.linear_names)
+
+    @property
+    def linear_names(self) -> list[str]:
+        return [name for name, parameter in self.effect.parameters.items() if parameter.linear]
+
+    @property
+    def nonlinear_names(self) -> list[str]:
+        return [name for name, parameter in self.effect.parameters.items() if not parameter.linear]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Effects that are fitted together; their parameters stand one candidate after the other."""
+
+    candidates: tuple[Candidate, ...]
+    # None for no effects at all.
+    fit: Fit | None
+    sse: np.ndarray
+    held_out_sse: np.ndarray
+    # Of held-out data, with the charge for every parameter; smaller is better.
+    deviance: float
+
+    def values(self, candidate: Candidate) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds."""
+        start = sum(c.signature.values.shape[2] for c in itertools.takewhile(lambda c: c is not candidate, self.candidates))
+        names = candidate.linear_names + candidate.nonlinear_names
+        offsets = np.concatenate([np.zeros(len(candidate.linear_names)), candidate.nonlinear])
+        part = slice(start, start + len(names))
+        values, intervals = self.fit.parameters[part] + offsets, self.fit.interval()[part] + offsets[:, None]
+        bounds = [candidate.effect.parameters[name].bounds for name in names]
+        return (
+            {name: float(np.clip(value, *b)) for name, value, b in zip(names, values, bounds, strict=True)},
+            {name: tuple(np.clip(i, *b).tolist()) for name, i, b in zip(names, intervals, bounds, strict=True)},
+        )
+
+
+class Search:
+    """The effects that could explain one residual, and the fits of them."""
+
+    def __init__(self, predictor: Predictor, effects: Iterable[type[Effect]], bodies: Sequence[str] = ()):
+        """Prepares the search.
+
+        Args:
+            effects: what is tried.
+            bodies: whose masses are tried.
+        """
+        self.predictor, self.effects = predictor, [effect for effect in effects if not effect.composite]
+        self._bodies = list(bodies)
+        self._joints = predictor.robot.joint_names
+        # What does not depend on the noise: columns of grids of nonlinear values, and candidates that are no joint torque effects.
+        self._raw_grids: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._raw_fixed: list[tuple[type[Effect], str, np.ndarray, Signature]] = []
+        self._weigh(predictor.residual)
+
+    def _weigh(self, residual: Residual) -> None:
+        self.white = WhitenedResidual(residual)
+        self._grids: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
+        self._found: dict[tuple[str, tuple[str, ...], bytes], Candidate] = {}
+        self.__dict__.pop("fixed_candidates", None)
+
+    def doubting(self, explanation: Explanation) -> Explanation:
+        """Weighs the residual anew: friction laws that an explanation takes off make it noisier. Returns the explanation, fitted anew."""
+        laws = []
+        for candidate in explanation.candidates:
+            if issubclass(candidate.effect, JointTorqueEffect):
+                values, _ = explanation.values(candidate)
+                same = {name: [value] * len(candidate.targets) for name, value in values.items()}
+                laws.append(candidate.effect.from_values(candidate.targets, same).resolve(self.predictor.robot.description))
+        self._weigh(self.predictor.residual.noisier(self.predictor.law_variance(laws)))
+        return self.explain([replace(c, signature=self.white.whiten_signature(c.raw)) for c in explanation.candidates])
+
+    @cached_property
+    def joint_effects(self) -> list[type[JointTorqueEffect]]:
+        return [effect for effect in self.effects if issubclass(effect, JointTorqueEffect)]
+
+    @cached_property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Joints that may share values: each alone, the same joint of every leg, all."""
+        names = self.predictor.robot.description
+        roles = [tuple(leg.joints[k] for leg in names.legs.values()) for k in range(len(names.leg_joints))]
+        wider = [group for group in (*roles, tuple(self._joints)) if len(group) > 1]
+        return [*((joint,) for joint in self._joints), *dict.fromkeys(wider)]
+
+    @cached_property
+    def fixed_candidates(self) -> list[Candidate]:
+        """All candidates that are no joint torque effects: one for each target that moves the residual."""
+        if not self._raw_fixed:
+            targets = {"joint": self._joints, "foot": self.predictor.robot.description.sides, "body": self._bodies, "robot": ["robot"]}
+            for effect in self.effects:
+                if issubclass(effect, JointTorqueEffect):
+                    continue
+                # Their nonlinear parameters keep the default.
+                for target in targets[effect.acts_on]:
+                    raw = self.predictor.signature(effect, target, _defaults(effect))
+                    if len(raw.rows):
+                        self._raw_fixed.append((effect, target, _defaults(effect), raw))
+        return [
+            Candidate(effect, (target,), nonlinear, self.white.whiten_signature(raw), raw)
+            for effect, target, nonlinear, raw in self._raw_fixed
+        ]
+
+    @cached_property
+    def threshold(self) -> np.ndarray:
+        """Drop of the deviance that k parameters must bring before they count, by k."""
+        tests = len(self.fixed_candidates)
+        for effect in self.joint_effects:
+            tests += len(self.groups) * max(1, self._grid(effect)[0].shape[1] // 4)
+        return np.array([np.inf, *(chi2.isf(FALSE_ALARM / tests, k) for k in range(1, 13))])
+
+    def explain(self, candidates: Sequence[Candidate]) -> Explanation:
+        """Fits candidates together."""
+        if not candidates:
+            return Explanation((), None, self.white.sse, self.white.sse, self.white.deviance(self.white.sse))
+        fit = self.white.fit([c.signature for c in candidates])
+        charge = _COMPLEXITY * len(fit.parameters)
+        return Explanation(tuple(candidates), fit, fit.sse, fit.held_out_sse, self.white.deviance(fit.held_out_sse) + charge)
+
+    @property
+    def noise_alone(self) -> Explanation:
+        """What an explanation that leaves nothing but noise would be, without any effects."""
+        return Explanation((), None, 1.0 * self.white.count, 1.0 * self.white.count, 0.0)
+
+    def best_additions(self, base: Explanation) -> list[Explanation]:
+        """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first."""
+        found = []
+        for candidate in self._promising(base):
+            wider = self.explain([*base.candidates, candidate])
+            if self.is_significant(base, wider, candidate):
+                found.append(wider)
+        return sorted(found, key=lambda e: e.deviance)
+
+    def systematic(self, rows: np.ndarray) -> float:
+        """Drop of the deviance that doubtful laws alone may give to an effect in these rows: what is doubted need not be random."""
+        return _SYSTEMATIC * float(self.white.doubt[rows].sum())
+
+    def is_significant(self, base: Explanation, wider: Explanation, added: Candidate) -> bool:
+        """Does the last candidate bring more than chance, with values that can be?"""
+        drop = base.deviance - wider.deviance
+        if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows):
+            return False
+        start = len(wider.fit.parameters) - added.signature.values.shape[2]
+        names = added.linear_names if added.has_linear else added.nonlinear_names
+        offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
+        values, deviations = wider.fit.parameters[start:][: len(names)] + offsets, wider.fit.deviation[start:][: len(names)]
+        for name, value, deviation in zip(names, values, deviations, strict=True):
+            low, high = added.effect.parameters[name].bounds
+            plausible = added.effect.parameters[name].plausible
+            widest = _IMPLAUSIBLE * max(abs(bound) for bound in plausible)
+            if value < low - 3 * deviation or value > high + 3 * deviation or abs(value) > widest + 3 * deviation:
+                return False
+        return True
+
+    def _promising(self, base: Explanation) -> list[Candidate]:
+        """Candidates that, alone, would take off enough of what an explanation leaves over."""
+        left, projection = self.leftover(base)
+        scale = self.white.scale(base.sse)
+        result = []
+        for candidate in self.fixed_candidates:
+            taken = any(c.effect is candidate.effect and c.targets == candidate.targets for c in base.candidates)
+            if not taken and self._fixed_gain(candidate, left, projection, scale) > 0.5 * self.threshold[1]:
+                result.append(candidate)
+        coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {group: [] for group in self.groups}
+        for effect in self.joint_effects:
+            taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
+            columns = self._grid(effect)[1]
+            moments = [self._moments(columns[j], j, left, projection, scale) for j in range(len(self._joints))]
+            for group in self.groups:
+                if taken & set(group):
+                    continue
+                places = [self._joints.index(joint) for joint in group]
+                gain = _gain(effect, sum(moments[j][0] for j in places), sum(moments[j][1] for j in places))
+                coarse[group].append((float(gain.max()), effect, int(gain.argmax())))
+        for group, found in coarse.items():
+            # What the grid shows far behind the best does not catch up between its points.
+            least = max(0.5 * self.threshold[1], 0.4 * max((gain for gain, *_ in found), default=0.0))
+            for gain, effect, best in found:
+                if gain > least:
+                    result.append(self._best_on(effect, group, best, left, projection, scale))
+        return result
+
+    def _fixed_gain(self, candidate: Candidate, left: np.ndarray, projection: dict[int, np.ndarray], scale: np.ndarray) -> float:
+        """Drop of the sum of squares by a candidate that is no joint torque effect, roughly."""
+        s = candidate.signature
+        X = np.concatenate([_project(s.values[:, k], projection.get(row)) / np.sqrt(scale[row]) for k, row in enumerate(s.rows)])
+        y = (left[:, s.rows] / np.sqrt(scale[s.rows])).T.ravel()
+        right = X.T @ y
+        return float(right @ np.linalg.lstsq(X.T @ X, right, rcond=1e-10)[0])
+
+    def _best_on(
+        self,
+        effect: type[JointTorqueEffect],
+        group: tuple[str, ...],
+        best: int,
+        left: np.ndarray,
+        projection: dict[int, np.ndarray],
+        scale: np.ndarray,
+    ) -> Candidate:
+        """A joint torque effect with the nonlinear values that fit best; found once for what is left in the group's rows."""
+        places = [self._joints.index(joint) for joint in group]
+        key = (effect.__name__, group, left[:, places].tobytes())
+        if key not in self._found:
+            nonlinear = self._narrowed(effect, places, best, left, projection, scale)
+            self._found[key] = self.candidate(effect, group, nonlinear, left, projection)
+        return self._found[key]
+
+    def candidate(
+        self,
+        effect: type[JointTorqueEffect],
+        group: tuple[str, ...],
+        nonlinear: np.ndarray,
+        left: np.ndarray,
+        projection: dict[int, np.ndarray],
+    ) -> Candidate:
+        """A joint torque effect with nonlinear values, linearised about them."""
+        places = np.array([self._joints.index(joint) for joint in group])
+        columns = self._columns(effect, places, nonlinear[:, None])[..., 0]
+        names = [name for name, parameter in effect.parameters.items() if not parameter.linear]
+        has_linear = len(names) < len(effect.parameters)
+        amounts = np.ones(1)
+        if has_linear:
+            whitened = [self.white.whiten(j, columns[:, r]) for r, j in enumerate(places)]
+            X = np.concatenate([_project(columns, projection.get(j)) for columns, j in zip(whitened, places, strict=True)])
+            amounts = np.linalg.lstsq(X, left[:, places].T.ravel())[0]
+        # Slopes with respect to the nonlinear parameters, for amounts that fit best.
+        slopes = []
+        for k in range(len(nonlinear)):
+            step = 0.02 * nonlinear[k]
+            moved = np.repeat(nonlinear[:, None], 2, axis=1)
+            moved[k] += [-step, step]
+            pair = self._columns(effect, places, moved)
+            slopes.append((pair[..., 1] - pair[..., 0]) @ amounts / (2 * step))
+        slope_columns = np.stack(slopes, axis=2) if slopes else np.zeros((len(columns), len(places), 0))
+        # A weak belief in the plausible range keeps values that the data say nothing about from running away.
+        ranges = [np.log(effect.parameters[name].plausible) for name in names]
+        belief = [1.0 / (0.25 * (high - low) * value) ** 2 for (low, high), value in zip(ranges, nonlinear, strict=True)]
+        if has_linear:
+            values = np.concatenate([columns, slope_columns], axis=2)
+            raw = Signature(places, values, prior=np.array([0.0] * columns.shape[2] + belief))
+        else:
+            raw = Signature(places, slope_columns, offset=columns[:, :, 0], prior=np.array(belief))
+        return Candidate(effect, group, nonlinear, self.white.whiten_signature(raw), raw)
+
+    def smallest_detectable(self, base: Explanation, effect: type[Effect]) -> dict[str, float]:
+        """Size of an effect's first parameter that would have been found beside an explanation, by target.
+
+        The size at which the effect's sum of squares reaches what its parameters must bring and cost.
+        """
+        _, projection = self.leftover(base)
+        scale = self.white.scale(base.sse)
+        result = {}
+        if not issubclass(effect, JointTorqueEffect):
+            for candidate in (c for c in self.fixed_candidates if c.effect is effect):
+                s = candidate.signature
+                power = sum((_project(s.values[:, k, :1], projection.get(row)) ** 2).sum() / scale[row] for k, row in enumerate(s.rows))
+                result[candidate.targets[0]] = float(
+                    np.sqrt((self._needed(s.values.shape[2]) + self.systematic(s.rows)) / max(power, 1e-30))
+                )
+            return result
+        points, columns = self._grid(effect)
+        has_linear = any(parameter.linear for parameter in effect.parameters.values())
+        usual = int(np.abs(np.log(points / _defaults(effect)[:, None])).sum(axis=0).argmin()) if len(points) else 0
+        for row, joint in enumerate(self._joints):
+            needed = self._needed(len(effect.parameters)) + self.systematic(np.array([row]))
+            first = columns[row][:, 0]
+            power = (_project(first, projection.get(row)) ** 2).sum(axis=0) / scale[row]
+            if has_linear:
+                result[joint] = float(np.sqrt(needed / max(power[usual], 1e-30)))
+            else:
+                # Sizes in the order of the grid, from weak to strong.
+                strong = power > needed
+                order = np.argsort(power)
+                enough = np.flatnonzero(strong[order])
+                result[joint] = _crossing(points[0][order], power[order], needed) if len(enough) else np.inf
+        return result
+
+    def separation(self, effect: type[Effect], targets: Sequence[str], values: Mapping[str, float], rival: type[Effect]) -> float:
+        """How much of what an effect would do here a rival could not mimic: a sum of squares in units of noise.
+
+        Args:
+            values: of the effect's parameters.
+        """
+        signal = np.zeros_like(self.white.y)
+        names = effect.parameters
+        nonlinear = np.array([values[name] for name, parameter in names.items() if not parameter.linear])
+        amounts = np.array([values[name] for name, parameter in names.items() if parameter.linear] or [1.0])
+        for target in targets:
+            raw = self.predictor.signature(effect, target, nonlinear)
+            whitened = self.white.whiten_signature(raw)
+            signal[:, whitened.rows] += whitened.values @ amounts
+        scale = np.ones(signal.shape[1])
+        if issubclass(rival, JointTorqueEffect):
+            left = 0.0
+            columns = self._grid(rival)[1]
+            for row, joint in enumerate(self._joints):
+                power = float((signal[:, row] ** 2).sum())
+                if joint in targets and power > 0:
+                    power -= float(_gain(rival, *self._moments(columns[row], row, signal, {}, scale)).max())
+                left += power
+            return left + float((signal[:, len(self._joints) :] ** 2).sum())
+        total = float((signal**2).sum())
+        return total - max((self._fixed_gain(c, signal, {}, scale) for c in self.fixed_candidates if c.effect is rival), default=0.0)
+
+    def _needed(self, parameters: int) -> float:
+        return float(self.threshold[min(12, parameters)] + (_COMPLEXITY + 1) * parameters)
+
+    def leftover(self, base: Explanation) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+        """Whitened residual after an explanation, (B, R), and by row an orthonormal basis of the columns it has there."""
+        left, by_row = self.white.y.copy(), {}
+        start = 0
+        for c in base.candidates:
+            s = c.signature
+            stop = start + s.values.shape[2]
+            left[:, s.rows] -= s.values @ base.fit.parameters[start:stop] + s.offset
+            for k, row in enumerate(s.rows):
+                by_row.setdefault(row, []).append(s.values[:, k])
+            start = stop
+        return left, {row: np.linalg.qr(np.concatenate(columns, axis=1))[0] for row, columns in by_row.items()}
+
+    def _grid(self, effect: type[JointTorqueEffect]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """First grid of an effect's nonlinear values, (m, G), and its whitened columns, (B, p, G) for each joint."""
+        if effect.__name__ not in self._grids:
+            searched = [parameter for parameter in effect.parameters.values() if not parameter.linear]
+            most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 4)
+            axes = [np.geomspace(*parameter.plausible, min(most, parameter.grid)) for parameter in searched]
+            points = np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1) if searched else np.zeros((0, 1))
+            if effect.__name__ not in self._raw_grids:
+                self._raw_grids[effect.__name__] = points, self._columns(effect, np.arange(len(self._joints)), points)
+            columns = self._raw_grids[effect.__name__][1]
+            self._grids[effect.__name__] = points, [self.white.whiten(j, columns[:, j]) for j in range(len(self._joints))]
+        return self._grids[effect.__name__]
+
+    def _columns(self, effect: type[JointTorqueEffect], places: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+        """Columns for G sets of nonlinear values (m, G), shape (B, r, p, G)."""
+        sets = np.repeat(nonlinear[:, :, None], len(places), axis=2)
+        # From (p, G, B, r).
+        return np.transpose(self.predictor.joint_columns(effect, sets, places), (2, 3, 0, 1))
+
+    def _moments(
+        self, columns: np.ndarray, row: int, left: np.ndarray, projection: dict[int, np.ndarray], scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gram matrices (G, p, p), right sides (G, p) of a row's columns (B, p, G)."""
+        X = _project(columns.reshape(len(columns), -1), projection.get(row)).reshape(columns.shape)
+        return np.einsum("bpg,bqg->gpq", X, X, optimize=True) / scale[row], np.einsum("bpg,b->gp", X, left[:, row]) / scale[row]
+
+    def _narrowed(
+        self,
+        effect: type[JointTorqueEffect],
+        places: Sequence[int],
+        best: int,
+        left: np.ndarray,
+        projection: dict[int, np.ndarray],
+        scale: np.ndarray,
+    ) -> np.ndarray:
+        """Nonlinear values between the grid's points that fit best, shape (m,)."""
+        points = self._grid(effect)[0]
+        chosen = points[:, best].copy()
+        ranges = [parameter.plausible for parameter in effect.parameters.values() if not parameter.linear]
+        steps = []
+        for axis in points:
+            values = np.unique(axis)
+            steps.append(np.log(values[1] / values[0]) if len(values) > 1 else 0.0)
+        for _ in range(_NARROWINGS):
+            for k in range(len(chosen)):
+                if steps[k] == 0:
+                    continue
+                trial = np.repeat(chosen[:, None], _POINTS, axis=1)
+                trial[k] = np.clip(chosen[k] * np.exp(np.linspace(-steps[k], steps[k], _POINTS)), *ranges[k])
+                columns = self._columns(effect, np.array(places), trial)
+                whitened = [self.white.whiten(j, columns[:, r]) for r, j in enumerate(places)]
+                moments = [self._moments(X, j, left, projection, scale) for X, j in zip(whitened, places, strict=True)]
+                gain = _gain(effect, sum(m[0] for m in moments), sum(m[1] for m in moments))
+                chosen[k] = trial[k, int(gain.argmax())]
+                steps[k] *= 2.0 / (_POINTS - 1)
+        return chosen
+
+
+def _gain(effect: type[Effect], gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Drop of the sum of squares for each set of nonlinear values, shape (G,)."""
+    if not any(parameter.linear for parameter in effect.parameters.values()):
+        return 2 * right[:, 0] - gram[:, 0, 0]
+    if right.shape[1] == 1:
+        parameter = next(p for p in effect.parameters.values() if p.linear)
+        theta = np.divide(right[:, 0], gram[:, 0, 0], out=np.zeros(len(right)), where=gram[:, 0, 0] > 1e-12)
+        theta = np.clip(theta, *parameter.bounds)
+        return 2 * theta * right[:, 0] - theta**2 * gram[:, 0, 0]
+    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(gram.shape[1]) + 1e-12 * np.eye(gram.shape[1])
+    return np.einsum("gp,gp->g", right, np.linalg.solve(gram + ridge, right[:, :, None])[:, :, 0])
+
+
+def _project(X: np.ndarray, Q: np.ndarray | None) -> np.ndarray:
+    return X if Q is None else X - Q @ (Q.T @ X)
+
+
+def _defaults(effect: type[Effect]) -> np.ndarray:
+    return np.array([_default(effect, name) for name, parameter in effect.parameters.items() if not parameter.linear])
+
+
+def _crossing(sizes: np.ndarray, power: np.ndarray, needed: float) -> float:
+    """Size at which increasing power reaches what is needed, interpolated in logarithms."""
+    first = int(np.argmax(power > needed))
+    if first == 0:
+        # Small effects grow in proportion to their size; a limit is the weaker the larger it is.
+        return float(sizes[0] * np.sqrt(needed / power[0])) if sizes[0] < sizes[-1] else float(sizes[0])
+    low, high = np.log(np.maximum(power[first - 1 : first + 1], 1e-30))
+    share = (np.log(needed) - low) / (high - low)
+    return float(np.exp((1 - share) * np.log(sizes[first - 1]) + share * np.log(sizes[first])))
+
+
+def _default(effect: type[Effect], name: str) -> float:
+    """A usual value of a nonlinear parameter: its default, or the middle of its plausible range."""
+    value = getattr(effect(), name)
+    if isinstance(value, dict):
+        value = value.get("all", np.sqrt(np.prod(effect.parameters[name].plausible)))
+    return float(value)

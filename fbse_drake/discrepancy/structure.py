@@ -1,0 +1,110 @@
+"""What no effect of the library explains: is anything left in a residual, where, and which variable does it live in?"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fbse_drake.discrepancy.search import Explanation, Search
+
+# Pieces of a piecewise linear function of one variable.
+_PIECES = 8
+# A row whose held-out residual exceeds the sensors' noise by more than this factor has something left.
+EXCESS = 1.2
+# Drop of the held-out deviance at which a smooth function of several variables counts as found, beside what is doubted about known laws.
+_DROP = 25.0
+# Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
+_KINEMATIC_EXCESS = 3.0
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is left in one row."""
+
+    row: str
+    # Place of the row.
+    index: int
+    # Root mean square of what is left, in multiples of the sensors' noise.
+    ratio: float
+    # Variable that explains most of it: position, velocity, load, acceleration, time or phase; and the share that it explains.
+    variable: str
+    share: float
+
+
+def leftover_structure(search: Search, explanation: Explanation) -> list[Structure]:
+    """Rows in which an explanation leaves more than noise."""
+    white, residual = search.white, search.white.residual
+    left, _ = search.leftover(explanation)
+    result = []
+    for k, row in enumerate(residual.rows):
+        if white.count[k] < 50:
+            continue
+        ratio = float(np.sqrt((left[:, k] ** 2).sum() / white.count[k]))
+        variables = _variables(search, k)
+        if row.kind == "kinematic":
+            if ratio < _KINEMATIC_EXCESS:
+                continue
+        else:
+            everything = np.concatenate(list(variables.values()), axis=1)
+            # Doubt about laws is itself uncertain by a factor.
+            tolerated = np.sqrt(EXCESS**2 + 2.0 * white.doubt[k] / white.count[k])
+            if ratio < tolerated and _drop(search, left, k, everything) < _DROP + white.doubt[k]:
+                continue
+        excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
+        shares = {name: _explained(search, left, k, basis) / excess for name, basis in variables.items()}
+        best = max(shares, key=lambda name: shares[name])
+        result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
+    return result
+
+
+def _variables(search: Search, row: int) -> dict[str, np.ndarray]:
+    """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces) each."""
+    motion, n = search.predictor.motion, len(search.predictor.robot.joint_names)
+    blocks = motion.blocks
+    result = {"time": hat_functions(motion.time)}
+    if row < n:
+        velocity = blocks.joint_velocity[:, row]
+        result["position"] = hat_functions(blocks.joint_position[:, row])
+        # Fine near standstill, coarse elsewhere.
+        result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
+        result["load"] = hat_functions(blocks.torque_command[:, row])
+        result["acceleration"] = hat_functions(np.arcsinh(blocks.joint_acceleration[:, row]))
+        others = [j for j in range(n) if j != row]
+        result["other joints' torque"] = blocks.torque_command[:, others]
+    else:
+        result["angular velocity"] = blocks.angular_velocity
+        result["specific force"] = blocks.specific_force
+    result["phase"] = search.white.residual.standing.astype(float)
+    return result
+
+
+def hat_functions(x: np.ndarray) -> np.ndarray:
+    """Piecewise linear functions with knots at the quantiles of x, (B, pieces); they sum to one."""
+    knots = np.unique(np.quantile(x, np.linspace(0, 1, _PIECES + 1)))
+    if len(knots) < 2:
+        return np.ones((len(x), 1))
+    return np.stack([np.interp(x, knots, np.eye(len(knots))[k]) for k in range(len(knots))], axis=1)
+
+
+def _fit(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> tuple[float, float]:
+    """Sums of squares of a row on held-out data, without and with a smooth function."""
+    white = search.white
+    X = white.whiten(row, basis)
+    X = X[:, np.abs(X).max(axis=0) > 0]
+    y = left[:, row]
+    ridge = 1e-3 * np.diag((X**2).sum(axis=0))
+    held_out = np.empty_like(y)
+    for fold in range(white.fold.max() + 1):
+        out = white.fold == fold
+        held_out[out] = y[out] - X[out] @ np.linalg.solve(X[~out].T @ X[~out] + ridge, X[~out].T @ y[~out])
+    return float((y**2).sum()), float((held_out**2).sum())
+
+
+def _drop(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    count = search.white.count[row]
+    before, after = (max(sse / count, 1e-9) for sse in _fit(search, left, row, basis))
+    return float(count * (np.log(max(before, 1)) + before / max(before, 1) - np.log(max(after, 1)) - after / max(after, 1)))
+
+
+def _explained(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    before, after = _fit(search, left, row, basis)
+    return before - after

@@ -1,0 +1,212 @@
+"""What is put into a log is found, with intervals that hold it; what is not is not; and what cannot be seen is said to be so."""
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from fbse_drake.discrepancy.add import add
+from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
+from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.search import Search
+from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.errors import InputError
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario, load_scenario
+from fbse_drake.simulate import simulate
+
+# Effects that look alike, and some that do not; the whole library is tried by `make hidden`.
+NAMES = (
+    "CoulombFriction",
+    "ViscousFriction",
+    "DirectionalFriction",
+    "LoadDependentFriction",
+    "QuadraticDrag",
+    "JointSpring",
+    "TorqueBias",
+    "TorqueGain",
+    "TorqueLag",
+    "ReflectedInertia",
+    "BodyMass",
+    "FootForceGain",
+    "AccelerometerBias",
+)
+
+
+def effects() -> list[type[Effect]]:
+    return [library()[name] for name in NAMES]
+
+
+def walking(*overrides: str) -> Scenario:
+    return load_scenario("paper_walk", overrides=["duration=3.2", *overrides])
+
+
+@cache
+def scenario() -> Scenario:
+    """What is believed: the robot without what is hidden."""
+    clean = walking()
+    return replace(clean, model=clean.robot)
+
+
+@cache
+def log_with(hidden: str) -> Log:
+    return simulate(walking("seed=11", *([f"robot.effects.hidden={hidden}"] if hidden else []))).log
+
+
+@cache
+def diagnosis_of(hidden: str) -> Diagnosis:
+    return diagnose(Predictor(scenario(), log_with(hidden)), effects())
+
+
+HIDDEN = {
+    "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}": ("TorqueGain", "left_knee_pitch", {"shortfall": 0.04}),
+    "!CoulombFriction {coulomb: {right_hip_pitch: 1.5}}": ("CoulombFriction", "right_hip_pitch", {"coulomb": 1.5}),
+    "!LoadDependentFriction {coefficient: {left_knee_pitch: 0.03}}": ("LoadDependentFriction", "left_knee_pitch", {"coefficient": 0.03}),
+    "!BodyMass {mass: {trunk: 2.0}}": ("BodyMass", "trunk", {"mass": 2.0}),
+    "!AccelerometerBias {x: 0.1, y: -0.05}": ("AccelerometerBias", "robot", {"x": 0.1, "y": -0.05, "z": 0.0}),
+}
+
+
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_what_is_hidden_is_found(hidden: str) -> None:
+    name, target, truth = HIDDEN[hidden]
+    diagnosis = diagnosis_of(hidden)
+    assert diagnosis.verdict == "effect_found"
+    first = diagnosis.ranking[0]
+    assert (first.effect, first.targets) == (name, (target,))
+    assert len(diagnosis.chosen) == 1
+    assert first.held_out_after < 1.2 < first.held_out_before
+    for parameter, value in truth.items():
+        found = first.parameters[parameter]
+        half = max(abs(end - found.value) for end in found.interval)
+        # Twice the half width of a 95 % interval: a single draw.
+        assert abs(found.value - value) < 2 * half, (parameter, found)
+        assert half < 0.1 * max(abs(v) for v in truth.values())
+    statuses = diagnosis.effects
+    assert statuses[name].verdict == "present"
+    assert all(status.verdict in ("absent", "confusable", "not_visible") for other, status in statuses.items() if other != name)
+
+
+def test_nothing_is_found_where_nothing_is_hidden() -> None:
+    diagnosis = diagnosis_of("")
+    assert diagnosis.verdict == "nothing_missing"
+    assert not diagnosis.ranking
+    assert all(status.verdict in ("absent", "not_visible") for status in diagnosis.effects.values())
+    assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.1)
+
+
+def injected(log: Log, effect: Effect) -> Log:
+    """The log of a robot whose motors, to move the same way against a further torque, were commanded more."""
+    names = Predictor(scenario(), log)
+    resolved = effect.resolve(names.robot.description)
+    torque, _ = resolved.torque_and_slope(JointMotion(log["truth/joint/velocity"][1:]))
+    command = log["joint/torque_command"].copy()
+    command[:-1] += torque
+    return replace(log, channels=log.channels | {"joint/torque_command": command})
+
+
+@pytest.mark.parametrize("joint", ["left_knee_pitch", "right_hip_roll"])
+def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) -> None:
+    log, viscous = log_with(""), library()["ViscousFriction"]
+    size = diagnosis_of("").effects["ViscousFriction"].smallest_detectable[joint]
+    found = {}
+    for factor in (0.5, 2.0):
+        weak = viscous.from_values([joint], {"viscous": [factor * size]})
+        found[factor] = diagnose(Predictor(scenario(), injected(log, weak)), effects()).chosen
+    assert not found[0.5]
+    assert found[2.0]
+    assert all(finding.targets == (joint,) for finding in found[2.0])
+
+
+def test_a_standing_robot_shows_no_friction() -> None:
+    """Too little excitation reads `not_visible`, never `absent`, with the experiment that would show it."""
+    standing = load_scenario("squat", overrides=["duration=2.5", "reference.amplitude=1e-6", "robot.effects=null"])
+    names = ("ViscousFriction", "QuadraticDrag")
+    diagnosis = diagnose(Predictor(standing, planned_log(standing)), [library()[name] for name in names])
+    assert diagnosis.verdict == "not_visible"
+    for status in diagnosis.effects.values():
+        assert status.verdict == "not_visible"
+        assert status.scenario is not None
+        assert status.command.startswith("fbse simulate ")
+
+
+@dataclass(frozen=True)
+class Grip(JointTorqueEffect):
+    """Not in the library: the joint sticks at one angle."""
+
+    description: ClassVar[str] = ""
+    signature: ClassVar[str] = ""
+    experiment: ClassVar[str] = ""
+    parameters: ClassVar[dict] = {}
+    grip: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple:  # noqa: ARG004
+        return (np.exp(-(((motion.position - 0.9) / 0.05) ** 2)) * np.sin(25 * motion.time),), (0.0,)
+
+
+def test_what_the_library_does_not_know_is_called_unknown() -> None:
+    log = log_with("")
+    joint = log.joints.index("left_knee_pitch")
+    motion = JointMotion(log["joint/velocity"], position=log["joint/position"], time=log.time[:, None])
+    command = log["joint/torque_command"].copy()
+    command[:, joint] += 4.0 * Grip.basis(motion, np.zeros(0))[0][0][:, joint]
+    strange = replace(log, channels=log.channels | {"joint/torque_command": command})
+    diagnosis = diagnose(Predictor(scenario(), strange), effects())
+    assert diagnosis.verdict == "unknown_effect"
+    assert [structure.row for structure in diagnosis.unexplained] == ["left_knee_pitch"]
+
+
+def test_two_effects_at_once_are_both_found() -> None:
+    log = log_with("!TorqueGain {shortfall: {left_knee_pitch: 0.04}}")
+    viscous = library()["ViscousFriction"].from_values(["right_hip_pitch"], {"viscous": [1.5]})
+    found = diagnose(Predictor(scenario(), injected(log, viscous)), effects()).chosen
+    assert {(finding.effect, finding.targets[0]) for finding in found} == {
+        ("TorqueGain", "left_knee_pitch"),
+        ("ViscousFriction", "right_hip_pitch"),
+    }
+
+
+def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
+    hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
+    result = study(scenario(), log_with(hidden), effects())
+    before, after = result.steps
+    assert after.held_out_rmse < 1.2 < before.held_out_rmse
+    assert after.rollout.position["left_knee_pitch"] < 0.5 * before.rollout.position["left_knee_pitch"]
+    assert "noise floor" in result.stopped_because
+    added = result.scenario.believed.effects["torque_gain"]
+    assert added.shortfall["left_knee_pitch"] == pytest.approx(0.04, rel=0.05)
+    content = study_json(result)
+    assert set(content) >= {"steps", "noise_floor", "stopped_because"}
+    assert set(content["steps"][1]) >= {"added", "held_out_rmse", "train_rmse"}
+
+
+def test_added_effects_are_taken_off_the_residual_exactly_as_they_were_fitted() -> None:
+    for hidden in ("!BodyMass {mass: {trunk: 2.0}}", "!AccelerometerBias {x: 0.1, y: -0.05}"):
+        wiser = add(scenario(), diagnosis_json(diagnosis_of(hidden)))
+        assert not diagnose(Predictor(wiser, log_with(hidden)), effects()).chosen
+
+
+def test_adding_what_a_diagnosis_has_not_got() -> None:
+    content = diagnosis_json(diagnosis_of("!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"))
+    with pytest.raises(InputError, match="no effect Backlash"):
+        add(scenario(), content, "Backlash")
+    with pytest.raises(InputError, match="not the contents of a diagnosis"):
+        add(scenario(), {"verdict": "effect_found"})
+
+
+def test_planned_motion_satisfies_the_equation_of_motion() -> None:
+    """A log made from a plan alone leaves no residual, on one leg and on two."""
+    wanted = load_scenario("frictionless_walk", overrides=["duration=3"])
+    residual = Predictor(wanted, planned_log(wanted)).residual
+    dynamic = [k for k, row in enumerate(residual.rows) if row.kind != "kinematic"]
+    assert np.sqrt((residual.value[:, dynamic] ** 2).mean()) < 0.5
+    search = Search(Predictor(wanted, planned_log(wanted)), [library()["ViscousFriction"]])
+    size = search.smallest_detectable(search.noise_alone, library()["ViscousFriction"])
+    # The hip yaw does not move in a straight walk.
+    assert size["left_hip_yaw"] > 100 * size["left_knee_pitch"]

@@ -1,0 +1,177 @@
+"""The residual is what the sensors' noise makes it when nothing is missing, and shows what is missing when something is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.regression import Signature, WhitenedResidual
+from fbse_drake.discrepancy.residual import Residual, Row, block_means
+from fbse_drake.discrepancy.sanity import check_sensors
+from fbse_drake.errors import InputError
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario, load_scenario
+from fbse_drake.simulate import simulate
+
+
+def believed(scenario: Scenario) -> Scenario:
+    """The scenario with a model that knows all of the robot."""
+    return replace(scenario, model=scenario.robot)
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Scenario, Log]:
+    scenario = load_scenario("paper_walk", overrides=["duration=3", "seed=5"])
+    return believed(scenario), simulate(scenario).log
+
+
+def changed(log: Log, **channels: np.ndarray) -> Log:
+    return replace(log, channels=log.channels | {name.replace("__", "/"): values for name, values in channels.items()})
+
+
+def kinds(residual: Residual, kind: str) -> list[int]:
+    return [k for k, row in enumerate(residual.rows) if row.kind == kind]
+
+
+def test_nothing_but_noise_is_left_where_nothing_is_missing(walk: tuple[Scenario, Log]) -> None:
+    white = WhitenedResidual(Predictor(*walk).residual)
+    rms = np.sqrt(white.sse / white.count)
+    assert np.all((0.85 < rms) & (rms < 1.2)), dict(zip((r.name for r in white.residual.rows), rms.round(2), strict=True))
+    # White: no block knows anything of the next.
+    y = white.y[:, kinds(white.residual, "joint") + kinds(white.residual, "base")]
+    correlation = (y[1:] * y[:-1]).sum(axis=0) / (y**2).sum(axis=0)
+    assert np.abs(correlation).max() < 4 / np.sqrt(len(y))
+
+
+def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None:
+    scenario, log = walk
+    floor = Predictor(scenario, log).residual.noise_floor
+    sensors = scenario.sensors
+    forces = replace(scenario, sensors=replace(sensors, foot_force=replace(sensors.foot_force, noise=50.0)))
+    by_forces = Predictor(forces, log).residual.noise_floor / floor
+    rows = Predictor(scenario, log).residual.row_index
+    # Vertical force on the base: the accelerometer's noise is nothing beside that of eight pads.
+    assert by_forces[rows["base/force_z"]] > 20
+    assert by_forces[rows["left_sole/angular_velocity_x"]] == pytest.approx(1.0, abs=1e-9)
+    # Eight pads of 50 N each, averaged over ten samples.
+    assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(50 * np.sqrt(8 / 10), rel=0.02)
+
+
+def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:
+    scenario, _ = walk
+    scenario = replace(scenario, sensors=type(scenario.sensors)(), duration=1.5)
+    log = simulate(scenario).log
+    residual = Predictor(replace(scenario, model=None), log).residual
+    friction = block_means(log["truth/joint/friction_torque"][:-1], 10)
+    n = friction.shape[1]
+    # What is left is the contact solver's tolerance.
+    assert np.abs(residual.value[:, :n] - friction).max() < 1e-2
+    # No joint effect appears in the base rows, where the robot's weight is 850 N.
+    assert np.abs(residual.value[:, n : n + 6]).max() < 0.2
+
+
+def test_gaps_are_left_out_and_touch_nothing_else(walk: tuple[Scenario, Log]) -> None:
+    scenario, log = walk
+    whole = Predictor(scenario, log).residual
+    keep = np.ones(len(log.time), dtype=bool)
+    keep[1234:1240] = False
+    torn = Predictor(scenario, replace(log, channels={name: values[keep] for name, values in log.channels.items()})).residual
+    lost = np.flatnonzero(~torn.known[:, 0])
+    assert lost.tolist() == [123]
+    others = np.delete(np.arange(len(whole.time)), [122, 123, 124])
+    np.testing.assert_allclose(torn.value[others, :18], whole.value[others, :18], atol=1e-9)
+
+
+def test_whitening_makes_differenced_noise_white() -> None:
+    rng = np.random.default_rng(1)
+    blocks, white, differenced = 4000, 0.3, 2.0
+    integral = rng.normal(scale=differenced, size=blocks + 1)
+    y = rng.normal(scale=white, size=blocks) + np.diff(integral)
+    one = np.ones((blocks, 1))
+    residual = Residual(
+        [Row("joint", "joint", "Nm")],
+        0.01 * np.arange(blocks),
+        y[:, None],
+        one > 0,
+        (white**2 + 2 * differenced**2) * one,
+        -(differenced**2) * one,
+        one > 0,
+        signals=None,
+    )
+    result = WhitenedResidual(residual)
+    assert (result.y**2).mean() == pytest.approx(1.0, abs=0.1)
+    assert np.abs((result.y[1:] * result.y[:-1]).mean()) < 0.07
+
+
+def test_intervals_cover_the_truth_also_where_errors_are_correlated() -> None:
+    rng = np.random.default_rng(2)
+    blocks, runs, covered, naive = 1000, 200, 0, 0
+    time = 0.01 * np.arange(blocks)
+    one = np.ones((blocks, 1))
+    column = np.sin(2 * np.pi * time / 1.5)
+    for _ in range(runs):
+        # Beside the white noise, an error that lasts for a fifth of a second.
+        lasting = np.repeat(rng.normal(size=blocks // 20), 20)
+        y = 0.7 * column + rng.normal(size=blocks) + lasting
+        residual = Residual([Row("joint", "joint", "Nm")], time, y[:, None], one > 0, one, 0 * one, one > 0, signals=None)
+        white = WhitenedResidual(residual)
+        fit = white.fit([white.whiten_signature(Signature(np.array([0]), column[:, None, None]))])
+        low, high = fit.interval()[0]
+        covered += low < 0.7 < high
+        naive += abs(fit.parameters[0] - 0.7) < 1.96 * np.sqrt(2.0 / (column**2).sum())
+    assert naive < 0.75 * runs, "the errors are not correlated enough for this test"
+    assert 0.88 * runs <= covered <= 0.99 * runs
+
+
+def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
+    rng = np.random.default_rng(3)
+    blocks = 1000
+    one = np.ones((blocks, 1))
+    residual = Residual(
+        [Row("joint", "joint", "Nm")], 0.01 * np.arange(blocks), rng.normal(size=(blocks, 1)), one > 0, one, 0 * one, one > 0, signals=None
+    )
+    white = WhitenedResidual(residual)
+    fit = white.fit([Signature(np.array([0]), rng.normal(size=(blocks, 1, 20)))])
+    assert fit.sse[0] < white.sse[0] < fit.held_out_sse[0]
+
+
+@pytest.mark.parametrize(
+    ("channel", "change", "words"),
+    [
+        ("imu__linear_acceleration", lambda x: x - [0, 0, 9.81], "gravity is missing"),
+        ("imu__linear_acceleration", lambda x: -x, "sign is reversed"),
+        ("imu__linear_acceleration", lambda x: x[:, [2, 1, 0]], "frame is wrong"),
+        ("imu__linear_acceleration", lambda x: x / 9.81, "gravity is missing"),
+        ("foot__left__pad_force", lambda x: -x, "unit, scale"),
+        ("joint__torque_command", lambda x: -x, "sign is reversed"),
+        ("joint__torque_command", lambda x: 1000 * x, "unit is wrong"),
+        ("joint__position", np.rad2deg, "degrees"),
+        ("joint__velocity", lambda x: -x, "sign is reversed"),
+        ("joint__velocity", np.rad2deg, "degrees per second"),
+    ],
+)
+def test_a_log_that_does_not_fit_is_said_in_one_line(walk: tuple[Scenario, Log], channel: str, change: object, words: str) -> None:
+    scenario, log = walk
+    wrong = changed(log, **{channel: change(log[channel.replace("__", "/")])})
+    with pytest.raises(InputError, match=words) as error:
+        check_sensors(Predictor(scenario, wrong).motion)
+    assert "\n" not in str(error.value)
+    assert channel.replace("__", "/").split("/")[0] in str(error.value)
+
+
+def test_feet_read_upside_down_or_sideways(walk: tuple[Scenario, Log]) -> None:
+    scenario, log = walk
+    feet = [f"foot__{side}__pad_force" for side in log.sides]
+    for change, words in ((lambda x: -x, "sign is reversed"), (lambda x: x[:, :, [2, 1, 0]], "frame is wrong")):
+        wrong = changed(log, **{name: change(log[name.replace("__", "/")]) for name in feet})
+        with pytest.raises(InputError, match=words):
+            check_sensors(Predictor(scenario, wrong).motion)
+
+
+def test_a_good_log_passes_and_a_missing_channel_is_named(walk: tuple[Scenario, Log]) -> None:
+    scenario, log = walk
+    check_sensors(Predictor(scenario, log).motion)
+    for name in ("imu/angular_velocity", "foot/right/pad_force"):
+        with pytest.raises(InputError, match=name):
+            Predictor(scenario, replace(log, channels={k: v for k, v in log.channels.items() if k != name}))
