@@ -1,6 +1,7 @@
 # make walk   installs into .venv, simulates the paper's walk and says where its report is
 # make test   installs into .venv, checks the style and runs the tests
 # make fbse   prints how good the friction estimate is, and writes out/fbse/report.html
+# make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
 # make bench  prints speeds, as ratios measured in one run
 PYTHON ?= python3
 VENV := .venv
@@ -8,7 +9,7 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell cat fbse_drake/*/*.py | cksum | cut -d' ' -f1)
 
-.PHONY: walk test lint format bench fbse clean
+.PHONY: walk test lint format bench fbse hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -31,6 +32,10 @@ bench: $(INSTALLED)
 # How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores.
 fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.fbse
+
+# How well missing physics is found: some 400 logs, hours on two cores; goes on where it was stopped. By hand: --quick, --only NAME.
+hidden: $(INSTALLED)
+	$(VENV)/bin/python -m benchmarks.hidden
 
 # Installs again when the package's needs change.
 $(INSTALLED): pyproject.toml constraints.txt

@@ -1,10 +1,12 @@
 """The `fbse` command. Exit status: 0 done, 1 the run failed (what was recorded is written), 2 bad input."""
 
 import argparse
+import json
 import os
 import sys
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,16 +17,40 @@ from rich.console import Console, Group
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from fbse_drake.discrepancy.add import add
+from fbse_drake.discrepancy.compare import compare, comparison_json
+from fbse_drake.discrepancy.diagnose import Estimate, Finding, diagnose, diagnosis_json
+from fbse_drake.discrepancy.hidden import SIZES, hide, reveal
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.sanity import check_sensors
+from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_text
 from fbse_drake.log import Log
+from fbse_drake.report.discrepancy import (
+    Inputs,
+    compare_outcome,
+    diagnosis_outcome,
+    parameter_text,
+    parameters_text,
+    study_outcome,
+    write_compare_report,
+    write_diagnosis_report,
+    write_study_report,
+)
+from fbse_drake.report.discrepancy_figures import by_effect, spaced, targets_text
+from fbse_drake.report.html import number
 from fbse_drake.report.metrics import run_metrics, write_json
 from fbse_drake.report.run import write_run_report
 from fbse_drake.scenario import Scenario, dump_scenario, read_scenario
 from fbse_drake.simulate import simulate
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
+# Failures and findings that are printed.
+_SHOWN = 8
+# Beginning of what `fbse add` writes.
+_ADDED = "# Effects added by fbse add"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,7 +97,63 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), from a simulation or from a robot")
     _add_output(run, "as for simulate, with _estimate at its end")
     run.set_defaults(run=_estimate)
+
+    for name, function, short, description in (
+        ("compare", _compare, "where a scenario's model fails on a log", "Says where a scenario's model fails on a log."),
+        (
+            "diagnose",
+            _diagnose,
+            "which physical effect a model lacks",
+            "Finds the physical effects that a scenario's model lacks, on a log.",
+        ),
+        ("study", _study, "diagnose, add, and again", "Adds what a scenario's model lacks until a log shows nothing more."),
+    ):
+        run = commands.add_parser(name, help=short, description=f"{description} Writes {name}.json and a report.")
+        _add_scenario(run)
+        run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), from a simulation or from a robot")
+        _add_output(run, f"as for simulate, with _{name} at its end")
+        run.set_defaults(run=function)
+
+    run = commands.add_parser(
+        "add",
+        help="add what a diagnosis found to a scenario's model",
+        description="Writes a scenario whose model has what a diagnosis found.",
+    )
+    _add_scenario(run)
+    run.add_argument("diagnosis", metavar="DIAGNOSIS", type=Path, help="what diagnose wrote: its folder, or diagnosis.json")
+    run.add_argument("--effect", help="an effect of the diagnosis' ranking (default: all that the diagnosis chose)")
+    run.add_argument("--out", metavar="NEW_SCENARIO", type=Path, required=True, help="the new scenario's file (yaml)")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.set_defaults(run=_add)
+
+    run = commands.add_parser(
+        "hide",
+        help="make an exercise: a log with a hidden effect",
+        description="Hides an effect in a scenario's robot and writes the log without it in the model, and the answer sealed (see reveal).",
+    )
+    _add_scenario(run)
+    run.add_argument("--seed", type=_whole_number, required=True, help="decides on what is hidden and on the sensors' noise")
+    run.add_argument("--what", default="any", help="any, library, decoy (nothing), stranger (none of the library) or the name of an effect")
+    run.add_argument("--size", choices=SIZES, help="how large it is (default: drawn as well)")
+    run.add_argument("--count", type=_whole_number, default=1, help="how many effects are hidden (default: 1)")
+    _add_output(run, "as for simulate, with _hidden at its end")
+    run.set_defaults(run=_hide)
+
+    run = commands.add_parser(
+        "reveal",
+        help="open the answer of an exercise",
+        description="Opens the answer of an exercise, and scores what was found in its folder.",
+    )
+    run.add_argument("folder", metavar="DIR", type=Path, help="what hide wrote")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.set_defaults(run=_reveal)
     return parser
+
+
+def _whole_number(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number >= 0, found {text}")
+    return int(text)
 
 
 def _add_scenario(run: argparse.ArgumentParser) -> None:
@@ -116,6 +198,193 @@ def _estimate(options: argparse.Namespace) -> int:
     estimated = replace(result.log, meta=result.log.meta | {"estimator_scenario": dump_scenario(scenario, name)})
     metrics = run_metrics(estimated, float(result.tick_time.sum()), result.tick_time)
     _write_results(console, out, name, scenario, estimated, metrics)
+    return DONE
+
+
+def _compare(options: argparse.Namespace) -> int:
+    console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
+    with _errors_located(options), console.status("comparing the model with the log"):
+        predictor = _checked(scenario, log)
+        comparison = compare(predictor)
+    _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
+    with console.status("writing the report"):
+        write_compare_report(out / "report.html", comparison, predictor, inputs)
+    table = Table("failure, worst first", title=inputs.name, title_justify="left")
+    for failure in comparison.failures[:_SHOWN]:
+        table.add_row(failure.text)
+    _conclude(console, out, compare_outcome(comparison), table)
+    return DONE
+
+
+def _diagnose(options: argparse.Namespace) -> int:
+    console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
+    with _errors_located(options), console.status("comparing the model with the log") as status:
+        predictor = _checked(scenario, log)
+        comparison = compare(predictor)
+        diagnosis = diagnose(predictor, progress=status.update)
+    _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
+    with console.status("writing the report"):
+        write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)
+    _conclude(console, out, diagnosis_outcome(diagnosis), _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]))
+    return DONE
+
+
+def _study(options: argparse.Namespace) -> int:
+    console, scenario, inputs, log, out = _scenario_and_log(options, "_study")
+    with _errors_located(options), console.status("comparing the model with the log") as status:
+        predictor = _checked(scenario, log)
+        comparison = compare(predictor)
+        result = study(scenario, log, progress=status.update)
+        status.update("comparing the completed model with the log")
+        after = Predictor(result.scenario, log) if result.found else predictor
+        completed = (after, compare(after) if result.found else comparison)
+    _write_findings(out, "study", study_json(result), scenario, inputs)
+    if result.found:
+        write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
+    with console.status("writing the report"):
+        write_study_report(out / "report.html", result, (predictor, comparison), completed, inputs)
+    table = Table("added", "held-out error / noise", "fitted error / noise", title=inputs.name, title_justify="left")
+    for step in result.steps:
+        effects = [f"{spaced(effect)} ({targets_text(targets)})" for effect, targets in by_effect(step.added).items()]
+        added = ", ".join(effects) or "the model as given"
+        table.add_row(added, number(step.held_out_rmse), number(step.train_rmse))
+    _conclude(console, out, f"{study_outcome(result)} Stopped because {result.stopped_because}.", table)
+    return DONE
+
+
+def _scenario_and_log(options: argparse.Namespace, suffix: str) -> tuple[Console, Scenario, Inputs, Log, Path]:
+    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    log = Log.load(options.log)
+    out = _output_folder(options, suffix)
+    return Console(quiet=options.quiet), scenario, Inputs(name, options.scenario, str(options.log), str(out)), log, out
+
+
+def _errors_located(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return located(f"{options.scenario} over {options.log}: ")
+
+
+def _checked(scenario: Scenario, log: Log) -> Predictor:
+    """The scenario's model over a log whose sensors are what they are said to be."""
+    predictor = Predictor(scenario, log)
+    check_sensors(predictor.motion)
+    return predictor
+
+
+def _write_findings(out: Path, kind: str, content: dict[str, Any], scenario: Scenario, inputs: Inputs) -> None:
+    """Writes what was found, under its own name and as metrics.json, and the scenario."""
+    write_json(out / f"{kind}.json", content)
+    write_json(out / "metrics.json", content)
+    write_text(out / "scenario.yaml", dump_scenario(scenario, inputs.name))
+
+
+def _conclude(console: Console, out: Path, outcome: str, table: Table) -> None:
+    """Prints the result."""
+    if table.row_count:
+        console.print(table)
+    console.print(outcome, highlight=False)
+    console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _findings_table(title: str, findings: Sequence[Finding]) -> Table:
+    table = Table("effect", "in", "held-out error before", "after", "values (95 % interval)", title=title, title_justify="left")
+    for finding in findings:
+        name = spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})"
+        errors = (number(error) for error in (finding.held_out_before, finding.held_out_after))
+        table.add_row(name, targets_text(finding.targets), *errors, parameters_text(finding))
+    return table
+
+
+def _add(options: argparse.Namespace) -> int:
+    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    path = options.diagnosis / "diagnosis.json" if options.diagnosis.is_dir() else options.diagnosis
+    try:
+        diagnosis = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except ValueError:
+        raise InputError(f"{path}: not a JSON file") from None
+    with located(f"{path}: "):
+        completed = add(scenario, diagnosis, options.effect)
+        findings = _added(diagnosis, options.effect)
+    out = options.out
+    # Nobody's own file is lost.
+    if out.is_dir() or (out.exists() and not out.read_bytes().startswith(_ADDED.encode())):
+        raise InputError(f"--out {out}: this exists already, and fbse add did not write it")
+    if out.exists() and Path(options.scenario).is_file() and out.samefile(options.scenario):
+        raise InputError(f"--out {out}: the new scenario would overwrite the old one")
+    header = "\n# ".join(
+        [f"{_ADDED} to {options.scenario}, from {path}.", *(line for finding in findings for line in _value_lines(finding))]
+    )
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_text(out, f"{header}\n{dump_scenario(completed, name)}")
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}") from None
+    console = Console(quiet=options.quiet)
+    console.print(_findings_table(name, findings))
+    console.print(f"Scenario: {out}", highlight=False, soft_wrap=True)
+    return DONE
+
+
+def _added(diagnosis: Mapping[str, Any], effect: str | None) -> list[Finding]:
+    """The findings of a diagnosis.json that `add` adds."""
+    named = [finding for finding in diagnosis["ranking"] if effect in (None, finding["effect"])]
+    try:
+        return [
+            Finding(
+                finding["effect"],
+                tuple(finding["joints"]),
+                finding["held_out_before"],
+                finding["held_out_after"],
+                {name: Estimate(p["value"], tuple(p["interval"]), p["unit"]) for name, p in finding["parameters"].items()},
+                tuple(finding["confusable_with"]),
+                chosen=True,
+            )
+            for finding in [finding for finding in named if finding["chosen"]] or named[:1]
+        ]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"not the contents of a diagnosis.json (at {error})") from None
+
+
+def _value_lines(finding: Finding) -> list[str]:
+    """Values with their 95 % intervals, and what they bring; for the comments of a scenario."""
+    where = f"{finding.effect} in {targets_text(finding.targets)}"
+    errors = f"{where}: held-out error {finding.held_out_before:.3g} times the noise before, {finding.held_out_after:.3g} after"
+    values = [f"{where}: {parameter_text(name, estimate)}, with its 95 % interval" for name, estimate in finding.parameters.items()]
+    return [errors, *values]
+
+
+def _hide(options: argparse.Namespace) -> int:
+    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    out = _output_folder(options, "_hidden")
+    console = Console(quiet=options.quiet)
+    start = clock.perf_counter()
+    with located(f"{options.scenario}: "), _progress(console, f"simulating {name}", scenario.duration) as progress:
+        hide(scenario, name, options.seed, out, what=options.what, size=options.size, count=options.count, progress=progress)
+    log, (_, public) = Log.load(out / "log.npz"), read_scenario(str(out / "scenario.yaml"))
+    _write_results(console, out, name, public, log, run_metrics(log, clock.perf_counter() - start))
+    console.print(
+        f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}", highlight=False, soft_wrap=True
+    )
+    return DONE
+
+
+def _reveal(options: argparse.Namespace) -> int:
+    revealed = reveal(options.folder)
+    answer, score = revealed["answer"], revealed["score"]
+    write_json(options.folder / "answer.json", revealed)
+    console = Console(quiet=options.quiet)
+    table = Table("hidden", "in", "values", title=f"{options.folder}: {answer['kind']}", title_justify="left")
+    for effect in answer["effects"]:
+        values = (f"{key} {number(float(next(iter(by_target.values()))))}" for key, by_target in effect["parameters"].items())
+        table.add_row(spaced(effect["effect"]), targets_text(effect["targets"]), ", ".join(values))
+    console.print(table if answer["effects"] else "Nothing was hidden.")
+    if score is None:
+        console.print(f"No diagnosis.json or study.json in {options.folder} to score.", highlight=False)
+        return DONE
+    verdict = "right" if score["verdict"] else "wrong"
+    found = ", ".join(f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in score["found"].items())
+    console.print("; ".join(part for part in (f"Verdict: {verdict}", found) if part) + ".", highlight=False)
     return DONE
 
 

@@ -1,3 +1,4 @@
+import functools
 import json
 import math
 import os
@@ -11,8 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fbse_drake import Log, load_scenario
+from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.study import study
+from fbse_drake.effects.effect import library
 
 FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
 # One foot swings from 0.5 s on.
@@ -77,6 +81,12 @@ def test_a_fall_ends_the_run_and_keeps_the_log(tmp_path: Path, capsys: pytest.Ca
         (["simulate", "squat", "--name", "other"], "no scenario called other (there are: squat)"),
         (["simulate", "paper_walk", "--set", "reference.step_length=0.5"], "reference: step 2 (left leg"),
         (["simulate", "squat", "--set", "robot.gantry_height=1.0"], "a robot with a fixed base cannot follow Squat"),
+        (["compare", "squat"], "the following arguments are required: LOG"),
+        (["diagnose", "squat", "nowhere.npz"], "nowhere.npz: No such file or directory"),
+        (["add", "squat", "nowhere"], "the following arguments are required: --out"),
+        (["hide", "squat"], "the following arguments are required: --seed"),
+        (["hide", "squat", "--seed", "-1"], "argument --seed: expected a whole number >= 0, found -1"),
+        (["reveal", "nowhere"], "nowhere/answer.sealed: No such file or directory; fbse hide makes one"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -262,3 +272,169 @@ def test_estimates_do_not_overwrite_the_log_they_are_made_from(walk: Path, capsy
     assert main(["estimate", *WALK, str(walk / "log.npz"), "--out", str(walk)]) == BAD_INPUT
     assert "would overwrite" in capsys.readouterr().err
     assert (walk / "log.npz").read_bytes() == before
+
+
+@pytest.fixture
+def undrawn_findings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of compare, diagnose and study are empty."""
+    for kind in ("compare", "diagnosis", "study"):
+        monkeypatch.setattr(f"fbse_drake.cli.write_{kind}_report", lambda path, *_, **__: path.write_text("report"))
+
+
+@pytest.fixture(scope="module")
+def biased(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of a robot whose left knee lacks 1 Nm, of which the model knows nothing."""
+    folder = tmp_path_factory.mktemp("biased")
+    bias = "robot.effects={hidden: !TorqueBias {bias: {left_knee_pitch: 1.0}}}"
+    simulate(load_scenario("frictionless_walk", overrides=["duration=1.5", bias])).log.save(folder / "log.npz")
+    return folder / "log.npz"
+
+
+# What the log was made with, without what is hidden.
+BIASED = ["frictionless_walk", "--set", "duration=1.5"]
+FOUND = ["metrics.json", "report.html", "scenario.yaml"]
+
+
+@pytest.mark.usefixtures("undrawn_findings")
+def test_compare_says_where_the_model_fails(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert main(["compare", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FOUND, "compare.json"])
+    content = json.loads((tmp_path / "compare.json").read_text())
+    assert (tmp_path / "metrics.json").read_text() == (tmp_path / "compare.json").read_text()
+    worst = content["failures"][0]
+    assert worst["channel"] == "left_knee_pitch"
+    assert worst["error"] == pytest.approx(1.0, abs=0.1)
+    assert load_scenario(tmp_path / "scenario.yaml").duration == 1.5
+    printed = capsys.readouterr().out
+    assert "left knee pitch: model torque" in printed
+    assert "report.html" in printed
+
+
+@pytest.mark.usefixtures("undrawn_findings")
+def test_diagnose_then_add_then_compare(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """From a log to a model that fits it."""
+    few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
+    monkeypatch.setattr("fbse_drake.cli.diagnose", functools.partial(diagnose, effects=few))
+    found = tmp_path / "found"
+    assert main(["diagnose", *BIASED, str(biased), "--out", str(found)]) == DONE
+    assert sorted(path.name for path in found.iterdir()) == sorted([*FOUND, "diagnosis.json"])
+    assert json.loads((found / "diagnosis.json").read_text())["verdict"] == "effect_found"
+    printed = capsys.readouterr().out
+    assert "Torque bias" in printed
+    assert "The model lacks torque bias in left knee pitch" in printed
+
+    completed = tmp_path / "new/completed.yaml"
+    assert main(["add", *BIASED, str(found), "--out", str(completed)]) == DONE
+    printed = capsys.readouterr().out
+    assert "left knee pitch" in printed
+    assert str(completed) in printed
+    (effect,) = load_scenario(completed, "frictionless_walk").believed.effects.values()
+    assert effect.bias == {"left_knee_pitch": pytest.approx(1.0, abs=0.1)}
+    comments = [line for line in completed.read_text().splitlines() if line.startswith("# ")]
+    assert comments[0] == f"# Effects added by fbse add to frictionless_walk, from {found}/diagnosis.json."
+    assert comments[1].startswith("# TorqueBias in left knee pitch: held-out error ")
+    assert comments[2].startswith("# TorqueBias in left knee pitch: bias ")
+    assert comments[2].endswith("with its 95 % interval")
+
+    # What fbse add wrote may be written again, but not over the scenario that is added to, nor over a file of somebody else.
+    assert main(["add", *BIASED, str(found / "diagnosis.json"), "--effect", "TorqueBias", "--out", str(completed), "--quiet"]) == DONE
+    assert capsys.readouterr() == ("", "")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("squat: {}")
+    for scenario, out, message in (
+        ("frictionless_walk", mine, "exists already"),
+        ("frictionless_walk", tmp_path, "exists already"),
+        (str(completed), completed, "would overwrite"),
+    ):
+        options = ["--name", "frictionless_walk", str(found), "--out", str(out)]
+        assert main(["add", scenario, *options]) == BAD_INPUT
+        assert message in capsys.readouterr().err
+    assert mine.read_text() == "squat: {}"
+
+    again = tmp_path / "again"
+    assert main(["compare", str(completed), "--name", "frictionless_walk", str(biased), "--out", str(again), "--quiet"]) == DONE
+    assert json.loads((again / "compare.json").read_text())["failures"] == []
+
+
+@pytest.mark.usefixtures("undrawn_findings")
+def test_study_writes_the_completed_scenario(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
+    monkeypatch.setattr("fbse_drake.cli.study", functools.partial(study, effects=few))
+    assert main(["study", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FOUND, "study.json", "completed.yaml"])
+    content = json.loads((tmp_path / "study.json").read_text())
+    first, *_, last = content["steps"]
+    assert first["held_out_rmse"] > 1.5 * content["noise_floor"]
+    assert last["held_out_rmse"] == pytest.approx(1.0, abs=0.05)
+    assert last["rollout_rmse"]["joint_position"] < first["rollout_rmse"]["joint_position"]
+    (effect,) = load_scenario(tmp_path / "completed.yaml", "frictionless_walk").believed.effects.values()
+    assert effect.bias == {"left_knee_pitch": pytest.approx(1.0, abs=0.1)}
+    printed = capsys.readouterr().out
+    assert "the model as given" in printed
+    assert "The model lacked torque bias in left knee pitch" in printed
+
+
+def negative(name: str) -> Callable[[Log, Path], None]:
+    return lambda log, path: Log(log.channels | {name: -log[name]}, log.meta).save(path)
+
+
+@pytest.mark.parametrize("command", ["compare", "diagnose", "study"])
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (cut, "truncated or not a log file (npz)"),
+        (renamed, "are not the model's"),
+        (lambda log, path: without_estimates(log, "imu/").save(path), "the log has no channel imu/linear_acceleration"),
+        (negative("imu/linear_acceleration"), "its sign is reversed"),
+        (negative("joint/velocity"), "channel joint/velocity"),
+    ],
+)
+def test_a_log_that_cannot_be_compared_is_one_line_and_status_2(
+    command: str, damage: Callable[[Log, Path], None], message: str, biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    damage(Log.load(biased), tmp_path / "log.npz")
+    assert main([command, *BIASED, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    printed = capsys.readouterr()
+    assert printed.err.startswith("fbse: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert not list(tmp_path.glob("out/*"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file or directory"),
+        ("not json", "not a JSON file"),
+        ("[1, 2]", "not the contents of a diagnosis.json"),
+        ('{"verdict": "nothing_missing", "ranking": []}', "it has no effect to add"),
+    ],
+)
+def test_a_bad_diagnosis_is_one_line_and_status_2(content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    if content is not None:
+        (tmp_path / "diagnosis.json").write_text(content)
+    assert main(["add", "squat", str(tmp_path), "--out", str(tmp_path / "new.yaml")]) == BAD_INPUT
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
+    assert not (tmp_path / "new.yaml").exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_hide_and_reveal(tmp_path: Path, capsys: pytest.CaptureFixture):
+    options = ["--set", "duration=0.5", "--what", "TorqueBias", "--out", str(tmp_path)]
+    assert main(["hide", "squat", "--seed", "5", *options]) == DONE
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FILES, "answer.sealed"])
+    printed = capsys.readouterr().out
+    assert "fbse study" in printed
+    assert "bias" not in printed.lower()
+    for name in ("scenario.yaml", "metrics.json", "answer.sealed"):
+        assert "TorqueBias" not in (tmp_path / name).read_text()
+    assert not [name for name in Log.load(tmp_path / "log.npz") if name.startswith("truth/")]
+    assert main(["reveal", str(tmp_path)]) == DONE
+    assert "Torque bias" in capsys.readouterr().out
+    answer = json.loads((tmp_path / "answer.json").read_text())["answer"]
+    assert answer["effects"][0]["effect"] == "TorqueBias"
+    (tmp_path / "answer.sealed").write_text("0 0")
+    assert main(["reveal", str(tmp_path)]) == BAD_INPUT
+    assert "damaged" in capsys.readouterr().err

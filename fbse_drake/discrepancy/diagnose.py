@@ -74,7 +74,7 @@ class Diagnosis:
     """Which effects are missing, and how sure that is."""
 
     verdict: Verdict
-    # Chosen effects in the order in which they were found, then alternatives, best first.
+    # Chosen effects, those that explain most first, then alternatives, best first.
     ranking: tuple[Finding, ...]
     effects: dict[str, EffectStatus]
     # What no effect of the library explains: by row.
@@ -120,7 +120,7 @@ def diagnose(
     unexplained = leftover_structure(search, final)
     say("finding what would have been seen")
     rivals = _rivals(search, final)
-    experiments = Experiments(predictor.scenario, search.effects, suspected_bodies(predictor))
+    experiments = Experiments(predictor.scenario, suspected_bodies(predictor))
     statuses = {e.__name__: _status(search, final, e, rivals, experiments) for e in search.effects}
     if unexplained and not _well_explained(search.white, final, unexplained):
         verdict: Verdict = "unknown_effect"
@@ -153,42 +153,58 @@ def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[
         say("found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates))
         if chosen.deviance > base.deviance - MARGIN:
             break
-        path.append(search.doubting(chosen))
+        path.append(search.polished(search.doubting(chosen)))
     return path
 
 
 def _spread(search: Search, additions: list[Explanation]) -> Explanation:
-    """The best addition, with the same effect on all further joints where nothing else explains more."""
-    best = additions[0]
+    """The best addition, with the same effect on all further joints where nothing else explains more.
+
+    Joints that share values get values of their own if that explains more.
+    """
+    best = _simplest(additions)
     added = best.candidates[-1]
     if not issubclass(added.effect, JointTorqueEffect):
         return best
-    chosen, taken = [*best.candidates], set(added.targets)
-    for joint in search.predictor.robot.joint_names:
-        if joint in taken:
-            continue
-        there = [e for e in additions if e.candidates[-1].targets == (joint,)]
-        same = [e for e in there if e.candidates[-1].effect is added.effect]
-        if same and same[0].deviance < there[0].deviance + MARGIN:
+    by_joint: dict[str, list[Explanation]] = {}
+    for explanation in additions:
+        candidate = explanation.candidates[-1]
+        if len(candidate.targets) == 1:
+            by_joint.setdefault(candidate.targets[0], []).append(explanation)
+    alone = {joint: [e for e in there if e.candidates[-1].effect is added.effect] for joint, there in by_joint.items()}
+    own = [e.candidates[-1] for joint, found in alone.items() if joint in added.targets for e in found]
+    if len(added.targets) > 1 and own:
+        apart = search.explain([*best.candidates[:-1], *own])
+        if apart.deviance < best.deviance - MARGIN:
+            best = apart
+    chosen, taken = [*best.candidates], {target for c in best.candidates if c.effect is added.effect for target in c.targets}
+    for joint, same in alone.items():
+        if joint not in taken and same and same[0].deviance < by_joint[joint][0].deviance + MARGIN:
             chosen.append(same[0].candidates[-1])
     return search.explain(chosen) if len(chosen) > len(best.candidates) else best
 
 
+def _simplest(additions: list[Explanation]) -> Explanation:
+    """The best addition; among those that are told apart by nobody, the one with the fewest parameters."""
+    equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
+    return min(equal, key=lambda e: len(e.fit.parameters))
+
+
 def _revise(search: Search, explanation: Explanation) -> Explanation:
-    """Tries every member against all others in its place, until nothing improves."""
-    improved = len(explanation.candidates) > 1
+    """Tries every member that shares a row with another one against all others in its place, until nothing improves."""
+    improved = True
     while improved:
         improved = False
         for member in explanation.candidates:
-            rest = search.explain([c for c in explanation.candidates if c is not member])
-            additions = search.best_additions(rest)
-            if not additions:
-                if rest.deviance < explanation.deviance:
-                    explanation, improved = rest, len(rest.candidates) > 1
-                    break
+            others = [c for c in explanation.candidates if c is not member]
+            rows = member.signature.rows
+            if not any(np.intersect1d(rows, c.signature.rows).size for c in others):
                 continue
-            if additions[0].deviance < explanation.deviance - MARGIN:
-                explanation, improved = additions[0], True
+            rest = search.explain(others)
+            additions = search.best_additions(rest, rows)
+            best = _simplest(additions) if additions else rest
+            if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
+                explanation, improved = best, True
                 break
     return explanation
 
@@ -198,7 +214,8 @@ def _rivals(search: Search, final: Explanation) -> dict[int, list[Explanation]]:
     result = {}
     for k, member in enumerate(final.candidates):
         rest = search.explain([c for c in final.candidates if c is not member])
-        result[k] = [e for e in search.best_additions(rest) if e.candidates[-1].effect is not member.effect]
+        additions = search.best_additions(rest, member.signature.rows)
+        result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
     return result
 
 
@@ -208,9 +225,10 @@ def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = sl
 
 def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Explanation]]) -> list[Finding]:
     final, white = path[-1], search.white
+    without = [search.explain([c for c in final.candidates if c is not member]) for member in final.candidates]
     findings = []
-    for k, member in enumerate(final.candidates):
-        rest = search.explain([c for c in final.candidates if c is not member])
+    for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
+        member, rest = final.candidates[k], without[k]
         equal = tuple(dict.fromkeys(e.candidates[-1].name for e in rivals[k] if e.deviance < final.deviance + MARGIN))
         findings.append(_finding(white, rest, final, member, equal, chosen=True))
     seen = {(f.effect, f.targets) for f in findings}
@@ -285,6 +303,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict,
         "held_out_before": diagnosis.held_out_before,
         "held_out_after": diagnosis.held_out_after,
+        "train_after": diagnosis.train_after,
         "noise_floor": 1.0,
         "ranking": [
             {

@@ -1,6 +1,6 @@
 """Which experiment would decide? What effects would do in the motions of other scenarios, predicted from those motions as planned."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -96,33 +96,35 @@ def _standing_forces(equation: EquationOfMotion, at: Instants, support: np.ndarr
 class Experiments:
     """Motions that a robot could make, and what each would show."""
 
-    def __init__(self, scenario: Scenario, effects: Iterable[type[Effect]], bodies: Sequence[str]):
+    def __init__(self, scenario: Scenario, bodies: Sequence[str]):
         """Nothing is planned before it is asked for.
 
         Args:
             scenario: whose model and sensors make the motions of the shipped scenarios.
-            effects: what may be asked about.
             bodies: whose masses may be asked about.
         """
-        self._scenario, self._effects, self._bodies = scenario, list(effects), list(bodies)
+        self._scenario, self._bodies = scenario, list(bodies)
 
     @cached_property
-    def _searches(self) -> dict[str, Search]:
+    def _predictors(self) -> dict[str, Predictor]:
         """What each motion would record, by the scenario's name."""
         found = {}
         for name, other in _motions(self._scenario).items():
             model = replace(self._scenario.believed, gantry_height=other.robot.gantry_height)
             wanted = replace(other, model=model, sensors=self._scenario.sensors)
             try:
-                found[name] = Search(Predictor(wanted, planned_log(wanted)), self._effects, self._bodies)
+                found[name] = Predictor(wanted, planned_log(wanted))
             except InputError:
                 continue  # A motion that this robot cannot make shows nothing.
         return found
 
+    def _searches(self, effect: type[Effect]) -> dict[str, Search]:
+        return {name: Search(predictor, [effect], self._bodies) for name, predictor in self._predictors.items()}
+
     def that_shows(self, effect: type[Effect]) -> str | None:
         """Name of the scenario that would show the smallest size of an effect, if that is a plausible one."""
         sizes = {}
-        for name, search in self._searches.items():
+        for name, search in self._searches(effect).items():
             found = search.smallest_detectable(search.noise_alone, effect)
             sizes[name] = min(found.values(), default=np.inf)
         best = min(sizes, key=lambda name: sizes[name], default=None)
@@ -130,7 +132,7 @@ class Experiments:
 
     def that_separates(self, effect: type[Effect], targets: Sequence[str], values: Mapping[str, float], rival: type[Effect]) -> str | None:
         """Name of the scenario in which an effect, with its values, could least be taken for a rival, if it could not."""
-        differences = {name: search.separation(effect, targets, values, rival) for name, search in self._searches.items()}
+        differences = {name: search.separation(effect, targets, values, rival) for name, search in self._searches(rival).items()}
         best = max(differences, key=lambda name: differences[name], default=None)
         return best if best is not None and differences[best] > MARGIN else None
 

@@ -17,13 +17,14 @@ from fbse_drake.discrepancy.residual import (
     block_means,
     joint_velocity_noise,
     residual_rows,
+    rms,
     steps,
 )
-from fbse_drake.effects.contact import ContactEffect, GroundCompliance, PadContact, pad_contact, spring_force
+from fbse_drake.effects.contact import ContactEffect, FootCreep, GroundCompliance, PadContact, pad_contact, spring_force
 from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedJointTorque, basis_over_time
-from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import located
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
@@ -32,6 +33,8 @@ from fbse_drake.scenario import Scenario, build_robot
 _SMOOTHING = 9
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
 _LAW_DOUBT = 8.0
+# How often the effect of a sensor is taken off its signals: it is small, and each time leaves a share of its own size.
+_UNDOING = 3
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
 
@@ -53,9 +56,8 @@ class Predictor:
         self.motion = RecordedMotion(self.robot, scenario.sensors, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
-                # To first order, a reading is set right by the opposite error.
-                undone = replace(known, linear=-known.linear)
-                self.motion.signals = known.effect.distorted(self.motion.signals, undone, self.robot, self.motion.period)
+                memory = known.effect.memory_over_time(self.motion.signals, known, self.motion.period)
+                self.motion.signals = self._undone(known, memory)
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
 
     @property
@@ -69,8 +71,39 @@ class Predictor:
         predicted = self.ground_gives_way()
         for known in self._known:
             predicted = predicted + self.predict(known)
-        laws = [known for known in self._known if isinstance(known, ResolvedJointTorque)]
-        return self.motion.residual.minus(predicted).noisier(self.law_variance(laws))
+        residual = self.motion.residual.minus(predicted)
+        of_ground = self.sinking_variance / self._contact.stiffness**2
+        return self.doubted(replace(residual, variance=residual.variance + of_ground), self._known)
+
+    def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
+        """A residual that is less certain because effects were taken off it.
+
+        Friction laws are doubtful, see `law_variance`, and the sinking of soles is predicted from forces that are measured with noise.
+        """
+        effects = list(effects)
+        doubt = np.zeros_like(residual.variance)
+        doubt[:, : len(self.robot.joint_names)] = self.law_variance(e for e in effects if isinstance(e, ResolvedJointTorque))
+        nominal = 1.0 / self._contact.stiffness
+        total = nominal + sum(float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance)
+        doubt += (total**2 - nominal**2) * self.sinking_variance
+        return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
+
+    @cached_property
+    def sinking_variance(self) -> np.ndarray:
+        """What the noise of the force sensors puts into the predicted sinking of the soles, per unit of compliance squared, (R,).
+
+        Of a noise that is added to the measured forces once more.
+        """
+        force = self.motion.signals.pad_force
+        if not self.robot.has_floating_base:
+            return np.zeros(self.rows)
+        noise = self.motion.sensors.foot_force.noise * np.random.default_rng(0).standard_normal(force.shape)
+        motions = [
+            [GroundCompliance.sole_motion(f, pads, self._sample_time) for f, pads in self._split_feet(forces)]
+            for forces in (force, force + noise)
+        ]
+        clean, noisy = (self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both]) for both in motions)
+        return np.nan_to_num(rms(noisy - clean, self.motion.known) ** 2)
 
     def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
         """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
@@ -145,63 +178,76 @@ class Predictor:
             joint = self.robot.joint_names.index(target)
             columns = self.joint_columns(effect, nonlinear[:, None], np.array([joint]))
             return Signature(np.array([joint]), np.moveaxis(columns, 0, 2))
-        if issubclass(effect, InertiaEffect):
-            values = self._inertia_columns(effect, target)
-        elif issubclass(effect, SensorEffect):
-            values = self._sensor_columns(effect, target, nonlinear)
-        else:
+        if issubclass(effect, ContactEffect):
             values = self._contact_columns(effect)
+        else:
+            names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+            units = np.diag([_probe(effect, name) for name in names])
+            columns = [self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units]
+            values = np.stack(columns, axis=2)
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
 
     @cached_property
     def _smooth_blocks(self) -> Instants:
         """Averages at which derivatives are taken. Accelerations are smoothed further: their noise is in the residual too."""
-        blocks = self.motion.blocks
-        return replace(
-            blocks,
-            joint_acceleration=_smooth(blocks.joint_acceleration),
-            angular_acceleration=_smooth(blocks.angular_acceleration),
-        )
+        return _smoothed(self.motion.blocks)
 
     @cached_property
     def _residual_at_blocks(self) -> np.ndarray:
         return self.motion.equation.residual(self._smooth_blocks)
 
-    def _inertia_columns(self, effect: type[InertiaEffect], target: str) -> np.ndarray:
-        """By changing the model: the residual is linear in its inertias."""
-        believed, columns = self.scenario.believed, []
-        dynamic = self._residual_at_blocks.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
-        for name in effect.parameters:
-            unit = _probe(effect, name)
-            changed = effect.from_values([target], {name: [unit]})
-            robot = build_robot(replace(believed, effects={**believed.effects, "_probe": changed}))
-            column = np.zeros_like(self._residual_at_blocks)
-            difference = EquationOfMotion(robot).residual(self._smooth_blocks, kinematic=False) - self._residual_at_blocks[:, :dynamic]
-            # What the robot has more than the model stays in the residual with the other sign.
-            column[:, :dynamic] = -difference / unit
-            columns.append(column)
-        return np.stack(columns, axis=2)
+    def signature_near(
+        self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray, elsewhere: Signature
+    ) -> Signature:
+        """The signature of an inertia or sensor effect about values of its parameters, for what it adds is not quite linear.
 
-    def _sensor_columns(self, effect: type[SensorEffect], target: str, nonlinear: np.ndarray) -> np.ndarray:
-        """By disturbing the signals."""
-        motion, columns, names = self.motion, [], list(effect.parameters)
-        fixed = [name for name in names if not effect.parameters[name].linear]
-        for name in names:
-            if not effect.parameters[name].linear:
-                continue
-            unit = _probe(effect, name)
-            values = {name: [unit], **{other: [value] for other, value in zip(fixed, nonlinear, strict=True)}}
-            resolved = effect.from_values([target], values).resolve(self.robot.description)
-            signals = effect.reading(motion.signals, self._memory(effect, resolved), resolved, self.robot)
-            blocks = averaged(steps(signals, motion.period), motion.length)
-            blocks = replace(
-                blocks,
-                joint_acceleration=_smooth(blocks.joint_acceleration),
-                angular_acceleration=_smooth(blocks.angular_acceleration),
-            )
-            columns.append((motion.equation.residual(blocks) - self._residual_at_blocks) / unit)
-        return np.stack(columns, axis=2)
+        Args:
+            linear, nonlinear: values of the parameters, shapes (p,) and (m,).
+            elsewhere: the signature about zero; it stays that of a contact effect.
+        """
+        if not issubclass(effect, InertiaEffect | SensorEffect):
+            return elsewhere
+        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+        here = self._addition(effect, target, linear, nonlinear)
+        slopes = []
+        for k, name in enumerate(names):
+            moved = linear.copy()
+            moved[k] += _probe(effect, name)
+            slopes.append((self._addition(effect, target, moved, nonlinear) - here) / _probe(effect, name))
+        values = np.stack(slopes, axis=2)
+        rows = elsewhere.rows
+        return replace(elsewhere, values=values[:, rows], offset=(here - values @ linear)[:, rows])
+
+    def _addition(self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+        """What an inertia or sensor effect with these values adds to the residual, (B, R)."""
+        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+        fixed = [name for name in effect.parameters if name not in names]
+        values = {name: [value] for name, value in (*zip(names, linear, strict=True), *zip(fixed, nonlinear, strict=True))}
+        changed = effect.from_values([target], values)
+        if issubclass(effect, InertiaEffect):
+            believed = self.scenario.believed
+            # By changing the model: what the robot has more than the model stays in the residual with the other sign.
+            robot = build_robot(replace(believed, effects={**believed.effects, "_probe": changed}))
+            dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+            result = np.zeros_like(self._residual_at_blocks)
+            other = EquationOfMotion(robot).residual(self._smooth_blocks, kinematic=False)
+            result[:, :dynamic] = self._residual_at_blocks[:, :dynamic] - other
+            return result
+        # By taking the effect off the signals.
+        motion, resolved = self.motion, changed.resolve(self.robot.description)
+        signals = self._undone(resolved, self._memory(effect, resolved))
+        blocks = averaged(steps(signals, motion.period), motion.length)
+        return self._residual_at_blocks - motion.equation.residual(_smoothed(blocks))
+
+    def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
+        """Signals that the effect turns into those of the log."""
+        measured = signals = self.motion.signals
+        for _ in range(_UNDOING):
+            read = effect.effect.reading(signals, memory, effect, self.robot)
+            off = {name: getattr(measured, name) - getattr(read, name) for name in vars(measured)}
+            signals = SensorSignals(**{name: getattr(signals, name) + off[name] for name in off})
+        return signals
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone."""
@@ -223,9 +269,12 @@ class Predictor:
 
     @cached_property
     def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return self._split_feet(self.motion.signals.pad_force)
+
+    def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Pad forces (N, P, 3), smoothed, with their springs' share as normal component, and places (P, 3) of each foot."""
         pads = self.motion.equation.pads
-        force = savgol_filter(self.motion.signals.pad_force, _SMOOTHING, 2, axis=0)
+        force = savgol_filter(pad_force, _SMOOTHING, 2, axis=0)
         force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
         return [(force[:, pads.foot == foot], pads.position[pads.foot == foot]) for foot in range(pads.foot.max() + 1)]
 
@@ -260,11 +309,17 @@ class Predictor:
 
     @cached_property
     def _contact(self) -> PadContact:
-        return pad_contact(self.scenario.believed.description, self.scenario.ground)
+        return pad_contact(self.scenario.believed.description, self.scenario.ground, self.scenario.plant)
 
     def ground_gives_way(self) -> np.ndarray:
-        """What the model's own ground adds: it gives way a little under the soles, (B, R)."""
-        return self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
+        """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""
+        sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
+        return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
+
+
+def _smoothed(blocks: Instants) -> Instants:
+    """Averages with smoothed accelerations."""
+    return replace(blocks, joint_acceleration=_smooth(blocks.joint_acceleration), angular_acceleration=_smooth(blocks.angular_acceleration))
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ from fbse_drake.discrepancy.residual import Residual
 # stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
 STRETCH = 0.25
 FOLDS = 5
+# How often the rows are weighted anew by what is left in them.
+_REWEIGHTINGS = 3
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Signature:
     offset: np.ndarray | float = 0.0
     # What is believed of the parameters beforehand: that they are 0, with this inverse variance, shape (p,) or 0.
     prior: np.ndarray | float = 0.0
+    # Smallest value that each parameter can have, shape (p,) or -inf.
+    lowest: np.ndarray | float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -111,34 +115,49 @@ class WhitenedResidual:
         scale = self.scale(sse)
         return float((self.count * np.log(scale) + sse / scale).sum())
 
-    def fit(self, signatures: Sequence[Signature], *, iterations: int = 3) -> Fit:
+    def fit(self, signatures: Sequence[Signature]) -> Fit:
         """Fits all signatures together, each row weighted by the inverse of what is left in it.
 
         Args:
             signatures: whitened.
         """
+        sizes = [s.values.shape[2] for s in signatures]
+        places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        parameters, freedom = np.zeros(sum(sizes)), np.ones(sum(sizes))
+        covariance = np.zeros((sum(sizes), sum(sizes)))
+        sse, held_out_sse = self.sse.copy(), self.sse.copy()
+        # Those that share no row have nothing to do with each other.
+        for group in _connected(signatures):
+            part = self._fit_together([signatures[k] for k in group])
+            at = np.concatenate([places[k] for k in group])
+            rows = np.unique(np.concatenate([signatures[k].rows for k in group]))
+            parameters[at], freedom[at], covariance[np.ix_(at, at)] = part.parameters, part.freedom, part.covariance
+            sse[rows], held_out_sse[rows] = part.sse[rows], part.held_out_sse[rows]
+        return Fit(parameters, covariance, freedom, sse, held_out_sse)
+
+    def _fit_together(self, signatures: Sequence[Signature]) -> Fit:
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
         size = sum(s.values.shape[2] for s in signatures)
-        X, prior = np.zeros((len(self.y), len(rows), size)), np.zeros(size)
+        X, prior, lowest = np.zeros((len(self.y), len(rows), size)), np.zeros(size), np.full(size, -np.inf)
         y = self.y[:, rows]
         start = 0
         for s in signatures:
             stop, places = start + s.values.shape[2], np.searchsorted(rows, s.rows)
-            X[:, places, start:stop], prior[start:stop] = s.values, s.prior
+            X[:, places, start:stop], prior[start:stop], lowest[start:stop] = s.values, s.prior, s.lowest
             y[:, places] -= s.offset
             start = stop
         # Units must not decide what counts as singular.
         norm = np.sqrt((X**2).sum(axis=(0, 1)))
         norm[norm == 0] = 1.0
-        X, prior = X / norm, np.diag(prior / norm**2)
+        X, prior, lowest = X / norm, np.diag(prior / norm**2), lowest * norm
         scale = self.scale(self.sse)[rows]
-        for _ in range(iterations if len(rows) > 1 else 1):
+        for _ in range(_REWEIGHTINGS if len(rows) > 1 else 1):
             grams, rights = _moments(X, y, scale)
-            theta = _solve(grams.sum(axis=0) + prior, rights.sum(axis=0))
+            theta = _solve(grams.sum(axis=0) + prior, rights.sum(axis=0), lowest)
             scale = np.maximum(((y - X @ theta) ** 2).sum(axis=0) / np.maximum(self.count[rows], 1), 1.0)
         grams, rights = _moments(X, y, scale)
         gram, right = grams.sum(axis=0) + prior, rights.sum(axis=0)
-        theta = _solve(gram, right)
+        theta = _solve(gram, right, lowest)
         left = y - X @ theta
 
         # Sandwich: what is left in a stretch may be correlated in any way.
@@ -155,10 +174,25 @@ class WhitenedResidual:
         held_out = np.empty_like(left)
         for fold in range(FOLDS):
             out = self.fold == fold
-            held_out[out] = y[out] - X[out] @ _solve(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0))
+            held_out[out] = y[out] - X[out] @ _solve(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest)
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         sse[rows], held_out_sse[rows] = (left**2).sum(axis=0), (held_out**2).sum(axis=0)
         return Fit(theta / norm, covariance / np.outer(norm, norm), np.maximum(effective - 1, 1.0), sse, held_out_sse)
+
+
+def _connected(signatures: Sequence[Signature]) -> list[list[int]]:
+    """Places of signatures that share rows, directly or through others."""
+    groups: list[tuple[set[int], list[int]]] = []
+    for k, signature in enumerate(signatures):
+        rows, members = set(signature.rows.tolist()), [k]
+        apart = []
+        for group in groups:
+            if group[0] & rows:
+                rows, members = rows | group[0], group[1] + members
+            else:
+                apart.append(group)
+        groups = [*apart, (rows, members)]
+    return [sorted(members) for _, members in groups]
 
 
 def _moments(X: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,5 +201,14 @@ def _moments(X: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarra
     return weighted @ X, (weighted @ y[:, :, None])[:, :, 0]
 
 
-def _solve(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return np.linalg.lstsq(gram, right, rcond=1e-10)[0]
+def _solve(gram: np.ndarray, right: np.ndarray, lowest: np.ndarray) -> np.ndarray:
+    """Least squares with parameters not below their bounds: what would be below is held there."""
+    free, theta = np.ones(len(right), dtype=bool), np.zeros(len(right))
+    while free.any():
+        rest = right[free] - gram[np.ix_(free, ~free)] @ theta[~free]
+        theta[free] = np.linalg.lstsq(gram[np.ix_(free, free)], rest, rcond=1e-10)[0]
+        below = free & (theta < lowest)
+        if not below.any():
+            break
+        theta[below], free = lowest[below], free & ~below
+    return theta

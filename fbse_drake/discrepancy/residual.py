@@ -344,12 +344,6 @@ class Residual:
         """Root mean square of the sensors' noise in each row, shape (R,); NaN for a row that is never known."""
         return rms(np.sqrt(self.variance), self.known)
 
-    def noisier(self, variance: np.ndarray) -> "Residual":
-        """With doubt about what was taken off the joint rows, a variance (B, n)."""
-        more = np.zeros_like(self.variance)
-        more[:, : variance.shape[1]] = variance
-        return replace(self, variance=self.variance + more, doubt=self.doubt + more)
-
     def minus(self, predicted: np.ndarray) -> "Residual":
         """What is left when a prediction (B, R) is taken off."""
         return replace(self, value=self.value - predicted)

@@ -25,6 +25,8 @@ _NARROWINGS = 2
 _POINTS = 9
 # Share of the doubt about known laws that an effect could mimic.
 _SYSTEMATIC = 0.25
+# What an effect takes off a row may be wrong by this share; so small a rest is no evidence of another effect.
+_MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
 
@@ -73,17 +75,24 @@ class Explanation:
     deviance: float
 
     def values(self, candidate: Candidate) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds."""
+        """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds.
+
+        A nonlinear parameter that was not searched for has its plausible range as interval.
+        """
         start = sum(c.signature.values.shape[2] for c in itertools.takewhile(lambda c: c is not candidate, self.candidates))
-        names = candidate.linear_names + candidate.nonlinear_names
-        offsets = np.concatenate([np.zeros(len(candidate.linear_names)), candidate.nonlinear])
-        part = slice(start, start + len(names))
+        names = candidate.linear_names
+        fitted = names + (candidate.nonlinear_names if issubclass(candidate.effect, JointTorqueEffect) else [])
+        offsets = np.concatenate([np.zeros(len(names)), candidate.nonlinear])[: len(fitted)]
+        part = slice(start, start + len(fitted))
         values, intervals = self.fit.parameters[part] + offsets, self.fit.interval()[part] + offsets[:, None]
-        bounds = [candidate.effect.parameters[name].bounds for name in names]
-        return (
-            {name: float(np.clip(value, *b)) for name, value, b in zip(names, values, bounds, strict=True)},
-            {name: tuple(np.clip(i, *b).tolist()) for name, i, b in zip(names, intervals, bounds, strict=True)},
-        )
+        found, between = {}, {}
+        for name, value, interval in zip(fitted, values, intervals, strict=True):
+            bounds = candidate.effect.parameters[name].bounds
+            found[name], between[name] = float(np.clip(value, *bounds)), tuple(np.clip(interval, *bounds).tolist())
+        for name, value in zip(candidate.nonlinear_names, candidate.nonlinear, strict=True):
+            if name not in found:
+                found[name], between[name] = float(value), candidate.effect.parameters[name].plausible
+        return found, between
 
 
 class Search:
@@ -112,13 +121,12 @@ class Search:
 
     def doubting(self, explanation: Explanation) -> Explanation:
         """Weighs the residual anew: friction laws that an explanation takes off make it noisier. Returns the explanation, fitted anew."""
-        laws = []
+        resolved = []
         for candidate in explanation.candidates:
-            if issubclass(candidate.effect, JointTorqueEffect):
-                values, _ = explanation.values(candidate)
-                same = {name: [value] * len(candidate.targets) for name, value in values.items()}
-                laws.append(candidate.effect.from_values(candidate.targets, same).resolve(self.predictor.robot.description))
-        self._weigh(self.predictor.residual.noisier(self.predictor.law_variance(laws)))
+            values, _ = explanation.values(candidate)
+            same = {name: [value] * len(candidate.targets) for name, value in values.items()}
+            resolved.append(candidate.effect.from_values(candidate.targets, same).resolve(self.predictor.robot.description))
+        self._weigh(self.predictor.doubted(self.predictor.residual, resolved))
         return self.explain([replace(c, signature=self.white.whiten_signature(c.raw)) for c in explanation.candidates])
 
     @cached_property
@@ -144,6 +152,9 @@ class Search:
                 # Their nonlinear parameters keep the default.
                 for target in targets[effect.acts_on]:
                     raw = self.predictor.signature(effect, target, _defaults(effect))
+                    raw = replace(
+                        raw, lowest=np.array([parameter.bounds[0] for parameter in effect.parameters.values() if parameter.linear])
+                    )
                     if len(raw.rows):
                         self._raw_fixed.append((effect, target, _defaults(effect), raw))
         return [
@@ -172,10 +183,14 @@ class Search:
         """What an explanation that leaves nothing but noise would be, without any effects."""
         return Explanation((), None, 1.0 * self.white.count, 1.0 * self.white.count, 0.0)
 
-    def best_additions(self, base: Explanation) -> list[Explanation]:
-        """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first."""
+    def best_additions(self, base: Explanation, rows: np.ndarray | None = None) -> list[Explanation]:
+        """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
+
+        Args:
+            rows: only candidates that change one of these; by default all.
+        """
         found = []
-        for candidate in self._promising(base):
+        for candidate in self._promising(base, rows):
             wider = self.explain([*base.candidates, candidate])
             if self.is_significant(base, wider, candidate):
                 found.append(wider)
@@ -190,6 +205,10 @@ class Search:
         drop = base.deviance - wider.deviance
         if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows):
             return False
+        rows = added.signature.rows
+        taken, gained = (float(np.maximum(a[rows] - b[rows], 0.0).sum()) for a, b in ((self.white.sse, base.sse), (base.sse, wider.sse)))
+        if gained < _MISFIT * taken:
+            return False
         start = len(wider.fit.parameters) - added.signature.values.shape[2]
         names = added.linear_names if added.has_linear else added.nonlinear_names
         offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
@@ -198,18 +217,21 @@ class Search:
             low, high = added.effect.parameters[name].bounds
             plausible = added.effect.parameters[name].plausible
             widest = _IMPLAUSIBLE * max(abs(bound) for bound in plausible)
-            if value < low - 3 * deviation or value > high + 3 * deviation or abs(value) > widest + 3 * deviation:
+            if value < low or value > high + 3 * deviation or abs(value) > widest + 3 * deviation:
                 return False
         return True
 
-    def _promising(self, base: Explanation) -> list[Candidate]:
+    def _promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over."""
         left, projection = self.leftover(base)
+        if rows is None:
+            rows = np.arange(left.shape[1])
         scale = self.white.scale(base.sse)
         result = []
         for candidate in self.fixed_candidates:
             taken = any(c.effect is candidate.effect and c.targets == candidate.targets for c in base.candidates)
-            if not taken and self._fixed_gain(candidate, left, projection, scale) > 0.5 * self.threshold[1]:
+            touches = np.intersect1d(candidate.signature.rows, rows).size > 0
+            if touches and not taken and self._fixed_gain(candidate, left, projection, scale) > 0.5 * self.threshold[1]:
                 result.append(candidate)
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {group: [] for group in self.groups}
         for effect in self.joint_effects:
@@ -217,9 +239,9 @@ class Search:
             columns = self._grid(effect)[1]
             moments = [self._moments(columns[j], j, left, projection, scale) for j in range(len(self._joints))]
             for group in self.groups:
-                if taken & set(group):
-                    continue
                 places = [self._joints.index(joint) for joint in group]
+                if taken & set(group) or not np.intersect1d(places, rows).size:
+                    continue
                 gain = _gain(effect, sum(moments[j][0] for j in places), sum(moments[j][1] for j in places))
                 coarse[group].append((float(gain.max()), effect, int(gain.argmax())))
         for group, found in coarse.items():
@@ -285,11 +307,13 @@ class Search:
         # A weak belief in the plausible range keeps values that the data say nothing about from running away.
         ranges = [np.log(effect.parameters[name].plausible) for name in names]
         belief = [1.0 / (0.25 * (high - low) * value) ** 2 for (low, high), value in zip(ranges, nonlinear, strict=True)]
+        # Nonlinear parameters stay positive.
+        lowest = [effect.parameters[name].bounds[0] for name in effect.parameters if name not in names] + (-0.6 * nonlinear).tolist()
         if has_linear:
             values = np.concatenate([columns, slope_columns], axis=2)
-            raw = Signature(places, values, prior=np.array([0.0] * columns.shape[2] + belief))
+            raw = Signature(places, values, prior=np.array([0.0] * columns.shape[2] + belief), lowest=np.array(lowest))
         else:
-            raw = Signature(places, slope_columns, offset=columns[:, :, 0], prior=np.array(belief))
+            raw = Signature(places, slope_columns, offset=columns[:, :, 0], prior=np.array(belief), lowest=np.array(lowest))
         return Candidate(effect, group, nonlinear, self.white.whiten_signature(raw), raw)
 
     def smallest_detectable(self, base: Explanation, effect: type[Effect]) -> dict[str, float]:
@@ -355,6 +379,30 @@ class Search:
     def _needed(self, parameters: int) -> float:
         return float(self.threshold[min(12, parameters)] + (_COMPLEXITY + 1) * parameters)
 
+    def polished(self, explanation: Explanation) -> Explanation:
+        """An explanation made linear about the values that its fit found."""
+        moved, start = [], 0
+        for candidate in explanation.candidates:
+            size, m = candidate.signature.values.shape[2], len(candidate.nonlinear)
+            shift = explanation.fit.parameters[start + size - m : start + size]
+            start += size
+            if not issubclass(candidate.effect, JointTorqueEffect):
+                values = explanation.fit.parameters[start - size : start]
+                raw = self.predictor.signature_near(candidate.effect, candidate.targets[0], values, candidate.nonlinear, candidate.raw)
+                moved.append(replace(candidate, raw=raw, signature=self.white.whiten_signature(raw)))
+                continue
+            if m == 0:
+                moved.append(candidate)
+                continue
+            rest = self.explain([c for c in explanation.candidates if c is not candidate])
+            ranges = np.array([candidate.effect.parameters[name].plausible for name in candidate.nonlinear_names])
+            # The slopes hold nearby.
+            near = np.clip(candidate.nonlinear + shift, 0.6 * candidate.nonlinear, 1.6 * candidate.nonlinear)
+            nonlinear = np.clip(near, 0.5 * ranges[:, 0], 2.0 * ranges[:, 1])
+            moved.append(self.candidate(candidate.effect, candidate.targets, nonlinear, *self.leftover(rest)))
+        polished = self.explain(moved)
+        return polished if polished.deviance <= explanation.deviance + _COMPLEXITY else explanation
+
     def leftover(self, base: Explanation) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Whitened residual after an explanation, (B, R), and by row an orthonormal basis of the columns it has there."""
         left, by_row = self.white.y.copy(), {}
@@ -372,7 +420,7 @@ class Search:
         """First grid of an effect's nonlinear values, (m, G), and its whitened columns, (B, p, G) for each joint."""
         if effect.__name__ not in self._grids:
             searched = [parameter for parameter in effect.parameters.values() if not parameter.linear]
-            most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 4)
+            most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
             axes = [np.geomspace(*parameter.plausible, min(most, parameter.grid)) for parameter in searched]
             points = np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1) if searched else np.zeros((0, 1))
             if effect.__name__ not in self._raw_grids:

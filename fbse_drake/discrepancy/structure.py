@@ -12,6 +12,8 @@ _PIECES = 8
 EXCESS = 1.2
 # Drop of the held-out deviance at which a smooth function of several variables counts as found, beside what is doubted about known laws.
 _DROP = 25.0
+# How many times as large as it was taken the doubt about known laws may be.
+_DOUBT = 3.0
 # Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
 _KINEMATIC_EXCESS = 3.0
 
@@ -45,9 +47,8 @@ def leftover_structure(search: Search, explanation: Explanation) -> list[Structu
                 continue
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
-            # Doubt about laws is itself uncertain by a factor.
-            tolerated = np.sqrt(EXCESS**2 + 2.0 * white.doubt[k] / white.count[k])
-            if ratio < tolerated and _drop(search, left, k, everything) < _DROP + white.doubt[k]:
+            tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
+            if ratio < tolerated and _drop(search, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
         shares = {name: _explained(search, left, k, basis) / excess for name, basis in variables.items()}
@@ -91,11 +92,12 @@ def _fit(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> tuple
     X = white.whiten(row, basis)
     X = X[:, np.abs(X).max(axis=0) > 0]
     y = left[:, row]
-    ridge = 1e-3 * np.diag((X**2).sum(axis=0))
-    held_out = np.empty_like(y)
-    for fold in range(white.fold.max() + 1):
-        out = white.fold == fold
-        held_out[out] = y[out] - X[out] @ np.linalg.solve(X[~out].T @ X[~out] + ridge, X[~out].T @ y[~out])
+    parts = [(X[white.fold == fold], y[white.fold == fold]) for fold in range(white.fold.max() + 1)]
+    grams, rights = [A.T @ A for A, _ in parts], [A.T @ b for A, b in parts]
+    gram, right = sum(grams), sum(rights)
+    ridge = 1e-3 * np.diag(np.diag(gram))
+    left_over = [b - A @ np.linalg.solve(gram - G + ridge, right - r) for (A, b), G, r in zip(parts, grams, rights, strict=True)]
+    held_out = np.concatenate(left_over)
     return float((y**2).sum()), float((held_out**2).sum())
 
 

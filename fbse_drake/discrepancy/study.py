@@ -14,6 +14,8 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario
 
+# Share by which a later round must lower the held-out error: the first one finds what there is, the others mend what is not linear.
+_LEAST_GAIN = 0.01
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
 
@@ -34,7 +36,7 @@ class Study:
     """What was added to a model, and what it brought. The first step adds nothing."""
 
     steps: tuple[StudyStep, ...]
-    # One for each round; the last one found nothing more to add.
+    # One for each round; the last one found nothing more that is worth adding.
     diagnoses: tuple[Diagnosis, ...]
     stopped_because: str
     # With the effects in its model.
@@ -79,7 +81,8 @@ def study(
         diagnoses.append(diagnosis)
         if not steps:
             steps.append(StudyStep((), diagnosis.held_out_before, diagnosis.held_out_before, rolled()))
-        if not diagnosis.chosen:
+        worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
+        if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis_json(diagnosis))
         steps.append(StudyStep(tuple(diagnosis.chosen), diagnosis.held_out_after, diagnosis.train_after, rolled()))
@@ -88,16 +91,15 @@ def study(
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
     last = diagnoses[-1]
-    if last.chosen:
+    if last.chosen and len(diagnoses) == _MOST_ROUNDS:
         return f"{len(diagnoses)} rounds were made and each found something: the library does not fit this robot well"
     if last.verdict == "unknown_effect":
         rows = ", ".join(structure.row for structure in last.unexplained)
         return f"no effect of the library explains what is left in {rows}"
     if last.verdict == "not_visible":
         return "this data does not excite what could still be missing"
-    return (
-        f"the noise floor is reached: what is left is {last.held_out_after:.2f} times the sensors' noise and no effect explains any of it"
-    )
+    left = f"what is left is {last.held_out_before:.2f} times the sensors' noise"
+    return f"the noise floor is reached: {left} and no effect explains a worthwhile part of it"
 
 
 def study_json(result: Study) -> dict[str, Any]:

@@ -21,6 +21,8 @@ from fbse_drake.robot.plant import Ground, make_robot
 
 # A pad that carries less than this counts as carrying it, where forces are ratios to the load [N].
 _LEAST_LOAD = 1.0
+# Contact approximations that hold a sole by friction that is regularised, so that it creeps.
+_CREEPING = ("lagged", "similar")
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ class FootCreep(ContactEffect):
     creep: float = 0.0
 
     def contact(self, ground: Ground, plant: MultibodyPlantConfig, friction: float) -> tuple[Ground, MultibodyPlantConfig]:
-        if plant.discrete_contact_approximation not in ("lagged", "similar"):
+        if plant.discrete_contact_approximation not in _CREEPING:
             found = plant.discrete_contact_approximation
             raise InputError(f"plant.discrete_contact_approximation: FootCreep needs lagged or similar, found {found}")
         changed = copy(plant)
@@ -201,17 +203,21 @@ class PadContact:
     # [N/m], [s/m]; of pad and ground together.
     stiffness: float
     dissipation: float
+    # Velocity at which it creeps per tangential over normal force [m/s].
+    creep: float
 
 
-def pad_contact(description: str, ground: Ground) -> PadContact:
-    """The contact between a robot's pads and the ground, as Drake combines the two."""
+def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -> PadContact:
+    """The contact between a robot's pads and the ground, as Drake combines the two and solves it with these settings."""
+    slides = plant.discrete_contact_approximation in _CREEPING
+    creep = plant.stiction_tolerance / _friction(description, ground) if slides and ground.friction > 0 else 0.0
     properties = _pad_properties(description)
     of_pad = properties.GetPropertyOrDefault("material", "point_contact_stiffness", np.inf)
     dissipation = properties.GetPropertyOrDefault("material", "hunt_crossley_dissipation", ground.dissipation)
     if np.isinf(of_pad):
-        return PadContact(ground.stiffness, ground.dissipation)
+        return PadContact(ground.stiffness, ground.dissipation, creep)
     total = of_pad + ground.stiffness
-    return PadContact(of_pad * ground.stiffness / total, (ground.stiffness * dissipation + of_pad * ground.dissipation) / total)
+    return PadContact(of_pad * ground.stiffness / total, (ground.stiffness * dissipation + of_pad * ground.dissipation) / total, creep)
 
 
 def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -> np.ndarray:

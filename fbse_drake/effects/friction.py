@@ -74,8 +74,8 @@ class StribeckFriction(JointTorqueEffect):
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds, some below 0.05 rad/s."
     parameters: ClassVar[dict[str, Parameter]] = {
         "gamma1": Parameter("Nm", linear=True, plausible=(0.0, 20.0)),
-        "gamma2": Parameter("s/rad", linear=False, plausible=(20.0, 500.0)),
-        "gamma3": Parameter("s/rad", linear=False, plausible=(1.0, 50.0)),
+        "gamma2": Parameter("s/rad", linear=False, plausible=(50.0, 500.0)),
+        "gamma3": Parameter("s/rad", linear=False, plausible=(1.0, 25.0)),
         "gamma4": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
         "gamma5": Parameter("s/rad", linear=False, plausible=(20.0, 500.0)),
         "gamma6": Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0)),

@@ -45,21 +45,21 @@ from fbse_drake.report.metrics import (
 from fbse_drake.scenario import Scenario
 from fbse_drake.walking.plan import Phase
 
-_SIDE_COLORS = ("#2979b5", "#d65f1a", "#2f8f6b", "#8457a8")
-_PLANNED = "#555b62"
+SIDE_COLORS = ("#2979b5", "#d65f1a", "#2f8f6b", "#8457a8")
+PLANNED = "#555b62"
 _TRUE = "#15181b"
 _COM = "#7a4fa3"
 _ZMP = "#2f8f6b"
-_TRUTH = "#c81e1e"
-_ESTIMATE = "#0b7a86"
+TRUTH = "#c81e1e"
+ESTIMATE = "#0b7a86"
 _SWING = "#8a9199"
-_PART_COLORS = (_ESTIMATE, "#d65f1a", _COM, "#8a8f14")
+_PART_COLORS = (ESTIMATE, "#d65f1a", _COM, "#8a8f14")
 # Estimate and truth mostly agree: a broad pale line shows beside a thin one on top of it.
 _BROAD = {"linewidth": 1.9, "alpha": 0.55}
-_THIN = {"color": _TRUTH, "linestyle": (0, (4, 1.5)), "linewidth": 0.8}
+_THIN = {"color": TRUTH, "linestyle": (0, (4, 1.5)), "linewidth": 0.8}
 _STATUS_COLORS = {Status.OK: "#cfe3d6", Status.NOT_FINITE: "#c81e1e", Status.STUCK: "#e39b16", Status.LOST: "#7a4fa3"}
 
-_WIDTH = 10.0
+WIDTH = 10.0
 # Points drawn of one line, about two per pixel of a wide panel.
 _POINTS = 2000
 # The least that a panel shows of a quantity.
@@ -276,12 +276,12 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
         outlines: corners of each side's sole in its sole frame, (K, 2) [m]; without them a foothold is a cross.
         pads: places of each side's pads in its sole frame, (pads, 3) [m]; without them no measured ZMP is drawn.
     """
-    figure = Figure(figsize=(_WIDTH, 5.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
-    _decorate(axes)
+    decorate(axes)
     for source, label in (("truth", "{} foot"), ("reference", "planned foothold")):
         for side in log.sides if has_feet(log, f"{source}/foot/{{}}/position") else ():
-            color = _side_color(log, side) if source == "truth" else _PLANNED
+            color = _side_color(log, side) if source == "truth" else PLANNED
             for place in _footholds(log, side, f"{source}/foot/{side}/position"):
                 if outlines is None:
                     axes.plot(*place, "x" if source == "truth" else "+", color=color, markersize=10, label=label.format(side))
@@ -301,7 +301,7 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x, forward [m]")
     axes.set_ylabel("y, to the left [m]")
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -312,12 +312,12 @@ def com(log: Log) -> Figure:
     if known and "reference/com/position" in log:
         errors.append(("RSE", _COM, com_rse(log)))
     if known and estimated:
-        errors.append(("RSE of estimate", _ESTIMATE, np.abs(log["estimate/com/position"] - log["truth/com/position"])[:, :2]))
+        errors.append(("RSE of estimate", ESTIMATE, np.abs(log["estimate/com/position"] - log["truth/com/position"])[:, :2]))
     figure, grid = _time_grid(log, 2, 1 + len(errors), height=5.6)
     for letter, axes in zip("abcdef", grid.flat, strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=10)
     lines: tuple[tuple[str, dict[str, Any]], ...] = (
-        ("estimate", {"color": _ESTIMATE, "label": "estimated", **_BROAD}),
+        ("estimate", {"color": ESTIMATE, "label": "estimated", **_BROAD}),
         ("truth", {"color": _COM, "label": "true"}),
         ("reference", {"color": _TRUE, "linestyle": "--", "linewidth": 1.0, "label": "desired"}),
     )
@@ -331,7 +331,7 @@ def com(log: Log) -> Figure:
             _plot(axes, log, 1e3 * error[:, column], color=color)
             axes.set_ylabel(f"{label} {name} [mm]")
             axes.set_ylim(0, max(1.0, axes.get_ylim()[1]))
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -349,7 +349,7 @@ def feet(log: Log) -> Figure:
         axes.set_ylabel(f"{name} [m]")
         axes.set_ylim(_at_least(axes.get_ylim(), _POSITION_SPAN))
     _name_phases(grid[0, 0], log)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -363,7 +363,7 @@ def joint_angles(log: Log) -> Figure:
             values = log["reference/joint/position"][:, joint]
             _plot(axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="reference")
     _widen(panels, _POSITION_SPAN)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -374,7 +374,7 @@ def joint_errors(log: Log) -> Figure:
     for joint, axes in panels.items():
         _plot(axes, log, error[:, joint], color=_joint_color(log, joint))
     _widen(panels, _ERROR_SPAN)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -386,7 +386,7 @@ def torques(log: Log) -> Figure:
         if "reference/joint/feedforward_torque" in log:
             values = log["reference/joint/feedforward_torque"][:, joint]
             _plot(axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="feed-forward")
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -404,7 +404,7 @@ def foot_forces(log: Log) -> Figure:
         used = np.full(len(total), np.nan)
         used[loaded] = np.linalg.norm(force[side][loaded, :2], axis=1) / force[side][loaded, 2]
         _plot(ratio, log, used, color=_side_color(log, side))
-    vertical.axhline(weight, color=_PLANNED, linestyle="--", linewidth=0.9, label="mean of all feet")
+    vertical.axhline(weight, color=PLANNED, linestyle="--", linewidth=0.9, label="mean of all feet")
     vertical.set_ylabel("vertical [N]")
     ratio.set_ylabel("tangential / vertical [1]")
     ratio.set_ylim(0, max(0.1, ratio.get_ylim()[1]))
@@ -424,9 +424,9 @@ def friction(log: Log) -> Figure:
     figure, panels = _joint_grid(log, "friction torque [Nm]")
     for joint, axes in panels.items():
         values = log["truth/joint/friction_torque"][:, joint]
-        _plot(axes, log, values, color=_TRUTH, linestyle="--", linewidth=1.0, label="true friction")
+        _plot(axes, log, values, color=TRUTH, linestyle="--", linewidth=1.0, label="true friction")
     _widen(panels, _FRICTION_SPAN)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -440,7 +440,7 @@ def estimated_friction(log: Log) -> Figure:
         if truth is not None:
             _plot(axes, log, truth[:, joint], **_THIN, label="true friction")
     _limit(log, panels, estimate, whole=truth, span=_FRICTION_SPAN)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -452,12 +452,12 @@ def friction_errors(log: Log) -> Figure:
     for joint, axes in panels.items():
         _plot(axes, log, error[:, joint], color=_joint_color(log, joint), linewidth=0.9)
         if np.isfinite(rms[joint]):
-            axes.axhspan(-rms[joint], rms[joint], facecolor=_TRUTH, alpha=0.15, linewidth=0, zorder=3, label="± RMS")
+            axes.axhspan(-rms[joint], rms[joint], facecolor=TRUTH, alpha=0.15, linewidth=0, zorder=3, label="± RMS")
             for edge in (-rms[joint], rms[joint]):
-                axes.axhline(edge, color=_TRUTH, linewidth=0.9, linestyle="--", zorder=4)
-            axes.set_title(f"RMS {number(float(rms[joint]), 2)} Nm", loc="right", fontsize=9, pad=3, color=_PLANNED)
+                axes.axhline(edge, color=TRUTH, linewidth=0.9, linestyle="--", zorder=4)
+            axes.set_title(f"RMS {number(float(rms[joint]), 2)} Nm", loc="right", fontsize=9, pad=3, color=PLANNED)
     _limit(log, panels, error, span=_FRICTION_SPAN)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -468,7 +468,7 @@ def friction_over_velocity(log: Log) -> Figure:
     """
     rows = _joint_rows(log)
     columns = min(3, len(rows))
-    figure = Figure(figsize=(_WIDTH, 0.6 + 2.6 * -(-len(rows) // columns)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.6 + 2.6 * -(-len(rows) // columns)), layout="constrained")
     grid = figure.subplots(-(-len(rows) // columns), columns, squeeze=False)
     for axes in grid.flat[len(rows) :]:
         axes.set_axis_off()
@@ -478,7 +478,7 @@ def friction_over_velocity(log: Log) -> Figure:
     if estimate is not None:
         estimate = np.concatenate([estimate[1:], estimate[-1:]])
     for axes, (role, joints) in zip(grid.flat, rows.items(), strict=False):
-        _decorate(axes)
+        decorate(axes)
         axes.locator_params(axis="x", nbins=5)
         axes.set_title(role.replace("_", " "), loc="left", fontsize=10)
         shown = estimate if estimate is not None else truth
@@ -488,7 +488,7 @@ def friction_over_velocity(log: Log) -> Figure:
             _dots(axes, velocity[_stride(log), joint], shown[_stride(log), joint], _joint_color(log, joint), size, label)
         if estimate is not None and truth is not None:
             for joint in joints.values():
-                _dots(axes, velocity[_stride(log), joint], truth[_stride(log), joint], _TRUTH, 1.8, "true friction")
+                _dots(axes, velocity[_stride(log), joint], truth[_stride(log), joint], TRUTH, 1.8, "true friction")
         axes.set_xlim(_at_least(axes.get_xlim(), _VELOCITY_SPAN))
         if estimate is None:
             axes.set_ylim(_at_least(axes.get_ylim(), _FRICTION_SPAN))
@@ -496,7 +496,7 @@ def friction_over_velocity(log: Log) -> Figure:
             _limit(log, dict.fromkeys(joints.values(), axes), estimate, whole=truth, span=_FRICTION_SPAN)
     figure.supxlabel("joint velocity [rad/s]", fontsize=10)
     figure.supylabel("friction torque [Nm]", fontsize=10)
-    _add_legend(figure, marker_size=9)
+    add_legend(figure, marker_size=9)
     return figure
 
 
@@ -536,7 +536,7 @@ def friction_parameters(log: Log) -> Figure:
                     )
             shown = values[:, list(joints.values()), parameter]
             axes.set_ylim(_readable(log, shown, span=_FRICTION_SPAN))
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -573,7 +573,7 @@ def support(log: Log) -> Figure:
         axes.set_ylim(-0.22 * len(strips) - 0.06, 1.4)
         axes.set_yticks([0, 0.5, 1])
     _name_phases(grid[0, 0], log)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -587,7 +587,7 @@ def filter_consistency(log: Log) -> Figure:
         axes.set_title(name.replace("_", " "), loc="left", fontsize=10)
         axes.set_ylabel("NIS [1]")
         axes.legend(handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=9)
-    _add_legend(figure, without={part for parts in filters.values() for part in parts})
+    add_legend(figure, without={part for parts in filters.values() for part in parts})
     return figure
 
 
@@ -598,16 +598,16 @@ def friction_consistency(log: Log) -> Figure:
     for joint, axes in panels.items():
         label = str(_joint_style(log, joint, "NIS")["label"])
         _plot_nis(axes, log, {label: parts[joint]}, {label: _joint_color(log, joint)})
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
 def statuses(log: Log) -> Figure:
     """What sensor monitor and estimators said of their inputs over time."""
     rows = _statuses(log)
-    figure = Figure(figsize=(_WIDTH, 1.2 + 0.3 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    _decorate(axes)
+    decorate(axes)
     axes.grid(visible=False, axis="y")
     axes.margins(x=0)
     seen = sorted({int(value) for values in rows.values() for value in np.unique(values)})
@@ -629,9 +629,9 @@ def imu(log: Log) -> Figure:
     for (channel, title, unit), column in zip(columns, grid.T, strict=True):
         column[0].set_title(title, loc="left", fontsize=10)
         for axes, values, name in zip(column, log[channel].T, "xyz", strict=True):
-            _plot(axes, log, values, color=_PLANNED, linewidth=0.8)
+            _plot(axes, log, values, color=PLANNED, linewidth=0.8)
             axes.set_ylabel(f"{name} [{unit}]")
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -645,7 +645,7 @@ def _source(channel: str) -> str:
 
 
 def _side_color(log: Log, side: str) -> str:
-    return _SIDE_COLORS[log.sides.index(side) % len(_SIDE_COLORS)]
+    return SIDE_COLORS[log.sides.index(side) % len(SIDE_COLORS)]
 
 
 def _joint_color(log: Log, joint: int) -> str:
@@ -785,16 +785,16 @@ def _estimate_and_error(
     estimate, truth, error = curves
     figure, grid = _time_grid(log, len(names), 1 if error is None else 2, height=0.9 + 1.75 * len(names))
     for column, (name, row) in enumerate(zip(names, grid, strict=True)):
-        _plot(row[0], log, estimate[:, column], color=_ESTIMATE, label="estimated", **_BROAD)
+        _plot(row[0], log, estimate[:, column], color=ESTIMATE, label="estimated", **_BROAD)
         if truth is not None:
             _plot(row[0], log, truth[:, column], **_THIN, label="true")
         row[0].set_ylabel(f"{name} [{units[0]}]")
         row[0].set_ylim(_readable(log, estimate[:, column], whole=None if truth is None else truth[:, column], span=spans[0]))
         if error is not None:
-            _plot(row[1], log, error[:, column], color=_ESTIMATE, linewidth=0.9)
+            _plot(row[1], log, error[:, column], color=ESTIMATE, linewidth=0.9)
             row[1].set_ylabel(f"error of {name} [{units[1]}]")
             row[1].set_ylim(_readable(log, error[:, column], span=spans[1]))
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -821,13 +821,13 @@ def _limit(log: Log, panels: Mapping[int, Axes], estimate: np.ndarray, *, whole:
 
 def _time_grid(log: Log, rows: int, columns: int, *, height: float, phases: bool = True) -> tuple[Figure, np.ndarray]:
     """A figure with panels over time that show the phases, if so wished; panels have shape (rows, columns)."""
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axes in grid.flat:
         if phases:
             _decorate_time(axes, log)
         else:
-            _decorate(axes)
+            decorate(axes)
             axes.margins(x=0)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
@@ -843,7 +843,7 @@ def _joint_grid(log: Log, quantity: str, *, own_swing: bool = False) -> tuple[Fi
     """
     joint_rows = list(_joint_rows(log).values())
     columns = max(len(row) for row in joint_rows)
-    figure = Figure(figsize=(_WIDTH, 0.8 + 1.55 * len(joint_rows)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.8 + 1.55 * len(joint_rows)), layout="constrained")
     grid = figure.subplots(len(joint_rows), columns, sharex=True, sharey="row", squeeze=False)
     panels = {}
     for row, row_axes in zip(joint_rows, grid, strict=True):
@@ -858,7 +858,8 @@ def _joint_grid(log: Log, quantity: str, *, own_swing: bool = False) -> tuple[Fi
     return figure, panels
 
 
-def _decorate(axes: Axes) -> None:
+def decorate(axes: Axes) -> None:
+    """Gives a panel the looks that all have."""
     axes.grid(color="#dfe2e6", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -869,7 +870,7 @@ def _decorate(axes: Axes) -> None:
 
 def _decorate_time(axes: Axes, log: Log, *, swing_of: str | None = None) -> None:
     """Also shades the single supports in the colour of the leg that stands, or when the leg of one side swings."""
-    _decorate(axes)
+    decorate(axes)
     axes.margins(x=0)
     for phase in support_phases(log):
         if swing_of is not None:
@@ -898,10 +899,10 @@ def _name_phases(axes: Axes, log: Log) -> None:
     for phase in support_phases(log):
         if phase.end - phase.start > 0.03 * duration:
             middle = (phase.start + phase.end) / 2
-            axes.text(middle, 1.02, phase.label, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, color=_PLANNED)
+            axes.text(middle, 1.02, phase.label, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, color=PLANNED)
 
 
-def _add_legend(figure: Figure, *, marker_size: float | None = None, without: Collection[str] = ()) -> None:
+def add_legend(figure: Figure, *, marker_size: float | None = None, without: Collection[str] = ()) -> None:
     """One legend above all panels: every label once but for those `without`, solid lines before dashed ones before areas.
 
     Args:

@@ -1,0 +1,535 @@
+"""How well missing physics is found: `python -m benchmarks.hidden [--quick] [--only NAME] [--seeds N]
+[--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
+
+Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also nothing, two effects at once, effects that
+the library does not have, and effects in robots that differ from their model in contact solver, plant step or friction law. Each log is
+diagnosed. Every case leaves DIR/cases/<case>.json; those that are there already, made by the same sources, are not run again. Prints the
+figures beside what was asked for and saves them as DIR/report.html with the confusion matrix, which is also DIR/confusion.png.
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import time
+import traceback
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table as ConsoleTable
+
+from fbse_drake import load_scenario
+from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
+from fbse_drake.discrepancy.hidden import SIZES, Answer, HiddenEffect, make_exercise, record, score
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.strangers import STRANGERS
+from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.effects.effect import library
+from fbse_drake.files import write_text
+from fbse_drake.report.html import Details, FigureBlock, Report, Section, Table, number, write_report
+
+_SCENARIO = "paper_walk"
+_FRICTION = frozenset(
+    {
+        "CoulombFriction",
+        "ViscousFriction",
+        "StribeckFriction",
+        "DirectionalFriction",
+        "LoadDependentFriction",
+        "QuadraticDrag",
+        "ThermalDrift",
+        "PreslidingHysteresis",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """A robot that differs from its model otherwise than by what is hidden."""
+
+    description: str
+    # Of the robot's scenario.
+    overrides: tuple[str, ...]
+    # Effects that rightly stand for the difference.
+    allowed: frozenset[str] = frozenset()
+
+
+_CREEP = frozenset({"FootCreep", "GroundCompliance"})
+_OTHER_LAW = (
+    "robot.effects.joint_friction=!CoulombViscousFriction {coulomb: {hip_yaw: 0.9, hip_roll: 0.8, hip_pitch: 0.6, knee_pitch: 0.5, "
+    "ankle_pitch: 0.1, ankle_roll: 0.05}, viscous: {all: 0.9}}"
+)
+_MISMATCHES = {
+    "similar": Mismatch("contact solver (similar)", ("plant.discrete_contact_approximation=similar",), _CREEP),
+    "sap": Mismatch("contact solver (sap)", ("plant.discrete_contact_approximation=sap",), _CREEP),
+    "step": Mismatch("plant step (0.5 ms)", ("plant.time_step=0.0005",)),
+    "friction": Mismatch("friction law", (_OTHER_LAW,), _FRICTION),
+}
+# Effects, targets and parameters whose stated smallest size is tried, at half and at twice of it.
+_THRESHOLDS = {
+    "CoulombFriction": ("left_knee_pitch", "coulomb"),
+    "ViscousFriction": ("left_ankle_pitch", "viscous"),
+    "LoadDependentFriction": ("right_hip_roll", "coefficient"),
+    "TorqueGain": ("left_hip_pitch", "shortfall"),
+    "TorqueBias": ("right_hip_pitch", "bias"),
+    "ReflectedInertia": ("left_knee_pitch", "inertia"),
+    "BodyMass": ("trunk", "mass"),
+    "FootForceGain": ("left", "gain"),
+    "EncoderOffset": ("right_ankle_pitch", "offset"),
+    "GyroscopeBias": ("robot", "x"),
+}
+_NOTHING, _UNKNOWN = "nothing", "unknown"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One log and its diagnosis."""
+
+    name: str
+    group: Literal["effect", "decoy", "stranger", "pair", "mismatch", "threshold", "length"]
+    # As in `fbse_drake.discrepancy.hidden.draw`.
+    what: str
+    size: str = "medium"
+    count: int = 1
+    # Of the scenario that is recorded.
+    overrides: tuple[str, ...] = ()
+    # Is the model simulated as well, with what was found and without?
+    rollout: bool = False
+    # In the place of what is drawn.
+    answer: Answer | None = None
+
+    @property
+    def seed(self) -> int:
+        return zlib.crc32(self.name.encode())
+
+
+def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
+    """All cases but those at the smallest size that can be found, see `threshold_cases`."""
+    names = [name for name, effect in library().items() if not effect.composite]
+    result = [Case(f"decoy-{seed}", "decoy", "decoy") for seed in range(4 if quick else 30)]
+    for seed in range(seeds):
+        for size in sizes:
+            rollout = size == "large" and seed == 0
+            result += [Case(f"effect-{name}-{size}-{seed}", "effect", name, size, rollout=rollout) for name in names]
+    for seed in range(1 if quick else 2):
+        result += [Case(f"stranger-{name}-{size}-{seed}", "stranger", name, size) for name in STRANGERS for size in SIZES[1:]]
+    result += [Case(f"pair-{seed}", "pair", "library", SIZES[1 + seed % 2], 2) for seed in range(3 if quick else 15)]
+    for name, mismatch in _MISMATCHES.items():
+        for seed in range(1 if quick else 3):
+            for what, size in (("decoy", "medium"), ("library", SIZES[1 + seed % 2])):
+                result.append(Case(f"mismatch-{name}-{what}-{seed}", "mismatch", what, size, overrides=mismatch.overrides))
+    return result
+
+
+def length_cases() -> list[Case]:
+    """One effect in walks once, twice and four times as long."""
+    hidden = HiddenEffect("TorqueGain", ("left_knee_pitch",), 0.1, {"shortfall": {"left_knee_pitch": 0.1}})
+    answer = Answer("library", "large", 1.0, (hidden,))
+    result = []
+    for times, supports in ((1, 7), (2, 14), (4, 30)):
+        overrides = (f"duration={11.5 * times}", f"reference.single_supports={supports}")
+        result.append(Case(f"length-{times}", "length", "TorqueGain", "large", overrides=overrides, answer=answer))
+    return result
+
+
+def threshold_cases(stated: dict[str, dict[str, float]]) -> list[Case]:
+    """Effects of half and of twice the smallest size that can be found.
+
+    Args:
+        stated: that size, by effect and target.
+    """
+    result = []
+    for name, (target, parameter) in _THRESHOLDS.items():
+        for label, factor in (("half", 0.5), ("twice", 2.0)):
+            size = factor * stated.get(name, {}).get(target, np.inf)
+            if np.isfinite(size):
+                answer = Answer("library", "small", 1.0, (HiddenEffect(name, (target,), size, {parameter: {target: size}}),))
+                result.append(Case(f"threshold-{name}-{label}", "threshold", name, answer=answer))
+    return result
+
+
+def run(job: tuple[Case, Path, str]) -> None:
+    """Runs a case and writes what came out.
+
+    Args:
+        job: the case, the file that is written, and a checksum of the sources.
+    """
+    case, path, sources = job
+    try:
+        result = _run(case)
+    except Exception:  # One bad case must not stop the others.
+        result = {"error": traceback.format_exc()}
+    write_text(path, json.dumps({"sources": sources, "case": asdict(case), **result}, indent=1, default=float) + "\n")
+
+
+def _run(case: Case) -> dict[str, Any]:
+    scenario = load_scenario(_SCENARIO, overrides=case.overrides)
+    if case.answer is not None:
+        exercise = record(scenario, _SCENARIO, case.answer, case.seed)
+    else:
+        exercise = make_exercise(scenario, _SCENARIO, case.seed, what=case.what, size=case.size, count=case.count)
+    scenario = exercise.scenario
+    if case.group == "mismatch":
+        # What is believed knows nothing of the overrides.
+        believed = load_scenario(_SCENARIO)
+        scenario = replace(believed, model=believed.robot)
+    start = time.perf_counter()
+    if case.rollout:
+        found = study_json(study(scenario, exercise.log))
+    else:
+        found = {"diagnoses": [diagnosis_json(diagnose(Predictor(scenario, exercise.log)))], "steps": []}
+    duration = time.perf_counter() - start
+    return {
+        "answer": asdict(exercise.answer),
+        "score": asdict(score(exercise.answer, found["diagnoses"])),
+        "wall_time": duration,
+        "steps": found["steps"],
+        "diagnoses": found["diagnoses"],
+    }
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came out of a case: the contents of its file."""
+
+    tree: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return self.tree["case"]["name"]
+
+    @property
+    def group(self) -> str:
+        return self.tree["case"]["group"]
+
+    @property
+    def size(self) -> str:
+        return self.tree["case"]["size"]
+
+    @property
+    def hidden(self) -> list[dict[str, Any]]:
+        return self.tree["answer"]["effects"]
+
+    @property
+    def score(self) -> dict[str, Any]:
+        return self.tree["score"]
+
+    @property
+    def diagnosis(self) -> dict[str, Any]:
+        return self.tree["diagnoses"][0]
+
+    @cached_property
+    def chosen(self) -> list[dict[str, Any]]:
+        return [finding for finding in self.diagnosis["ranking"] if finding["chosen"]]
+
+    @property
+    def label(self) -> str:
+        """What the diagnosis says, in a word."""
+        if self.diagnosis["verdict"] == "unknown_effect" and (self.group == "stranger" or not self.chosen):
+            return _UNKNOWN
+        return self.chosen[0]["effect"] if self.chosen else _NOTHING
+
+    @property
+    def truth(self) -> str:
+        return self.hidden[0]["effect"] if self.hidden else _NOTHING
+
+    def is_found(self, *, alternatives: bool = True) -> bool:
+        """Is everything found that is hidden, or else declared to be an alternative?"""
+        return all(found or (alternatives and self.score["confusable"][name]) for name, found in self.score["found"].items())
+
+    def is_visible(self, stated: dict[str, dict[str, float]]) -> bool:
+        """Is every hidden effect, on some target, larger than the smallest size that can be found?"""
+
+        def exceeds(hidden: dict[str, Any], target: str) -> bool:
+            return _strength(hidden, target) > _limit(stated, hidden, target)
+
+        return all(any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden)
+
+    def is_wrong(self, allowed: Iterable[str] = ()) -> bool:
+        """Does it name effects with confidence that are not there?"""
+        return self.diagnosis["verdict"] == "effect_found" and bool(set(self.score["wrong"]) - set(allowed))
+
+    def text(self) -> str:
+        """One line."""
+        hidden = ", ".join(f"{e['effect']} {e['size']:.3g} ({' '.join(e['targets'])})" for e in self.hidden) or _NOTHING
+        chosen = ", ".join(f"{f['effect']} ({' '.join(f['joints'])})" for f in self.chosen) or _NOTHING
+        left = " ".join(row["row"] for row in self.diagnosis["unexplained"]) or "nothing"
+        return f"{self.name}: {hidden} -> {self.diagnosis['verdict']}: {chosen}; unexplained: {left}"
+
+
+def _strength(hidden: dict[str, Any], target: str) -> float:
+    """How large a hidden effect is on a target, so that more is easier to find: its first parameter, or the length of a vector."""
+    name, parameter = next(iter(library()[hidden["effect"]].parameters.items()))
+    if parameter.neutral == np.inf:
+        return -hidden["parameters"][name][target]
+    if not parameter.linear:
+        return hidden["parameters"][name][target]
+    parameters = library()[hidden["effect"]].parameters
+    return float(np.linalg.norm([hidden["parameters"][n][target] for n, p in parameters.items() if p.linear and p.unit == parameter.unit]))
+
+
+def _limit(stated: dict[str, dict[str, float]], hidden: dict[str, Any], target: str) -> float:
+    """The smallest strength that can be found."""
+    parameter = next(iter(library()[hidden["effect"]].parameters.values()))
+    limit = stated.get(hidden["effect"], {}).get(target, np.inf)
+    return -limit if parameter.neutral == np.inf and np.isfinite(limit) else limit
+
+
+def stated_sizes(decoys: Sequence[Result]) -> dict[str, dict[str, float]]:
+    """The smallest size that can be found, by effect and target: the median of what the diagnoses of the decoys say."""
+    sizes: dict[str, dict[str, float]] = {}
+    for name in library():
+        stated = [decoy.diagnosis["effects"].get(name, {}).get("smallest_detectable_by_target", {}) for decoy in decoys]
+        targets = dict.fromkeys(target for of_decoy in stated for target in of_decoy)
+        sizes[name] = {target: float(np.median([of_decoy.get(target, np.inf) for of_decoy in stated])) for target in targets}
+    return sizes
+
+
+@dataclass(frozen=True)
+class Figures:
+    """All figures of merit."""
+
+    results: list[Result]
+
+    @staticmethod
+    def of_finished(results: Iterable[Result]) -> "Figures":
+        """The figures of those cases that did not raise an error."""
+        return Figures([result for result in results if "error" not in result.tree])
+
+    def of(self, *groups: str) -> list[Result]:
+        return [result for result in self.results if result.group in groups]
+
+    @cached_property
+    def stated(self) -> dict[str, dict[str, float]]:
+        return stated_sizes(self.of("decoy"))
+
+    @cached_property
+    def visible(self) -> list[Result]:
+        """Single effects of the library that are large enough."""
+        return [result for result in self.of("effect") if result.is_visible(self.stated)]
+
+    def table(self) -> Table:
+        """What was asked for and what came out."""
+        visible, strangers, decoys = self.visible, self.of("stranger"), self.of("decoy")
+        missed = [r for r in visible if not r.score["first"]]
+        pairs = [r for r in self.of("pair") if r.is_visible(self.stated)]
+        small = [r for r in self.of("effect") if not r.is_visible(self.stated)]
+        right = [r for r in visible if r.is_found(alternatives=False)]
+        covered = [value for r in right for value in r.score["covered"].values()]
+        walks = [r for r in self.of("effect") if len(r.tree["steps"]) > 1 and r.is_found()]
+        half, twice = ([r for r in self.of("threshold") if r.name.endswith(label)] for label in ("half", "twice"))
+        times = [r.tree["wall_time"] for r in self.results if r.group != "length" and not r.tree["steps"]]
+        lengths = {r.name: r.tree["wall_time"] for r in self.of("length")}
+        rows = [
+            ("hidden effect ranked first (above the stated smallest size)", ">= 95 %", *_share(r.score["first"] for r in visible)),
+            ("  the rest: declared confusable with the first", "100 %", *_share(r.is_found() for r in missed)),
+            ("  on exactly the right targets", "", *_share(all(r.score["targets"].values()) for r in right)),
+            ("nothing hidden: false alarms", "<= 1 of 30", f"{sum(not r.score['verdict'] for r in decoys)}", f"{len(decoys)}"),
+            ("below the stated smallest size: no other effect named", "", *_share(not r.score["wrong"] for r in small)),
+            ("not in the library: unknown_effect", "", *_share(r.score["verdict"] for r in strangers)),
+            ("  with exactly the right joints", ">= 80 %", *_share(r.score["verdict"] and r.score["joints"] for r in strangers)),
+            ("  a wrong name with confidence", "<= 10 %", *_share(r.is_wrong() for r in strangers)),
+            ("two effects: both found", ">= 80 %", *_share(r.is_found() for r in pairs)),
+            ("held-out residual after adding <= 1.2 x noise", "100 %", *_share(r.diagnosis["held_out_after"] <= 1.2 for r in right)),
+            ("rollout error falls", "100 %", *_share(_rollout_falls(r) for r in walks)),
+            ("95 % intervals that hold the true value", "88 to 99 %", *_share(covered)),
+            ("half the stated smallest size: not found", "100 %", *_share(not any(r.score["found"].values()) for r in half)),
+            ("twice the stated smallest size: found", "100 %", *_share(r.is_found() for r in twice)),
+            *(
+                (
+                    f"another {m.description} than the model's: a wrong name with confidence",
+                    "0 %",
+                    *_share(bad for _, bad in self._misled(name)),
+                )
+                for name, m in _MISMATCHES.items()
+            ),
+            ("time of a diagnosis, median and longest, with all cores busy", "<= 60 s", _spread(times), f"{len(times)}"),
+            *(
+                (f"  of a log {k} times as long", f"{k} times as long", _ratio(lengths, f"length-{k}", "length-1"), "1")
+                for k in (2, 4)
+                if f"length-{k}" in lengths
+            ),
+        ]
+        return Table(("figure", "asked", "measured", "of"), tuple(rows))
+
+    def _misled(self, name: str) -> list[tuple[Result, bool]]:
+        """Cases of a mismatch: do they name a wrong effect with confidence?"""
+        mine = [r for r in self.of("mismatch") if r.name.startswith(f"mismatch-{name}-")]
+        return [(r, r.is_wrong(_MISMATCHES[name].allowed)) for r in mine]
+
+    def by_effect(self) -> Table:
+        """What became of each effect."""
+        rows = []
+        for name in library():
+            mine = [r for r in self.of("effect") if r.truth == name]
+            if not mine:
+                continue
+            seen = [r for r in mine if r in self.visible]
+            counts = [f"{sum(r.score['first'] for r in mine if r.size == size)}/{sum(r.size == size for r in mine)}" for size in SIZES]
+            others = Counter(r.label for r in seen if not r.score["first"])
+            covered = [value for r in seen for value in r.score["covered"].values()]
+            after = [r.diagnosis["held_out_after"] for r in seen if r.score["first"]]
+            shown = ", ".join(f"{label} {count}" for label, count in others.items())
+            middle = float(np.median(after)) if after else np.nan
+            shrunk = sum(r.tree["answer"]["shrunk"] < 1 for r in mine)
+            rows.append((name, *counts, f"{len(mine) - len(seen)}", f"{shrunk}", shown, _share(covered)[0], middle))
+        header = ("hidden", *SIZES, "too small", "made smaller", "first instead", "intervals", "held-out after")
+        return Table(header, tuple(rows))
+
+    def failures(self) -> list[str]:
+        """A line for each case that did not go as it should."""
+        bad = [r for r in self.visible if not r.score["first"]]
+        bad += [r for r in self.of("effect") if r not in self.visible and r.score["wrong"]]
+        bad += [r for r in self.of("decoy") if not r.score["verdict"]]
+        bad += [r for r in self.of("stranger") if not (r.score["verdict"] and r.score["joints"])]
+        bad += [r for r in self.of("pair") if not r.is_found()]
+        bad += [r for r in self.of("threshold") if r.is_found() != r.name.endswith("twice")]
+        bad += [r for name in _MISMATCHES for r, misled in self._misled(name) if misled]
+        return [r.text() for r in bad]
+
+    def confusion(self) -> Figure:
+        """How often each hidden effect led to each answer: shares of a row, with the counts."""
+        shown = [r for r in self.of("effect", "decoy", "stranger") if r.group != "effect" or r in self.visible]
+        counts = Counter((r.truth, r.label) for r in shown)
+        names = [*(name for name, effect in library().items() if not effect.composite), _NOTHING]
+        rows = [name for name in (*names, *STRANGERS) if any(truth == name for truth, _ in counts)]
+        columns = [*names, _UNKNOWN]
+        matrix = np.array([[counts[row, column] for column in columns] for row in rows], dtype=float).reshape(len(rows), len(columns))
+        figure = Figure(figsize=(12, 11), layout="constrained")
+        axes = figure.add_subplot()
+        axes.imshow(matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1.4)
+        for i, j in zip(*np.nonzero(matrix), strict=True):
+            axes.text(j, i, f"{matrix[i, j]:.0f}", ha="center", va="center", fontsize=8)
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
+        axes.set_yticks(range(len(rows)), rows, fontsize=8)
+        axes.set(xlabel="ranked first", ylabel="hidden")
+        return figure
+
+
+def _share(values: Iterable[bool]) -> tuple[str, str]:
+    """Percentage and number of cases."""
+    values = list(values)
+    return (f"{100 * np.mean(values):.1f} %" if values else "n/a"), f"{len(values)}"
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{np.median(values):.0f} s, {max(values):.0f} s" if values else "n/a"
+
+
+def _ratio(times: dict[str, float], name: str, reference: str) -> str:
+    return f"{times[name] / times[reference]:.2f}" if reference in times else "n/a"
+
+
+def _rollout_falls(result: Result) -> bool:
+    before, after = (result.tree["steps"][k]["rollout_rmse"]["joint_position"] for k in (0, -1))
+    return after < before
+
+
+def _sources() -> str:
+    """Checksum of what decides on a case."""
+    folder = Path(diagnose.__code__.co_filename).parent
+    files = sorted([*folder.glob("*.py"), *(folder.parent / "effects").glob("*.py")])
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+class Store:
+    """The folder that holds a file for every case."""
+
+    def __init__(self, folder: Path, sources: str, *, keep: bool):
+        """Makes the folder.
+
+        Args:
+            sources: checksum of the sources; files made by others do not count.
+            keep: they do count.
+        """
+        self._folder, self._sources, self._keep = folder, sources, keep
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def read(self, cases: Iterable[Case]) -> list[Result]:
+        """Results of those cases that have been run."""
+        trees = [json.loads(path.read_text()) for path in map(self._path, cases) if path.exists()]
+        return [Result(tree) for tree in trees if self._keep or tree["sources"] == self._sources]
+
+    def run(self, cases: Iterable[Case], jobs: int, console: Console, title: str) -> None:
+        """Runs those cases that have not been run."""
+        cases = list(cases)
+        done = {result.name for result in self.read(cases)}
+        todo = [(case, self._path(case), self._sources) for case in cases if case.name not in done]
+        # Numerical libraries must not start threads of their own beside a process for every core.
+        os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+            for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
+                pass
+
+    def _path(self, case: Case) -> Path:
+        return self._folder / f"{case.name}.json"
+
+
+def _print(console: Console, title: str, table: Table) -> None:
+    shown = ConsoleTable(title=title, title_justify="left")
+    for head in table.header:
+        shown.add_column(head)
+    for row in table.rows:
+        shown.add_row(*(cell if isinstance(cell, str) else number(cell) for cell in row))
+    console.print(shown)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs what has not been run, and prints the figures of all that has."""
+    parser = argparse.ArgumentParser(description="How well missing physics is found.")
+    parser.add_argument("--quick", action="store_true", help="one seed, medium sizes, few of the other cases")
+    parser.add_argument("--only", default="", metavar="NAME", help="run only cases with this in their names, as effect-TorqueGain or decoy")
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds of each effect and size (default 3)")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=SIZES, help="sizes of the effects (default all)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases that run at once (default: all cores)")
+    parser.add_argument("--keep", action="store_true", help="keep results of other sources")
+    parser.add_argument("--out", type=Path, default=Path("out/hidden"), help="where everything goes (default out/hidden)")
+    options = parser.parse_args(arguments)
+    console = Console(width=190)
+    store = Store(options.out / "cases", _sources(), keep=options.keep)
+    seeds, sizes = (1, ("medium",)) if options.quick else (options.seeds, options.sizes)
+    drawn, lengths = cases(seeds, sizes, quick=options.quick), length_cases()
+
+    def wanted(some: Iterable[Case]) -> list[Case]:
+        return [case for case in some if options.only in case.name]
+
+    store.run(wanted(drawn), options.jobs, console, "hiding and finding")
+    thresholds = threshold_cases(Figures.of_finished(store.read(drawn)).stated)
+    if not options.quick:
+        store.run(wanted(thresholds), options.jobs, console, "at the smallest sizes")
+        # Alone, since their times are compared.
+        store.run(wanted(lengths), 1, console, "longer logs")
+
+    everything = store.read([*drawn, *thresholds, *lengths])
+    figures = Figures.of_finished(everything)
+    errors = [f"{result.name}:\n{result.tree['error']}" for result in everything if "error" in result.tree]
+    made = {"What was asked for": figures.table(), "By effect": figures.by_effect()}
+    for title, table in made.items():
+        _print(console, title, table)
+    failures = "\n".join([*figures.failures(), *errors])
+    console.print(failures, highlight=False, soft_wrap=True)
+    confusion = figures.confusion()
+    confusion.savefig(options.out / "confusion.png", dpi=130)
+    caption = "Hidden effects large enough to be found, decoys and strangers; numbers count cases."
+    sections = (
+        *(Section(title, tables=(table,)) for title, table in made.items()),
+        Section("Confusion", figures=(FigureBlock("What was hidden and what was ranked first", caption, confusion),)),
+        Section("Cases that went wrong", details=(Details("One line each", failures or "none"),)),
+    )
+    outcome = f"{len(everything)} cases."
+    write_report(options.out / "report.html", Report("Finding the missing physics", not errors, outcome, sections))
+    console.print(f"Report: {options.out / 'report.html'}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()

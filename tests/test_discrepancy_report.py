@@ -1,0 +1,214 @@
+"""The reports of compare, diagnose and study: they say what was found, and hold everything they show."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fbse_drake import Log, load_scenario
+from fbse_drake.discrepancy.compare import Comparison, compare
+from fbse_drake.discrepancy.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.rollout import RolloutError
+from fbse_drake.discrepancy.structure import Structure
+from fbse_drake.discrepancy.study import Study, StudyStep
+from fbse_drake.report import discrepancy as reports
+from fbse_drake.report import discrepancy_figures as figures
+
+INPUTS = reports.Inputs("a_walk", "paper_walk", "walk.npz", "out/a_walk")
+KNEES = ("left_knee_pitch", "right_knee_pitch")
+FRICTION = Finding(
+    "CoulombFriction",
+    KNEES,
+    8.1,
+    1.02,
+    {"coulomb": Estimate(1.5, (1.4, 1.6), "Nm"), "transition": Estimate(0.004, (0.001, 0.007), "rad/s")},
+    ("PreslidingHysteresis",),
+    chosen=True,
+)
+RIVAL = Finding("PreslidingHysteresis", KNEES, 8.1, 1.03, {"coulomb": Estimate(1.5, (1.4, 1.6), "Nm")}, (), chosen=False)
+MASS = Finding("BodyMass", ("trunk",), 5.0, 1.01, {"mass": Estimate(2.0, (1.9, 2.1), "kg")}, (), chosen=True)
+STATUSES = {
+    "CoulombFriction": EffectStatus("present", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move each joint to and fro."),
+    "PreslidingHysteresis": EffectStatus("confusable", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move by small amounts.", "squat"),
+    "TorqueBias": EffectStatus("absent", "bias", "Nm", {"left_knee_pitch": 0.02, "right_knee_pitch": 1e9}, "Hold each joint still."),
+    "ThermalDrift": EffectStatus("not_visible", "change", "Nm", dict.fromkeys(KNEES, np.inf), "Repeat one motion."),
+}
+
+
+def made_diagnosis(verdict: str = "effect_found", ranking: tuple[Finding, ...] = (FRICTION, RIVAL), **changes: object) -> Diagnosis:
+    content = {"effects": STATUSES, "unexplained": (), "path": (), "held_out_before": 4.2, "held_out_after": 1.01, "train_after": 1.0}
+    return Diagnosis(verdict=verdict, ranking=ranking, **(content | changes))
+
+
+NOTHING = made_diagnosis("nothing_missing", (), held_out_before=1.0)
+UNKNOWN = made_diagnosis("unknown_effect", (), unexplained=(Structure("left_knee_pitch", 3, 6.2, "position", 0.8),))
+
+
+@pytest.fixture(scope="module")
+def walk(run: Callable[..., Log]) -> tuple[Predictor, Comparison]:
+    """A walk with friction that its model lacks."""
+    predictor = Predictor(load_scenario("paper_walk"), run("paper_walk", "duration=3"))
+    return predictor, compare(predictor)
+
+
+def pages(text: str) -> int:
+    """Number of pictures of a report, all of which are in it."""
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    assert "https://" not in text
+    sources = re.findall(r'<img src="([^"]{0,30})', text)
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert not re.findall(r"<(?:link|script)", text)
+    return len(sources)
+
+
+def test_compare_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    predictor, comparison = walk
+    reports.write_compare_report(tmp_path / "report.html", comparison, predictor, INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert pages(text) == 3
+    assert comparison.failures[0].text.replace("<", "&lt;").replace(">", "&gt;") in text
+    assert "fbse diagnose paper_walk walk.npz" in text
+    assert "accelerometer 0.02 m/s², gyroscope 0.001 rad/s" in text
+    assert "!Walk" in text
+    assert ">nan<" not in text
+
+
+def test_study_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
+    better = dataclasses.replace(rolled, position={"left_knee_pitch": 0.002})
+    steps = (StudyStep((), 4.2, 4.2, rolled), StudyStep((FRICTION,), 1.01, 1.0, better))
+    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert pages(text) == 10
+    assert "The model lacked Coulomb friction in left and right knee pitch." in text
+    assert "falls from 4.20 to 1.01 times" in text
+    assert "The noise floor is reached." in text
+    assert "YAML with the completed model" in text
+    # Joint angles of the simulated model [mrad].
+    assert '<td class="number">12.0</td>' in text
+    assert '<td class="number">2.00</td>' in text
+    assert "coulomb 1.5 Nm (1.4 to 1.6)" in text
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures are empty, which saves the time to draw them."""
+    for name, function in vars(figures).items():
+        if not name.startswith("_") and getattr(function, "__annotations__", {}).get("return") is figures.Figure:
+            monkeypatch.setattr(figures, name, lambda *_, **__: figures.Figure())
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("diagnosis", "passed", "texts"),
+    [
+        (
+            made_diagnosis(),
+            True,
+            [
+                "The model lacks Coulomb friction in left and right knee pitch; this log cannot tell that from presliding hysteresis.",
+                "the error of all channels falls from 4.20 to 1.01 times the sensors&#39; noise (1.00 on the data that it was fitted to)",
+                "Presliding hysteresis explains this log as well as Coulomb friction in left and right knee pitch.",
+                "To tell them apart: Move by small amounts (fbse simulate squat",
+                "fbse add paper_walk out/a_walk --out",
+                "coulomb 1.5 Nm (1.4 to 1.6), transition 0.004 rad/s (0.001 to 0.007)",
+                "<td>bias 0.02 Nm; none in right knee pitch</td>",
+                "<td>not visible</td><td>change none in left and right knee pitch</td>",
+            ],
+        ),
+        (NOTHING, True, ["Nothing is missing", "no effect makes it smaller on held-out data"]),
+        (
+            UNKNOWN,
+            False,
+            ["Something is missing that no effect of the library explains, in left knee pitch (follows position).", "register an effect"],
+        ),
+        (
+            made_diagnosis("not_visible", ()),
+            False,
+            [
+                "This log cannot tell whether something is missing: 1 of 4 effects would not show in it.",
+                "Repeat one motion. [Thermal drift]",
+            ],
+        ),
+        (
+            made_diagnosis(ranking=(FRICTION, MASS)),
+            True,
+            ["The model lacks Coulomb friction in left and right knee pitch and body mass in trunk"],
+        ),
+    ],
+)
+def test_diagnosis_report_says_what_how_sure_what_else_and_what_next(
+    diagnosis: Diagnosis, passed: bool, texts: list[str], walk: tuple[Predictor, Comparison], tmp_path: Path
+):
+    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for expected in texts:
+        assert expected in text
+    assert ('class="outcome passed"' in text) == passed
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_study_that_finds_nothing_says_so(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    study = Study((StudyStep((), 1.0, 1.0, None),), (NOTHING,), "the noise floor is reached", walk[0].scenario)
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Nothing is missing" in text
+    assert "completed" not in text
+
+
+def test_falling_error_shows_both_errors_and_the_noise(walk: tuple[Predictor, Comparison]):
+    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((MASS,), 1.01, 1.0, None))
+    (axes,) = figures.falling_error(Study(steps, (), "", walk[0].scenario)).axes
+    lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
+    np.testing.assert_allclose(lines["held-out data"], [4.2, 1.3, 1.01])
+    np.testing.assert_allclose(lines["data that it was fitted to"], [4.2, 1.2, 1.0])
+    assert set(lines["sensors' noise"]) == {1.0}
+    assert [label.get_text() for label in axes.get_xticklabels()][2] == "+ Body mass\n(trunk)"
+
+
+def test_detectability_is_relative_to_what_is_plausible():
+    (axes,) = figures.detectability(STATUSES).axes
+    dots = {line.get_label(): line.get_xdata() for line in axes.get_lines() if line.get_marker() == "o"}
+    # Biases of up to 20 Nm are plausible; what is beyond the picture is at its edge.
+    np.testing.assert_allclose(dots["absent"], [0.02 / 20, 30.0])
+    np.testing.assert_allclose(dots["not visible"], [30.0, 30.0])
+
+
+def test_errors_over_time_show_supports_and_noise(walk: tuple[Predictor, Comparison]):
+    predictor, comparison = walk
+    channels = [channel for channel in comparison.channels if channel.row.name in ("left_knee_pitch", "left_sole/specific_force_z")]
+    knee, sole = figures.errors_over_time(predictor.residual, ["left", "right"], channels).axes
+    assert {"left leg supports", "right leg supports", "error"} <= set(knee.get_legend_handles_labels()[1])
+    drawn = next(line for line in sole.get_lines() if line.get_label() == "error").get_ydata()
+    known = predictor.residual.known[:, predictor.residual.row_index["left_sole/specific_force_z"]]
+    # Not while the foot swings.
+    assert 0 < known.sum() <= predictor.residual.standing[:, 0].sum() < len(known)
+    np.testing.assert_array_equal(np.isfinite(drawn), known)
+
+
+def test_an_effect_that_is_found_in_several_rounds_is_named_once(walk: tuple[Predictor, Comparison]):
+    again = dataclasses.replace(FRICTION, targets=("left_knee_pitch", "left_hip_yaw"))
+    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((again,), 5.0, 1.0, None))
+    text = reports.study_outcome(Study(steps, (made_diagnosis(), made_diagnosis()), "", walk[0].scenario))
+    assert text.startswith("The model lacked Coulomb friction in left knee pitch, right knee pitch, left hip yaw.")
+    assert "the held-out error rises from 4.20 to 5.00 times" in text
+
+
+@pytest.mark.parametrize(
+    ("targets", "text"),
+    [
+        (("left_knee_pitch",), "left knee pitch"),
+        (KNEES, "left and right knee pitch"),
+        (("left_knee_pitch", "left_hip_yaw"), "left knee pitch, left hip yaw"),
+        (tuple(f"left_joint_{k}" for k in range(12)), "12 joints"),
+        (("left", "right"), "left and right"),
+        (("trunk",), "trunk"),
+    ],
+)
+def test_targets_in_words(targets: tuple[str, ...], text: str):
+    assert figures.targets_text(targets) == text
