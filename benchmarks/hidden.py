@@ -467,7 +467,8 @@ class Store:
         todo = [(case, self._path(case), self._sources) for case in cases if case.name not in done]
         # Numerical libraries must not start threads of their own beside a process for every core.
         os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        # Drake's diagrams hold on to what they were built of: a process that simulates again and again grows.
+        with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=10) as pool:
             for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
                 pass
 

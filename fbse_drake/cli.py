@@ -17,9 +17,9 @@ from rich.console import Console, Group
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from fbse_drake.discrepancy.add import add
+from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.compare import compare, comparison_json
-from fbse_drake.discrepancy.diagnose import Estimate, Finding, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnose import Finding, diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import SIZES, hide, reveal
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.sanity import check_sensors
@@ -304,8 +304,8 @@ def _add(options: argparse.Namespace) -> int:
     except ValueError:
         raise InputError(f"{path}: not a JSON file") from None
     with located(f"{path}: "):
-        completed = add(scenario, diagnosis, options.effect)
-        findings = _added(diagnosis, options.effect)
+        findings = read_findings(diagnosis, options.effect)
+        completed = add(scenario, findings)
     out = options.out
     # Nobody's own file is lost.
     if out.is_dir() or (out.exists() and not out.read_bytes().startswith(_ADDED.encode())):
@@ -324,26 +324,6 @@ def _add(options: argparse.Namespace) -> int:
     console.print(_findings_table(name, findings))
     console.print(f"Scenario: {out}", highlight=False, soft_wrap=True)
     return DONE
-
-
-def _added(diagnosis: Mapping[str, Any], effect: str | None) -> list[Finding]:
-    """The findings of a diagnosis.json that `add` adds."""
-    named = [finding for finding in diagnosis["ranking"] if effect in (None, finding["effect"])]
-    try:
-        return [
-            Finding(
-                finding["effect"],
-                tuple(finding["joints"]),
-                finding["held_out_before"],
-                finding["held_out_after"],
-                {name: Estimate(p["value"], tuple(p["interval"]), p["unit"]) for name, p in finding["parameters"].items()},
-                tuple(finding["confusable_with"]),
-                chosen=True,
-            )
-            for finding in [finding for finding in named if finding["chosen"]] or named[:1]
-        ]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"not the contents of a diagnosis.json (at {error})") from None
 
 
 def _value_lines(finding: Finding) -> list[str]:

@@ -46,8 +46,8 @@ class Station(Diagram):
 
     Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration, ideal pad forces, torque
     loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the command and may be left unconnected; a station that
-    compensates its own estimate does not have it. A station with an estimator also has the ports `estimator_friction_estimate` a port
-    for each of `estimator.channels`, see `EstimatorDiagram`; one with joint torque sensors has `measured_torque`.
+    compensates its own estimate does not have it. A station with an estimator also has a port for each of `estimator.channels`, see
+    `EstimatorDiagram`; one with joint torque sensors has `measured_torque`.
     """
 
     robot: Robot

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from fbse_drake.discrepancy.add import add
+from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
 from fbse_drake.discrepancy.experiment import planned_log
 from fbse_drake.discrepancy.prediction import Predictor
@@ -188,16 +188,16 @@ def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
 
 def test_added_effects_are_taken_off_the_residual_exactly_as_they_were_fitted() -> None:
     for hidden in ("!BodyMass {mass: {trunk: 2.0}}", "!AccelerometerBias {x: 0.1, y: -0.05}"):
-        wiser = add(scenario(), diagnosis_json(diagnosis_of(hidden)))
+        wiser = add(scenario(), read_findings(diagnosis_json(diagnosis_of(hidden))))
         assert not diagnose(Predictor(wiser, log_with(hidden)), effects()).chosen
 
 
 def test_adding_what_a_diagnosis_has_not_got() -> None:
     content = diagnosis_json(diagnosis_of("!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"))
     with pytest.raises(InputError, match="no effect Backlash"):
-        add(scenario(), content, "Backlash")
+        read_findings(content, "Backlash")
     with pytest.raises(InputError, match="not the contents of a diagnosis"):
-        add(scenario(), {"verdict": "effect_found"})
+        read_findings({"verdict": "effect_found"})
 
 
 def test_planned_motion_satisfies_the_equation_of_motion() -> None:

@@ -1,43 +1,61 @@
 """Adds what a diagnosis found to a scenario's model."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from fbse_drake.discrepancy.diagnose import Estimate, Finding
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.errors import InputError
 from fbse_drake.scenario import Scenario
 
 
-def add(scenario: Scenario, diagnosis: Mapping[str, Any], effect: str | None = None) -> Scenario:
-    """The scenario with further effects in its model.
+def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> list[Finding]:
+    """What there is to add according to a diagnosis.json.
 
     Args:
-        diagnosis: contents of diagnosis.json.
+        diagnosis: its contents.
         effect: which effect of the ranking, on the targets where it explains most; by default all that the diagnosis chose.
 
     Raises:
         InputError: the ranking has no such effect, or there is nothing to add.
     """
     try:
-        ranking = diagnosis["ranking"]
-        if effect is None:
-            findings = [finding for finding in ranking if finding["chosen"]]
-        else:
-            named = [finding for finding in ranking if finding["effect"] == effect]
-            findings = [finding for finding in named if finding["chosen"]] or named[:1]
-        if not findings:
-            names = ", ".join(dict.fromkeys(finding["effect"] for finding in ranking)) or "none"
-            wanted = f"no effect {effect}" if effect else "no effect to add"
-            raise InputError(f"diagnosis: it has {wanted} (effects in its ranking: {names})")
-        by_effect: dict[str, dict[str, dict[str, float]]] = {}
-        for finding in findings:
-            values = by_effect.setdefault(finding["effect"], {})
-            for name, parameter in finding["parameters"].items():
-                values.setdefault(name, {}).update({target: float(parameter["value"]) for target in finding["joints"]})
-    except (KeyError, TypeError) as error:
-        raise InputError(f"diagnosis: not the contents of a diagnosis.json (at {error})") from None
+        ranking = [
+            Finding(
+                entry["effect"],
+                tuple(entry["joints"]),
+                entry["held_out_before"],
+                entry["held_out_after"],
+                {name: Estimate(float(p["value"]), tuple(p["interval"]), p["unit"]) for name, p in entry["parameters"].items()},
+                tuple(entry["confusable_with"]),
+                entry["chosen"],
+            )
+            for entry in diagnosis["ranking"]
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"not the contents of a diagnosis.json (at {error})") from None
+    named = [finding for finding in ranking if effect in (None, finding.effect)]
+    findings = [finding for finding in named if finding.chosen] or (named[:1] if effect else [])
+    if not findings:
+        names = ", ".join(dict.fromkeys(finding.effect for finding in ranking)) or "none"
+        wanted = f"no effect {effect}" if effect else "no effect to add"
+        raise InputError(f"the diagnosis has {wanted} (effects in its ranking: {names})")
+    return findings
+
+
+def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
+    """The scenario with further effects in its model.
+
+    Raises:
+        InputError: an effect that the library does not have.
+    """
+    by_effect: dict[str, dict[str, dict[str, float]]] = {}
+    for finding in findings:
+        values = by_effect.setdefault(finding.effect, {})
+        for name, estimate in finding.parameters.items():
+            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, estimate.value))
     model = scenario.believed
     effects = dict(model.effects)
     for name, values in by_effect.items():
@@ -48,7 +66,7 @@ def add(scenario: Scenario, diagnosis: Mapping[str, Any], effect: str | None = N
 def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:
     kind = library().get(name)
     if kind is None:
-        raise InputError(f"diagnosis: the library has no effect {name} (there are: {', '.join(library())})")
+        raise InputError(f"the library has no effect {name} (there are: {', '.join(library())})")
     targets = list(next(iter(values.values())))
     return kind.from_values(targets, {parameter: [numbers[target] for target in targets] for parameter, numbers in values.items()})
 

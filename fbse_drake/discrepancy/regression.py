@@ -15,6 +15,8 @@ from fbse_drake.discrepancy.residual import Residual
 # stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
 STRETCH = 0.25
 FOLDS = 5
+# Long stretches are this many short ones.
+_LONG = 4
 # How often the rows are weighted anew by what is left in them.
 _REWEIGHTINGS = 3
 
@@ -40,18 +42,13 @@ class Fit:
     """Regression on several signatures at once; P parameters in their order, R rows."""
 
     parameters: np.ndarray
-    # Sandwich estimate by stretches of time, not smaller than what the noise alone gives, shape (P, P).
-    covariance: np.ndarray
+    # Standard deviation of each parameter, shape (P,): sandwich estimate by stretches of time, not less than what the noise alone gives.
+    deviation: np.ndarray
     # Degrees of freedom of each parameter's interval: stretches that bear on it, shape (P,).
     freedom: np.ndarray
     # Sum of squares of the whitened residual in each row: over all blocks, and with each block predicted from the other folds, (R,).
     sse: np.ndarray
     held_out_sse: np.ndarray
-
-    @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviation of each parameter, shape (P,)."""
-        return np.sqrt(np.diag(self.covariance))
 
     def interval(self, confidence: float = 0.95) -> np.ndarray:
         """Confidence interval of each parameter, shape (P, 2)."""
@@ -123,17 +120,16 @@ class WhitenedResidual:
         """
         sizes = [s.values.shape[2] for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        parameters, freedom = np.zeros(sum(sizes)), np.ones(sum(sizes))
-        covariance = np.zeros((sum(sizes), sum(sizes)))
+        parameters, deviation, freedom = np.zeros(sum(sizes)), np.zeros(sum(sizes)), np.ones(sum(sizes))
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         # Those that share no row have nothing to do with each other.
         for group in _connected(signatures):
             part = self._fit_together([signatures[k] for k in group])
             at = np.concatenate([places[k] for k in group])
             rows = np.unique(np.concatenate([signatures[k].rows for k in group]))
-            parameters[at], freedom[at], covariance[np.ix_(at, at)] = part.parameters, part.freedom, part.covariance
+            parameters[at], deviation[at], freedom[at] = part.parameters, part.deviation, part.freedom
             sse[rows], held_out_sse[rows] = part.sse[rows], part.held_out_sse[rows]
-        return Fit(parameters, covariance, freedom, sse, held_out_sse)
+        return Fit(parameters, deviation, freedom, sse, held_out_sse)
 
     def _fit_together(self, signatures: Sequence[Signature]) -> Fit:
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
@@ -160,16 +156,20 @@ class WhitenedResidual:
         theta = _solve(gram, right, lowest)
         left = y - X @ theta
 
-        # Sandwich: what is left in a stretch may be correlated in any way.
+        # Sandwich: what is left in a stretch may be correlated in any way. Of many short stretches and few long ones, the wider counts.
         bread = np.linalg.pinv(gram, hermitian=True)
-        edges = np.flatnonzero(np.diff(self.stretch, prepend=-1))
-        scores = np.add.reduceat(rights - grams @ theta, edges, axis=0)
-        information = np.add.reduceat(np.diagonal(grams, axis1=1, axis2=2), edges, axis=0)
-        stretches = len(edges)
-        sandwich = bread @ (scores.T @ scores) @ bread * stretches / max(1, stretches - size)
-        covariance = sandwich + np.diag(np.maximum(0.0, np.diag(bread) - np.diag(sandwich)))
-        total = information.sum(axis=0)
-        effective = np.divide(total**2, (information**2).sum(axis=0), out=np.ones(size), where=total > 0)
+        deviation, freedom = np.sqrt(np.diag(bread)), np.full(size, np.inf)
+        for stretch in (self.stretch, self.stretch // _LONG):
+            edges = np.flatnonzero(np.diff(stretch, prepend=-1))
+            scores = np.add.reduceat(rights - grams @ theta, edges, axis=0)
+            sandwich = ((scores @ bread) ** 2).sum(axis=0) * len(edges) / max(1, len(edges) - size)
+            information = np.add.reduceat(np.diagonal(grams, axis1=1, axis2=2), edges, axis=0)
+            bearing = np.divide(
+                information.sum(axis=0) ** 2, (information**2).sum(axis=0), out=np.ones(size), where=information.any(axis=0)
+            )
+            spread, degrees = np.sqrt(np.maximum(sandwich, np.diag(bread))), np.maximum(bearing - 1, 1.0)
+            wider = student.ppf(0.975, degrees) * spread > student.ppf(0.975, freedom) * deviation
+            deviation, freedom = np.where(wider, spread, deviation), np.where(wider, degrees, freedom)
 
         held_out = np.empty_like(left)
         for fold in range(FOLDS):
@@ -177,7 +177,7 @@ class WhitenedResidual:
             held_out[out] = y[out] - X[out] @ _solve(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest)
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         sse[rows], held_out_sse[rows] = (left**2).sum(axis=0), (held_out**2).sum(axis=0)
-        return Fit(theta / norm, covariance / np.outer(norm, norm), np.maximum(effective - 1, 1.0), sse, held_out_sse)
+        return Fit(theta / norm, deviation / norm, freedom, sse, held_out_sse)
 
 
 def _connected(signatures: Sequence[Signature]) -> list[list[int]]:

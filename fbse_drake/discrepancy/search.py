@@ -27,6 +27,8 @@ _POINTS = 9
 _SYSTEMATIC = 0.25
 # What an effect takes off a row may be wrong by this share; so small a rest is no evidence of another effect.
 _MISFIT = 0.02
+# A size that is this many times the largest plausible one is none.
+_HOPELESS = 1e3
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
 
@@ -317,10 +319,14 @@ class Search:
         return Candidate(effect, group, nonlinear, self.white.whiten_signature(raw), raw)
 
     def smallest_detectable(self, base: Explanation, effect: type[Effect]) -> dict[str, float]:
-        """Size of an effect's first parameter that would have been found beside an explanation, by target.
+        """Size of an effect's first parameter that would have been found beside an explanation, by target; infinite where none would.
 
         The size at which the effect's sum of squares reaches what its parameters must bring and cost.
         """
+        sizes = self._sizes_that_reach(base, effect)
+        return {target: size if size < _HOPELESS * effect.largest_plausible() else np.inf for target, size in sizes.items()}
+
+    def _sizes_that_reach(self, base: Explanation, effect: type[Effect]) -> dict[str, float]:
         _, projection = self.leftover(base)
         scale = self.white.scale(base.sse)
         result = {}

@@ -84,7 +84,7 @@ def study(
         worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
         if not diagnosis.chosen or not worthwhile:
             break
-        scenario = add(scenario, diagnosis_json(diagnosis))
+        scenario = add(scenario, diagnosis.chosen)
         steps.append(StudyStep(tuple(diagnosis.chosen), diagnosis.held_out_after, diagnosis.train_after, rolled()))
     return Study(tuple(steps), tuple(diagnoses), _reason(diagnoses), scenario)
 

@@ -134,7 +134,7 @@ class TorqueSaturation(JointTorqueEffect):
     signature: ClassVar[str] = "Torque only where the command is large, and then all that is beyond."
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
     parameters: ClassVar[dict[str, Parameter]] = {
-        "limit": Parameter("Nm", linear=False, plausible=(2.0, 300.0), neutral=np.inf, grid=25),
+        "limit": Parameter("Nm", linear=False, plausible=(2.0, 300.0), neutral=np.inf, grid=300),
     }
 
     limit: dict[str, float] = field(default_factory=dict)
