@@ -100,6 +100,16 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("seed", [11, 12])
+def test_noise_in_the_regressors_is_not_taken_for_an_effect(seed: int) -> None:
+    """In a squat the feet hardly move: what their accelerations show is noise, and it is in the residual too."""
+    squat = load_scenario("squat", overrides=["duration=4", f"seed={seed}"])
+    squat = replace(squat, model=squat.robot)
+    names = ("BodyCentreOfMass", "BodyMass", "ReflectedInertia", "ThermalDrift")
+    diagnosis = diagnose(Predictor(squat, simulate(squat).log), [library()[name] for name in names])
+    assert diagnosis.verdict == "nothing_missing"
+
+
 def injected(log: Log, effect: Effect) -> Log:
     """The log of a robot whose motors, to move the same way against a further torque, were commanded more."""
     names = Predictor(scenario(), log)

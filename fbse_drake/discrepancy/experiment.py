@@ -138,7 +138,7 @@ class Experiments:
 
 
 def _motions(scenario: Scenario) -> dict[str, Scenario]:
-    """Shipped scenarios with different motions of the same robot, by name."""
+    """Shipped scenarios in which the same robot moves otherwise, by name."""
     found: dict[str, Scenario] = {}
     for path in sorted(resources.folder("scenarios").glob("*.yaml")):
         try:
@@ -146,6 +146,6 @@ def _motions(scenario: Scenario) -> dict[str, Scenario]:
         except InputError:
             continue
         same_robot = other.believed.description == scenario.believed.description
-        if same_robot and all(other.reference != known.reference for known in found.values()):
+        if same_robot and all(other.reference != known.reference for known in (scenario, *found.values())):
             found[path.stem] = other
     return found

@@ -136,7 +136,15 @@ class Predictor:
     @cached_property
     def joint_motion(self) -> JointMotion:
         """What joint torque effects depend on, step by step: (N - 1, n) each."""
-        motion, signals = self.motion, self.motion.signals
+        return self._joint_motion_of(self.motion.signals)
+
+    @cached_property
+    def noisier_joint_motion(self) -> JointMotion:
+        """The same if the sensors' noise were in it once more."""
+        return self._joint_motion_of(self._noisier_signals)
+
+    def _joint_motion_of(self, signals: SensorSignals) -> JointMotion:
+        motion = self.motion
         velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
         time = motion.start + np.arange(len(velocity) - 1) * motion.period
         return JointMotion(
@@ -147,17 +155,20 @@ class Predictor:
             time_step=motion.period,
         )
 
-    def joint_columns(self, effect: type[JointTorqueEffect], nonlinear: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    def joint_columns(
+        self, effect: type[JointTorqueEffect], nonlinear: np.ndarray, joints: np.ndarray, *, noisier: bool = False
+    ) -> np.ndarray:
         """Torque of a joint effect per unit of each linear parameter, averaged over blocks.
 
         Args:
             nonlinear: (m, T), or (m, G, T) for G sets of values, for the joints.
             joints: places of the joints, shape (T,).
+            noisier: with the sensors' noise once more.
 
         Returns:
             Shape (p, B, T), or (p, G, B, T).
         """
-        whole, length = self.joint_motion, self.motion.length
+        whole, length = self.noisier_joint_motion if noisier else self.joint_motion, self.motion.length
         motion = replace(whole, **{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command")})
         if nonlinear.ndim == 2:
             return np.stack([block_means(column, length) for column in basis_over_time(effect, motion, nonlinear)])
@@ -197,6 +208,46 @@ class Predictor:
     def _residual_at_blocks(self) -> np.ndarray:
         return self.motion.equation.residual(self._smooth_blocks)
 
+    @cached_property
+    def _noisier_signals(self) -> SensorSignals:
+        """The signals if the sensors' noise were in them once more."""
+        motion, sensors, random = self.motion, self.motion.sensors, np.random.default_rng(0)
+        noise = {
+            "joint_velocity": joint_velocity_noise(sensors),
+            "specific_force": sensors.imu.acceleration_noise,
+            "angular_velocity": sensors.imu.angular_velocity_noise,
+            "pad_force": sensors.foot_force.noise,
+        }
+        more = {name: getattr(motion.signals, name) for name in noise}
+        added = {name: values + noise[name] * random.standard_normal(values.shape) for name, values in more.items()}
+        return replace(motion.signals, **added)
+
+    @cached_property
+    def _noisier_blocks(self) -> Instants:
+        return averaged(steps(self._noisier_signals, self.motion.period), self.motion.length)
+
+    @cached_property
+    def noise_realization(self) -> np.ndarray:
+        """What that noise adds to the residual, (B, R)."""
+        return self.motion.equation.residual(self._noisier_blocks) - self.motion.equation.residual(self.motion.blocks)
+
+    def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
+        """What that noise adds to the signature of an inertia effect: regressors are measured too."""
+        noisy = _smoothed(self._noisier_blocks)
+        dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+        without = self.motion.equation.residual(noisy, kinematic=False)
+        columns = np.zeros((len(without), self.rows, len(effect.parameters)))
+        for k, name in enumerate(effect.parameters):
+            unit = _probe(effect, name)
+            other = self._equation_with(effect.from_values([target], {name: [unit]})).residual(noisy, kinematic=False)
+            columns[:, :dynamic, k] = (without - other) / unit
+        return replace(clean, values=columns[:, clean.rows] - clean.values)
+
+    def _equation_with(self, effect: Effect) -> EquationOfMotion:
+        """The equation of motion of a model with a further effect."""
+        believed = self.scenario.believed
+        return EquationOfMotion(build_robot(replace(believed, effects={**believed.effects, "_probe": effect})))
+
     def signature_near(
         self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray, elsewhere: Signature
     ) -> Signature:
@@ -226,12 +277,10 @@ class Predictor:
         values = {name: [value] for name, value in (*zip(names, linear, strict=True), *zip(fixed, nonlinear, strict=True))}
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
-            believed = self.scenario.believed
             # By changing the model: what the robot has more than the model stays in the residual with the other sign.
-            robot = build_robot(replace(believed, effects={**believed.effects, "_probe": changed}))
             dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
             result = np.zeros_like(self._residual_at_blocks)
-            other = EquationOfMotion(robot).residual(self._smooth_blocks, kinematic=False)
+            other = self._equation_with(changed).residual(self._smooth_blocks, kinematic=False)
             result[:, :dynamic] = self._residual_at_blocks[:, :dynamic] - other
             return result
         # By taking the effect off the signals.

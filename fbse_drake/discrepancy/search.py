@@ -12,6 +12,7 @@ from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import Fit, Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual import Residual
 from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Probability of any false alarm on a log that hides nothing.
@@ -24,9 +25,11 @@ _COMPLEXITY = 4.0
 _NARROWINGS = 2
 _POINTS = 9
 # Share of the doubt about known laws that an effect could mimic.
-_SYSTEMATIC = 0.25
+_SYSTEMATIC = 0.5
 # What an effect takes off a row may be wrong by this share; so small a rest is no evidence of another effect.
 _MISFIT = 0.02
+# Safety on what the noise in an effect's own columns may feign.
+_SPURIOUS = 3.0
 # A size that is this many times the largest plausible one is none.
 _HOPELESS = 1e3
 # A value may lie beyond the plausible range by this factor.
@@ -45,6 +48,8 @@ class Candidate:
     # Whitened; columns are the linear parameters, then the change of the nonlinear ones. And as it is.
     signature: Signature
     raw: Signature
+    # Drop of the deviance that it brings because the sensors' noise is in its columns and in the residual alike.
+    spurious: float = 0.0
 
     @property
     def name(self) -> str:
@@ -112,14 +117,15 @@ class Search:
         self._joints = predictor.robot.joint_names
         # What does not depend on the noise: columns of grids of nonlinear values, and candidates that are no joint torque effects.
         self._raw_grids: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        self._raw_fixed: list[tuple[type[Effect], str, np.ndarray, Signature]] = []
+        self._raw_fixed: list[tuple[type[Effect], str, np.ndarray, Signature, Signature | None]] = []
         self._weigh(predictor.residual)
 
     def _weigh(self, residual: Residual) -> None:
         self.white = WhitenedResidual(residual)
         self._grids: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
         self._found: dict[tuple[str, tuple[str, ...], bytes], Candidate] = {}
-        self.__dict__.pop("fixed_candidates", None)
+        for name in ("fixed_candidates", "_noise"):
+            self.__dict__.pop(name, None)
 
     def doubting(self, explanation: Explanation) -> Explanation:
         """Weighs the residual anew: friction laws that an explanation takes off make it noisier. Returns the explanation, fitted anew."""
@@ -158,11 +164,25 @@ class Search:
                         raw, lowest=np.array([parameter.bounds[0] for parameter in effect.parameters.values() if parameter.linear])
                     )
                     if len(raw.rows):
-                        self._raw_fixed.append((effect, target, _defaults(effect), raw))
-        return [
-            Candidate(effect, (target,), nonlinear, self.white.whiten_signature(raw), raw)
-            for effect, target, nonlinear, raw in self._raw_fixed
-        ]
+                        noise = self.predictor.noise_in(effect, target, raw) if issubclass(effect, InertiaEffect) else None
+                        self._raw_fixed.append((effect, target, _defaults(effect), raw, noise))
+        result = []
+        for effect, target, nonlinear, raw, noise in self._raw_fixed:
+            signature = self.white.whiten_signature(raw)
+            spurious = 0.0 if noise is None else self._spurious(signature, self.white.whiten_signature(noise))
+            result.append(Candidate(effect, (target,), nonlinear, signature, raw, spurious))
+        return result
+
+    def _spurious(self, signature: Signature, noise: Signature) -> float:
+        both = np.einsum("brp,br->p", noise.values, self._noise[:, signature.rows])
+        power = (signature.values**2).sum(axis=(0, 1))
+        return _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        """A realization of the residual's noise, whitened, (B, R)."""
+        realization = self.predictor.noise_realization
+        return np.stack([self.white.whiten(row, values) for row, values in enumerate(realization.T)], axis=1)
 
     @cached_property
     def threshold(self) -> np.ndarray:
@@ -205,7 +225,7 @@ class Search:
     def is_significant(self, base: Explanation, wider: Explanation, added: Candidate) -> bool:
         """Does the last candidate bring more than chance, with values that can be?"""
         drop = base.deviance - wider.deviance
-        if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows):
+        if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows) + added.spurious:
             return False
         rows = added.signature.rows
         taken, gained = (float(np.maximum(a[rows] - b[rows], 0.0).sum()) for a, b in ((self.white.sse, base.sse), (base.sse, wider.sse)))
@@ -309,14 +329,20 @@ class Search:
         # A weak belief in the plausible range keeps values that the data say nothing about from running away.
         ranges = [np.log(effect.parameters[name].plausible) for name in names]
         belief = [1.0 / (0.25 * (high - low) * value) ** 2 for (low, high), value in zip(ranges, nonlinear, strict=True)]
-        # Nonlinear parameters stay positive.
-        lowest = [effect.parameters[name].bounds[0] for name in effect.parameters if name not in names] + (-0.6 * nonlinear).tolist()
+        # Nonlinear parameters do not fall far below their plausible range.
+        lows = 0.5 * np.array([effect.parameters[name].plausible[0] for name in names])
+        lowest = [effect.parameters[name].bounds[0] for name in effect.parameters if name not in names]
+        lowest += np.maximum(-0.6 * nonlinear, np.minimum(lows - nonlinear, 0.0)).tolist()
         if has_linear:
             values = np.concatenate([columns, slope_columns], axis=2)
             raw = Signature(places, values, prior=np.array([0.0] * columns.shape[2] + belief), lowest=np.array(lowest))
         else:
             raw = Signature(places, slope_columns, offset=columns[:, :, 0], prior=np.array(belief), lowest=np.array(lowest))
-        return Candidate(effect, group, nonlinear, self.white.whiten_signature(raw), raw)
+        noisier = self._columns(effect, places, nonlinear[:, None], noisier=True)[..., 0] - columns
+        signature = self.white.whiten_signature(raw)
+        clean = self.white.whiten_signature(Signature(places, columns))
+        spurious = self._spurious(clean, self.white.whiten_signature(Signature(places, noisier)))
+        return Candidate(effect, group, nonlinear, signature, raw, spurious)
 
     def smallest_detectable(self, base: Explanation, effect: type[Effect]) -> dict[str, float]:
         """Size of an effect's first parameter that would have been found beside an explanation, by target; infinite where none would.
@@ -335,7 +361,7 @@ class Search:
                 s = candidate.signature
                 power = sum((_project(s.values[:, k, :1], projection.get(row)) ** 2).sum() / scale[row] for k, row in enumerate(s.rows))
                 result[candidate.targets[0]] = float(
-                    np.sqrt((self._needed(s.values.shape[2]) + self.systematic(s.rows)) / max(power, 1e-30))
+                    np.sqrt((self._needed(s.values.shape[2]) + self.systematic(s.rows) + candidate.spurious) / max(power, 1e-30))
                 )
             return result
         points, columns = self._grid(effect)
@@ -435,11 +461,11 @@ class Search:
             self._grids[effect.__name__] = points, [self.white.whiten(j, columns[:, j]) for j in range(len(self._joints))]
         return self._grids[effect.__name__]
 
-    def _columns(self, effect: type[JointTorqueEffect], places: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
-        """Columns for G sets of nonlinear values (m, G), shape (B, r, p, G)."""
+    def _columns(self, effect: type[JointTorqueEffect], places: np.ndarray, nonlinear: np.ndarray, *, noisier: bool = False) -> np.ndarray:
+        """Columns for G sets of nonlinear values (m, G), shape (B, r, p, G); see `Predictor.joint_columns`."""
         sets = np.repeat(nonlinear[:, :, None], len(places), axis=2)
         # From (p, G, B, r).
-        return np.transpose(self.predictor.joint_columns(effect, sets, places), (2, 3, 0, 1))
+        return np.transpose(self.predictor.joint_columns(effect, sets, places, noisier=noisier), (2, 3, 0, 1))
 
     def _moments(
         self, columns: np.ndarray, row: int, left: np.ndarray, projection: dict[int, np.ndarray], scale: np.ndarray

@@ -62,18 +62,25 @@ def _variables(search: Search, row: int) -> dict[str, np.ndarray]:
     motion, n = search.predictor.motion, len(search.predictor.robot.joint_names)
     blocks = motion.blocks
     result = {"time": hat_functions(motion.time)}
+
+    def without_own_noise(values: np.ndarray) -> np.ndarray:
+        # The noise of a block is in its residual too: its neighbours beyond the next ones tell what was measured without it.
+        padded = np.concatenate([values[:1]] * 3 + [values] + [values[-1:]] * 3)
+        n = len(values)
+        return 0.25 * (padded[:n] + padded[1 : n + 1] + padded[5 : n + 5] + padded[6 : n + 6])
+
     if row < n:
-        velocity = blocks.joint_velocity[:, row]
+        velocity = without_own_noise(blocks.joint_velocity[:, row])
         result["position"] = hat_functions(blocks.joint_position[:, row])
         # Fine near standstill, coarse elsewhere.
         result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
         result["load"] = hat_functions(blocks.torque_command[:, row])
-        result["acceleration"] = hat_functions(np.arcsinh(blocks.joint_acceleration[:, row]))
+        result["acceleration"] = hat_functions(np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row])))
         others = [j for j in range(n) if j != row]
         result["other joints' torque"] = blocks.torque_command[:, others]
     else:
-        result["angular velocity"] = blocks.angular_velocity
-        result["specific force"] = blocks.specific_force
+        result["angular velocity"] = without_own_noise(blocks.angular_velocity)
+        result["specific force"] = without_own_noise(blocks.specific_force)
     result["phase"] = search.white.residual.standing.astype(float)
     return result
 

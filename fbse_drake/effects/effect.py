@@ -153,6 +153,12 @@ def in_library(effect: T) -> T:
     names = [field.name for field in fields(effect)]
     if names != list(effect.parameters):
         raise InputError(f"effect {effect.__name__}: expected a dataclass with the fields {list(effect.parameters)}, found {names}")
+    for name, parameter in effect.parameters.items():
+        if not parameter.linear and not 0 < parameter.plausible[0] < parameter.plausible[1]:
+            raise InputError(
+                f"effect {effect.__name__}: parameter {name} is not linear, so it is searched in its plausible range: "
+                f"expected 0 < low < high, found {parameter.plausible}"
+            )
     known = _LIBRARY.get(effect.__name__)
     if known is not None and (known.__module__, known.__qualname__) != (effect.__module__, effect.__qualname__):
         raise InputError(f"effect {effect.__name__}: the library has another effect of this name, in {known.__module__}")
