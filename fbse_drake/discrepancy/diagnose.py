@@ -160,26 +160,33 @@ def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[
 def _spread(search: Search, additions: list[Explanation]) -> Explanation:
     """The best addition, with the same effect on all further joints where nothing else explains more.
 
-    Joints that share values get values of their own if that explains more.
+    Joints that share values get values of their own if that explains more; then a simpler effect may do as well.
     """
     best = _simplest(additions)
-    added = best.candidates[-1]
+    added, others = best.candidates[-1], best.candidates[:-1]
     if not issubclass(added.effect, JointTorqueEffect):
         return best
     by_joint: dict[str, list[Explanation]] = {}
     for explanation in additions:
         candidate = explanation.candidates[-1]
-        if len(candidate.targets) == 1:
+        if len(candidate.targets) == 1 and issubclass(candidate.effect, JointTorqueEffect):
             by_joint.setdefault(candidate.targets[0], []).append(explanation)
-    alone = {joint: [e for e in there if e.candidates[-1].effect is added.effect] for joint, there in by_joint.items()}
-    own = [e.candidates[-1] for joint, found in alone.items() if joint in added.targets for e in found]
-    if len(added.targets) > 1 and own:
-        apart = search.explain([*best.candidates[:-1], *own])
-        if apart.deviance < best.deviance - MARGIN:
-            best = apart
-    chosen, taken = [*best.candidates], {target for c in best.candidates if c.effect is added.effect for target in c.targets}
-    for joint, same in alone.items():
-        if joint not in taken and same and same[0].deviance < by_joint[joint][0].deviance + MARGIN:
+
+    def alone(effect: type[Effect], joint: str) -> list[Explanation]:
+        return [e for e in by_joint.get(joint, []) if e.candidates[-1].effect is effect]
+
+    if len(added.targets) > 1:
+        simple = [_simplest(by_joint[joint]).candidates[-1].effect for joint in added.targets if joint in by_joint]
+        options = [best]
+        for effect in dict.fromkeys([added.effect, *simple]):
+            own = [e.candidates[-1] for joint in added.targets for e in alone(effect, joint)]
+            options += [search.explain([*others, *own])] if own else []
+        best = _simplest(sorted(options, key=lambda e: e.deviance))
+    effect = best.candidates[-1].effect
+    chosen, taken = [*best.candidates], {target for c in best.candidates if c.effect is effect for target in c.targets}
+    for joint, there in by_joint.items():
+        same = alone(effect, joint)
+        if joint not in taken and same and same[0].deviance < there[0].deviance + MARGIN:
             chosen.append(same[0].candidates[-1])
     return search.explain(chosen) if len(chosen) > len(best.candidates) else best
 
