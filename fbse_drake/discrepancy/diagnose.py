@@ -16,8 +16,10 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
 EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
-# An effect counts as the explanation of a row if it takes away this share of what exceeds the noise there.
+# An effect counts as the explanation of a row if it takes away this share of what exceeds the noise there, and leaves no more than this
+# many times the noise.
 _EXPLAINED = 0.97
+_LARGEST_REST = 5.0
 # Bodies lighter than this share of the robot are not suspected.
 _LIGHT_BODY = 0.03
 # No explanation has more parts than this.
@@ -273,7 +275,7 @@ def _well_explained(white: WhitenedResidual, final: Explanation, unexplained: Se
     for structure in unexplained:
         row = structure.index
         before, after = white.sse[row] - white.count[row], final.held_out_sse[row] - white.count[row]
-        if after > (1 - _EXPLAINED) * before:
+        if after > (1 - _EXPLAINED) * before or structure.ratio > _LARGEST_REST:
             return False
     return True
 
