@@ -407,7 +407,7 @@ def test_a_log_that_cannot_be_compared_is_one_line_and_status_2(
         (None, "No such file or directory"),
         ("not json", "not a JSON file"),
         ("[1, 2]", "not the contents of a diagnosis.json"),
-        ('{"verdict": "nothing_missing", "ranking": []}', "it has no effect to add"),
+        ('{"verdict": "nothing_missing", "ranking": []}', "the diagnosis has no effect to add"),
     ],
 )
 def test_a_bad_diagnosis_is_one_line_and_status_2(content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture):

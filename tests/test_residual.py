@@ -53,7 +53,9 @@ def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None
     rows = Predictor(scenario, log).residual.row_index
     # Vertical force on the base: the accelerometer's noise is nothing beside that of eight pads.
     assert by_forces[rows["base/force_z"]] > 20
-    assert by_forces[rows["left_sole/angular_velocity_x"]] == pytest.approx(1.0, abs=1e-9)
+    # How a sole tilts is predicted from the forces, how it turns about the vertical is not.
+    assert by_forces[rows["left_sole/angular_velocity_x"]] > 5
+    assert by_forces[rows["left_sole/angular_velocity_z"]] == pytest.approx(1.0, abs=1e-9)
     # Eight pads of 50 N each, averaged over ten samples.
     assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(50 * np.sqrt(8 / 10), rel=0.02)
 
