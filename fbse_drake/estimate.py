@@ -8,6 +8,7 @@ import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import make_estimator
+from fbse_drake.estimators.foot_pads import measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot
@@ -61,13 +62,8 @@ def _inputs(robot: Robot, log: Log) -> dict[str, np.ndarray]:
     inputs = {"measured_joint_state": np.hstack([q, velocity]), "torque_command": log["joint/torque_command"]}
     if "imu/linear_acceleration" in log and "imu/angular_velocity" in log:
         inputs["measured_imu"] = np.hstack([log["imu/linear_acceleration"], log["imu/angular_velocity"]])
-    feet = [f"foot/{side}/pad_force" for side in robot.description.sides]
-    if all(name in log for name in feet):
-        for side, name in zip(robot.description.sides, feet, strict=True):
-            pads = len(robot.description.legs[side].pads)
-            if log[name].shape[1] != pads:
-                raise InputError(f"channel {name}: expected {pads} pads as in the model, found {log[name].shape[1]}")
-        inputs["measured_pad_force"] = np.hstack([log[name].reshape(len(log.time), -1) for name in feet])
+    if any(name.startswith("foot/") for name in log):
+        inputs["measured_pad_force"] = measured_pad_forces(robot, log).reshape(len(log.time), -1)
     for port, name in (("measured_torque", "joint/torque_measured"), ("torque_loss", "truth/joint/friction_torque")):
         if name in log:
             inputs[port] = log[name]

@@ -19,7 +19,7 @@ from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules
-from fbse_drake.errors import InputError, located, require_positive
+from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import load_description
@@ -73,6 +73,39 @@ class FallConfig:
 
 
 @dataclass(frozen=True)
+class RecordingConfig:
+    """How a log is read before its physics is looked at. The defaults are for logs of `fbse simulate`."""
+
+    # The equation of motion is averaged over blocks of this length [s].
+    block: float = 0.010
+    # What a row of the log holds: `per_step` (IMU and forces over the step that ends there, the torque of the step that begins there), or
+    # `instantaneous` (all channels sampled together).
+    rows: str = "per_step"
+    # Joint velocities: `measured`, or `differenced` from the angles, as they are in any case where the log has none.
+    velocity: str = "measured"
+    # All channels go through a low-pass without delay (Butterworth of order 4, forwards and backwards) with this corner [Hz]; 0 for none.
+    cutoff: float = 0.0
+    # White noise of the torque of each joint, standard deviation of a sample [Nm].
+    torque_noise: dict[str, float] = field(default_factory=dict)
+    # Models are fitted to this first share of the log and tested on the rest.
+    train_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, "block")
+        require_not_negative(self, "cutoff")
+        for key, allowed in (("rows", ("per_step", "instantaneous")), ("velocity", ("measured", "differenced"))):
+            if getattr(self, key) not in allowed:
+                raise InputError(f"{key}: expected {' or '.join(allowed)}, found {getattr(self, key)}")
+        if self.cutoff > 0 and self.block * self.cutoff < 0.5:
+            raise InputError(f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found {self.block:g} s")
+        if not 0 < self.train_share <= 1:
+            raise InputError(f"train_share: expected a number in (0, 1], found {self.train_share:g}")
+        for joint, value in self.torque_noise.items():
+            if value < 0:
+                raise InputError(f"torque_noise.{joint}: expected a number >= 0, found {value:g}")
+
+
+@dataclass(frozen=True)
 class LogConfig:
     """What is recorded."""
 
@@ -115,6 +148,7 @@ class Scenario:
     compensation: CompensationConfig = field(default_factory=NoCompensation)
     fall: FallConfig = field(default_factory=FallConfig)
     log: LogConfig = field(default_factory=LogConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
 
     def __post_init__(self) -> None:
         require_positive(self, "duration")
@@ -233,7 +267,10 @@ def check_joints(scenario: Scenario) -> None:
                 value.resolve(names, key=f"effects.{effect}")
     names, _ = load_description(scenario.robot.description)
     for key in ("kp", "kd", "torque_limit"):
-        names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
+        # The default gains are those of the paper's legs; a recording of another robot needs none.
+        if getattr(scenario.control, key) != getattr(PositionLoopConfig(), key):
+            names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
+    names.per_joint(scenario.recording.torque_noise, key="recording.torque_noise", default=0.0)
     if isinstance(scenario.compensation, IntegralCompensation):
         names.per_joint(scenario.compensation.gain, key="compensation.gain")
     if isinstance(scenario.estimator, FixedFriction):

@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog
 
+from fbse_drake.estimators.foot_pads import FootPads
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
@@ -149,8 +150,7 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "joint/position": raw["measured_joint_state"][:, :n],
         "joint/velocity": raw["measured_joint_state"][:, n:],
         "joint/torque_command": raw["torque_command"],
-        "imu/linear_acceleration": raw["measured_imu"][:, :3],
-        "imu/angular_velocity": raw["measured_imu"][:, 3:],
+        **_imu_channels(robot, raw["measured_imu"]),
         **_split_pads(robot, raw["measured_pad_force"], ""),
         **_reference_channels(station, time),
         **({"joint/torque_measured": raw["measured_torque"]} if "measured_torque" in raw else {}),
@@ -180,9 +180,14 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 
 
+def _imu_channels(robot: Robot, readings: np.ndarray) -> dict[str, np.ndarray]:
+    if not robot.description.imu:
+        return {}
+    return {"imu/linear_acceleration": readings[:, :3], "imu/angular_velocity": readings[:, 3:]}
+
+
 def _split_pads(robot: Robot, pad_force: np.ndarray, prefix: str) -> dict[str, np.ndarray]:
-    counts = np.cumsum([len(leg.pads) for leg in robot.description.legs.values()])[:-1]
-    parts = np.split(pad_force.reshape(len(pad_force), -1, 3), counts, axis=1)
+    parts = FootPads(robot).split(pad_force.reshape(len(pad_force), -1, 3))
     return {f"{prefix}foot/{side}/pad_force": part for side, part in zip(robot.description.sides, parts, strict=True)}
 
 
@@ -247,5 +252,6 @@ def _truth_channels(robot: Robot, state: np.ndarray, acceleration: np.ndarray, p
             pad_force_W[k, rows] = pad_force_F[k, rows] @ R_FW
             pad_position_W[k, rows] = X_WF.translation() + pads[side] @ R_FW
             row = rows.stop
-    truth["zmp"] = zero_moment_point(pad_force_W, pad_position_W)
+    if soles:
+        truth["zmp"] = zero_moment_point(pad_force_W, pad_position_W)
     return {f"truth/{name}": values for name, values in truth.items()}

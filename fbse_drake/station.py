@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import Demultiplexer, MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, MatrixGain
 
 from fbse_drake.control.compensation import FrictionCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoop
@@ -98,12 +98,17 @@ class Station(Diagram):
         imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, *draw))
         for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
             builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
-        foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, time_step, *draw))
-        builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
+        if names.legs:
+            foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, time_step, *draw))
+            builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
+            pad_force = {name: foot_force.GetOutputPort(name) for name in ("measured_pad_force", "true_pad_force")}
+        else:
+            no_force = builder.AddNamedSystem("no_foot_force", ConstantVectorSource(np.zeros(0)))
+            pad_force = dict.fromkeys(("measured_pad_force", "true_pad_force"), no_force.get_output_port())
         available = {
             "measured_joint_state": encoders.get_output_port(),
             "measured_imu": imu.get_output_port(),
-            "measured_pad_force": foot_force.GetOutputPort("measured_pad_force"),
+            "measured_pad_force": pad_force["measured_pad_force"],
         }
         distorting = [
             effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items() if isinstance(effect, SensorEffect)
@@ -165,7 +170,7 @@ class Station(Diagram):
         builder.ExportOutput(source.GetOutputPort("feedforward_torque"), "feedforward_torque")
         builder.ExportOutput(plant.get_state_output_port(), "plant_state")
         builder.ExportOutput(plant.get_generalized_acceleration_output_port(), "generalized_acceleration")
-        builder.ExportOutput(foot_force.GetOutputPort("true_pad_force"), "true_pad_force")
+        builder.ExportOutput(pad_force["true_pad_force"], "true_pad_force")
         builder.ExportOutput(effects.get_output_port(), "torque_loss")
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(publish_period=1 / 32)
@@ -190,7 +195,7 @@ def _set_initial_state(robot: Robot, reference: Reference, ground: Ground) -> No
     plant = robot.plant
     context = plant.CreateDefaultContext()
     if robot.has_floating_base:
-        pads = sum(len(leg.pads) for leg in robot.description.legs.values())
+        pads = sum(leg.points for leg in robot.description.legs.values())
         weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
         penetration = weight / (pads * ground.stiffness)
         p_WB = reference.base.position[0] - [0.0, 0.0, penetration]

@@ -120,7 +120,8 @@ def test_refusals(run: Run):
     log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 5))
     for scenario_, bad, message in (
         (WALK, without(log, "imu/"), "imu/linear_acceleration"),
-        (WALK, without(log, "foot/left/pad_force"), "foot/<side>/pad_force"),
+        (WALK, without(log, "foot/left/pad_force"), "no channel foot/left/pad_force, nor foot/left/wrench"),
+        (WALK, without(log, "foot/"), "foot/<side>/pad_force"),
         (dataclasses.replace(WALK, estimator=NoEstimator()), log, "the scenario has none"),
         (WALK, dataclasses.replace(log, meta={**log.meta, "joints": log.joints[::-1]}), "the log's joints"),
         (WALK, cut(log, slice(0, 5), **{"foot/left/pad_force": log["foot/left/pad_force"][:, :3]}), "expected 4 pads"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from fbse_drake import resources
 from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import BLOCK, EquationOfMotion, Instants
+from fbse_drake.discrepancy.residual import EquationOfMotion, Instants
 from fbse_drake.discrepancy.search import MARGIN, Search
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError, located
@@ -16,6 +16,9 @@ from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, load_scenario
 from fbse_drake.walking.reference import make_reference
+
+# A planned motion is evaluated at this period and interpolated [s].
+_PERIOD = 0.010
 
 
 def planned_log(scenario: Scenario) -> Log:
@@ -27,7 +30,7 @@ def planned_log(scenario: Scenario) -> Log:
         InputError: a motion that the model cannot make.
     """
     robot, period = build_robot(scenario.believed), scenario.log.period
-    coarse = np.arange(int(scenario.duration / BLOCK) + 1) * BLOCK
+    coarse = np.arange(int(scenario.duration / _PERIOD) + 1) * _PERIOD
     with located("reference: "):
         reference = make_reference(scenario.reference, robot, coarse)
     n = len(robot.joint_names)

@@ -288,8 +288,7 @@ def _targets(random: np.random.Generator, effect: type[Effect], robot: Robot, ta
         return (joint,)
     if _recipe(effect).everywhere and chance < 0.75:
         return tuple(robot.joint_names)
-    role = robot.joint_names.index(joint) % len(names.leg_joints)
-    return tuple(leg.joints[role] for leg in names.legs.values())
+    return names.counterparts(joint)
 
 
 def make_exercise(

@@ -18,7 +18,6 @@ from fbse_drake.discrepancy.residual import (
     joint_velocity_noise,
     residual_rows,
     rms,
-    steps,
 )
 from fbse_drake.effects.contact import ContactEffect, FootCreep, GroundCompliance, PadContact, pad_contact, spring_force
 from fbse_drake.effects.effect import Effect, ResolvedEffect
@@ -53,7 +52,7 @@ class Predictor:
             self.robot = build_robot(scenario.believed)
         names = self.robot.description
         self._known = [effect.resolve(names, key=f"model.effects.{key}") for key, effect in scenario.believed.effects.items()]
-        self.motion = RecordedMotion(self.robot, scenario.sensors, log)
+        self.motion = RecordedMotion(self.robot, scenario.sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
                 memory = known.effect.memory_over_time(self.motion.signals, known, self.motion.period)
@@ -68,12 +67,13 @@ class Predictor:
     @cached_property
     def residual(self) -> Residual:
         """What the model, with its effects, leaves over."""
-        predicted = self.ground_gives_way()
+        residual = self.motion.residual
         for known in self._known:
-            predicted = predicted + self.predict(known)
-        residual = self.motion.residual.minus(predicted)
-        of_ground = self.sinking_variance / self._contact.stiffness**2
-        return self.doubted(replace(residual, variance=residual.variance + of_ground), self._known)
+            residual = residual.minus(self.predict(known))
+        if self.robot.has_floating_base:
+            residual = residual.minus(self.ground_gives_way())
+            residual = replace(residual, variance=residual.variance + self.sinking_variance / self._contact.stiffness**2)
+        return self.doubted(residual, self._known)
 
     def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
         """A residual that is less certain because effects were taken off it.
@@ -83,9 +83,10 @@ class Predictor:
         effects = list(effects)
         doubt = np.zeros_like(residual.variance)
         doubt[:, : len(self.robot.joint_names)] = self.law_variance(e for e in effects if isinstance(e, ResolvedJointTorque))
-        nominal = 1.0 / self._contact.stiffness
-        total = nominal + sum(float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance)
-        doubt += (total**2 - nominal**2) * self.sinking_variance
+        softer = sum(float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance)
+        if softer:
+            nominal = 1.0 / self._contact.stiffness
+            doubt += ((nominal + softer) ** 2 - nominal**2) * self.sinking_variance
         return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
 
     @cached_property
@@ -95,8 +96,6 @@ class Predictor:
         Of a noise that is added to the measured forces once more.
         """
         force = self.motion.signals.pad_force
-        if not self.robot.has_floating_base:
-            return np.zeros(self.rows)
         noise = self.motion.sensors.foot_force.noise * np.random.default_rng(0).standard_normal(force.shape)
         motions = [
             [GroundCompliance.sole_motion(f, pads, self._sample_time) for f, pads in self._split_feet(forces)]
@@ -147,10 +146,12 @@ class Predictor:
         motion = self.motion
         velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
         time = motion.start + np.arange(len(velocity) - 1) * motion.period
+        at = motion.steps_of(replace(signals, joint_velocity=velocity))
         return JointMotion(
-            velocity=velocity[1:],
-            position=signals.joint_position[:-1],
-            command=signals.torque_command[:-1],
+            # A simulated step's law holds at the velocity of its end.
+            velocity=velocity[1:] if motion.recording.rows == "per_step" else at.joint_velocity,
+            position=at.joint_position,
+            command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
         )
@@ -224,7 +225,7 @@ class Predictor:
 
     @cached_property
     def _noisier_blocks(self) -> Instants:
-        return averaged(steps(self._noisier_signals, self.motion.period), self.motion.length)
+        return averaged(self.motion.steps_of(self._noisier_signals), self.motion.length)
 
     @cached_property
     def noise_realization(self) -> np.ndarray:
@@ -286,7 +287,7 @@ class Predictor:
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self._undone(resolved, self._memory(effect, resolved))
-        blocks = averaged(steps(signals, motion.period), motion.length)
+        blocks = averaged(motion.steps_of(signals), motion.length)
         return self._residual_at_blocks - motion.equation.residual(_smoothed(blocks))
 
     def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
@@ -325,7 +326,7 @@ class Predictor:
         pads = self.motion.equation.pads
         force = savgol_filter(pad_force, _SMOOTHING, 2, axis=0)
         force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
-        return [(force[:, pads.foot == foot], pads.position[pads.foot == foot]) for foot in range(pads.foot.max() + 1)]
+        return list(zip(pads.split(force), pads.split(pads.position), strict=True))
 
     def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Kinematic rows for soles that move like this.

@@ -12,24 +12,24 @@ noise whose covariance is known: white noise (accelerometer, forces) stays white
 average of order one, so that each row's covariance is tridiagonal.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.foot_pads import FootPads
+from fbse_drake.estimators.foot_pads import FootPads, measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot, grasp_map
-from fbse_drake.scenario import SensorsConfig
+from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
-# Length of a block [s].
-BLOCK = 0.010
+# Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
+_ORDER, _PADDING = 4, 100
 # A sole stands still while it carries more than this share of the weight, and each of its pads this one.
 _STANDING = 0.15
 _STANDING_PAD = 0.01
@@ -51,7 +51,7 @@ class Row:
 
 def residual_rows(robot: Robot) -> list[Row]:
     """The residual's rows for a robot, in order."""
-    rows = [Row(name, "joint", "Nm") for name in robot.joint_names]
+    rows = [Row(name, "joint", unit) for name, unit in zip(robot.joint_names, robot.torque_units, strict=True)]
     if not robot.has_floating_base:
         return rows
     rows += [Row(f"base/{kind}_{axis}", "base", unit) for kind, unit in (("moment", "Nm"), ("force", "N")) for axis in _AXES]
@@ -63,7 +63,7 @@ def residual_rows(robot: Robot) -> list[Row]:
     return rows
 
 
-def read_signals(robot: Robot, log: Log) -> tuple[SensorSignals, np.ndarray]:
+def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
     Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced.
@@ -83,40 +83,61 @@ def read_signals(robot: Robot, log: Log) -> tuple[SensorSignals, np.ndarray]:
     known = np.ones(len(grid), dtype=bool)
     if not even:
         known = (time[after] - time[after - 1] < 1.5 * period) | (time[after] - grid < 1e-3 * period)
+    stretches = _stretches(known)
+
+    def low_passed(values: np.ndarray) -> np.ndarray:
+        if recording.cutoff == 0:
+            return values
+        result = values.copy()
+        filter_ = butter(_ORDER, recording.cutoff, fs=1 / period, output="sos")
+        for stretch in stretches:
+            result[stretch] = sosfiltfilt(filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING))
+        return result
 
     def on_grid(values: np.ndarray) -> np.ndarray:
         if even:
-            return values
+            return low_passed(values)
         share = ((grid - time[after - 1]) / (time[after] - time[after - 1])).clip(0.0, 1.0)
         share = share.reshape(-1, *[1] * (values.ndim - 1))
-        return (1 - share) * values[after - 1] + share * values[after]
+        return low_passed((1 - share) * values[after - 1] + share * values[after])
 
     def held(values: np.ndarray) -> np.ndarray:
-        return values if even else values[np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)]
+        return low_passed(values if even else values[np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)])
 
-    needed = ["imu/linear_acceleration", "imu/angular_velocity"] + [f"foot/{side}/pad_force" for side in robot.description.sides]
+    def rate(values: np.ndarray) -> np.ndarray:
+        result = np.zeros_like(values)
+        for stretch in stretches:
+            if len(values[stretch]) > 1:
+                result[stretch] = np.gradient(values[stretch], period, axis=0)
+        return result
+
+    zeros = np.zeros((len(grid), 3))
+    specific_force = angular_velocity = zeros
+    pad_force = np.zeros((len(grid), len(FootPads(robot).foot), 3))
     if robot.has_floating_base:
-        for name in needed:
+        for name in ("imu/linear_acceleration", "imu/angular_velocity"):
             if name not in log:
                 raise InputError(f"the log has no channel {name}, which the residual of a floating robot needs")
+        specific_force, angular_velocity = on_grid(log["imu/linear_acceleration"]), on_grid(log["imu/angular_velocity"])
+        pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
-    velocity = on_grid(log["joint/velocity"]) if "joint/velocity" in log else np.gradient(q, period, axis=0)
-    zeros = np.zeros((len(grid), 3))
-    pads = len(FootPads(robot).foot)
-    feet = [on_grid(log[name]) for name in needed[2:] if name in log]
-    for side, force in zip(robot.description.sides, feet, strict=False):
-        expected = len(robot.description.legs[side].pads)
-        if force.shape[1] != expected:
-            raise InputError(f"channel foot/{side}/pad_force: expected {expected} pads as in the model, found {force.shape[1]}")
+    measured = "joint/velocity" in log and recording.velocity == "measured"
+    torque = log["joint/torque_command"]
     signals = SensorSignals(
         joint_position=q,
-        joint_velocity=velocity,
-        specific_force=on_grid(log[needed[0]]) if needed[0] in log else zeros,
-        angular_velocity=on_grid(log[needed[1]]) if needed[1] in log else zeros,
-        pad_force=np.concatenate(feet, axis=1) if len(feet) == len(needed) - 2 and feet else np.zeros((len(grid), pads, 3)),
-        torque_command=held(log["joint/torque_command"]),
+        joint_velocity=on_grid(log["joint/velocity"]) if measured else rate(q),
+        specific_force=specific_force,
+        angular_velocity=angular_velocity,
+        pad_force=pad_force,
+        torque_command=on_grid(torque) if recording.rows == "instantaneous" else held(torque),
     )
     return signals, known
+
+
+def _stretches(known: np.ndarray) -> list[slice]:
+    """Runs of samples between gaps."""
+    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
+    return [slice(start, stop) for start, stop in edges.reshape(-1, 2)]
 
 
 @dataclass(frozen=True)
@@ -134,8 +155,19 @@ class Instants:
     torque_command: np.ndarray
 
 
-def steps(signals: SensorSignals, period: float) -> Instants:
-    """Every step between two samples: posture, velocity and command where it began, accelerations and forces over it; M = N - 1."""
+def steps(signals: SensorSignals, period: float, rows: str = "per_step") -> Instants:
+    """Every step between two samples, M = N - 1, see `RecordingConfig.rows`.
+
+    Of samples per step posture, velocity and command count where the step began, accelerations and forces over it; of instantaneous ones
+    all in its middle.
+    """
+    if rows == "instantaneous":
+        middle = {name: 0.5 * (values[1:] + values[:-1]) for name, values in vars(signals).items()}
+        return Instants(
+            joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
+            angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
+            **middle,
+        )
     return Instants(
         joint_position=signals.joint_position[:-1],
         joint_velocity=signals.joint_velocity[:-1],
@@ -195,14 +227,16 @@ class EquationOfMotion:
 
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
-        parts = [pad_force[:, self.pads.foot == foot].reshape(len(pad_force), -1) for foot in range(len(self._grasp))]
-        return [part @ G.T for part, G in zip(parts, self._grasp, strict=True)]
+        parts = self.pads.split(pad_force)
+        return [part.reshape(len(part), -1) @ G.T for part, G in zip(parts, self._grasp, strict=True)]
 
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
-        normal = pad_force[:, :, 2]
-        feet = [normal[:, self.pads.foot == foot] for foot in range(len(self._grasp))]
-        return np.stack([(f.sum(axis=1) > _STANDING * self.weight) & (f.min(axis=1) > _STANDING_PAD * self.weight) for f in feet], axis=1)
+        result = np.zeros((len(pad_force), len(self._grasp)), dtype=bool)
+        for foot, force in enumerate(self.pads.split(pad_force)):
+            normal = force[:, :, 2]
+            result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (normal.min(axis=1) > _STANDING_PAD * self.weight)
+        return result
 
     def residual(self, at: Instants, *, kinematic: bool = True) -> np.ndarray:
         """All rows, shape (M, rows); kinematic ones have their value whether or not a sole stands.
@@ -359,20 +393,21 @@ def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 class RecordedMotion:
     """A log seen by a model: makes residuals, and finds how they change with the signals or the model."""
 
-    def __init__(self, robot: Robot, sensors: SensorsConfig, log: Log):
+    def __init__(self, robot: Robot, sensors: SensorsConfig, recording: RecordingConfig, log: Log):
         """Reads the log.
 
         Args:
             robot: the model.
             sensors: whose noise is believed.
+            recording: how the log is read.
 
         Raises:
             InputError: a log that does not fit the model, or one that is too short.
         """
-        self.robot, self.sensors, self.log = robot, sensors, log
+        self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
         self.period = float(log.meta["period"])
-        self.signals, self.measured = read_signals(robot, log)
-        self.length = max(1, round(BLOCK / self.period))
+        self.signals, self.measured = read_signals(robot, log, recording)
+        self.length = max(1, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed")
         self.start = float(log.time[0])
@@ -380,7 +415,11 @@ class RecordedMotion:
 
     @cached_property
     def steps(self) -> Instants:
-        return steps(self.signals, self.period)
+        return self.steps_of(self.signals)
+
+    def steps_of(self, signals: SensorSignals) -> Instants:
+        """Steps of other signals on the same grid."""
+        return steps(signals, self.period, self.recording.rows)
 
     @cached_property
     def blocks(self) -> Instants:
@@ -415,13 +454,11 @@ class RecordedMotion:
         """The residual of the model's rigid bodies; what its effects explain is not taken off."""
         value = block_means(self.equation.residual(self.steps), self.length)
         white, differenced = self.equation.noise(self.blocks, self.sensors)
+        names = self.robot.description
+        torque_noise = names.per_joint(self.recording.torque_noise, key="recording.torque_noise", default=0.0)
+        white[:, : len(torque_noise)] += torque_noise**2
         duration = self.length * self.period
         variance = white / self.length + 2 * differenced / duration**2
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
         covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
         return Residual(residual_rows(self.robot), self.time, value, self.known, variance, covariance, self.standing, self.blocks)
-
-
-def rows_of(residual: Residual, kinds: Sequence[str]) -> np.ndarray:
-    """Places of the rows of these kinds."""
-    return np.array([k for k, row in enumerate(residual.rows) if row.kind in kinds], dtype=int)

@@ -144,9 +144,8 @@ class Search:
     @cached_property
     def groups(self) -> list[tuple[str, ...]]:
         """Joints that may share values: each alone, the same joint of every leg, all."""
-        names = self.predictor.robot.description
-        roles = [tuple(leg.joints[k] for leg in names.legs.values()) for k in range(len(names.leg_joints))]
-        wider = [group for group in (*roles, tuple(self._joints)) if len(group) > 1]
+        description = self.predictor.robot.description
+        wider = [group for group in (*map(description.counterparts, self._joints), tuple(self._joints)) if len(group) > 1]
         return [*((joint,) for joint in self._joints), *dict.fromkeys(wider)]
 
     @cached_property

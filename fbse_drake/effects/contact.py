@@ -78,11 +78,13 @@ def contact_with_effects(
 
 
 def _pad_properties(description: str) -> ProximityProperties:
-    """Contact properties of a robot's pads."""
+    """Contact properties of a robot's pads; those of corners are the ground's."""
     robot, scene_graph = make_robot(description)
     pads = [pad for leg in robot.description.legs.values() for pad in leg.pads]
+    if not robot.description.legs:
+        raise InputError(f"{description}: contact effects need a robot with feet")
     if not pads:
-        raise InputError(f"{description}: contact effects need a robot with pads under its feet")
+        return ProximityProperties()
     pad = robot.plant.GetJointByName(pads[0]).child_body()
     (geometry,) = robot.plant.GetCollisionGeometriesForBody(pad)
     return scene_graph.model_inspector().GetProximityProperties(geometry)
@@ -90,8 +92,10 @@ def _pad_properties(description: str) -> ProximityProperties:
 
 def _friction(description: str, ground: Ground) -> float:
     """Friction coefficient between pads and ground as Drake combines it."""
-    of_pad = _pad_properties(description).GetProperty("material", "coulomb_friction")
-    return CalcContactFrictionFromSurfaceProperties(of_pad, CoulombFriction(ground.friction, ground.friction)).dynamic_friction()
+    of_ground = CoulombFriction(ground.friction, ground.friction)
+    properties = _pad_properties(description)
+    of_pad = properties.GetProperty("material", "coulomb_friction") if properties.HasProperty("material", "coulomb_friction") else of_ground
+    return CalcContactFrictionFromSurfaceProperties(of_pad, of_ground).dynamic_friction()
 
 
 def _still(samples: int) -> np.ndarray:

@@ -92,7 +92,7 @@ class SensorEffect(Effect):
 
 def _pads_of(values: np.ndarray, robot: Robot) -> np.ndarray:
     """Values for each pad from those for each foot, (..., feet) -> (..., P)."""
-    return np.repeat(values, [len(leg.pads) for leg in robot.description.legs.values()], axis=-1)
+    return np.repeat(values, [leg.points for leg in robot.description.legs.values()], axis=-1)
 
 
 @in_library

@@ -35,7 +35,7 @@ class SensorMonitorConfig:
 
 def measurement_fields(robot: Robot) -> dict[str, int]:
     """Fields of the checked measurements; `trust` has a status each for joints, IMU and every foot."""
-    n, pads = len(robot.joint_names), sum(len(leg.pads) for leg in robot.description.legs.values())
+    n, pads = len(robot.joint_names), sum(leg.points for leg in robot.description.legs.values())
     return {
         "trust": 2 + len(robot.description.sides),
         "joint_position": n,

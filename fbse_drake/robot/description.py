@@ -1,7 +1,9 @@
 """What the project must know of a robot beyond its model file: names of its base, legs, feet and sensors."""
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,35 +21,80 @@ class Leg:
     foot: str
     # Frame: z up, origin on the ground when the foot is flat.
     sole: str
-    # Fixed joints that hold the foot's pads: 3-axis force sensors, parallel to the sole frame.
-    pads: list[str]
+    # A foot with 3-axis force sensors: the fixed joints that hold its pads, parallel to the sole frame.
+    pads: list[str] = field(default_factory=list)
+    # A foot with a six-axis sensor instead: where it meets the ground, points in the sole frame [m].
+    corners: list[list[float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if bool(self.pads) == bool(self.corners):
+            raise InputError("expected either pads (3-axis force sensors) or corners (of a foot with a six-axis sensor)")
+        for point in self.corners:
+            if len(point) != 3:
+                raise InputError(f"corners: expected points of three coordinates, found {point}")
+        if self.corners and np.linalg.matrix_rank(np.diff(self.corners, axis=0), tol=1e-4) < 2:
+            raise InputError("corners: expected at least three points that are not in one line")
+
+    @property
+    def points(self) -> int:
+        """At how many places the ground's force is known."""
+        return len(self.pads) or len(self.corners)
 
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """Names of a legged robot's parts in its model; read from YAML by `load_description`."""
+    """Names of a robot's parts in its model; read from YAML by `load_description`.
 
-    # Drake model directives, relative to the description's file.
-    directives: str
+    A robot has legs, further joints, or both. Joints of the model that are not named are held where `held` says.
+    """
+
+    # Root of the robot: floats unless `fixed_base` is true or a scenario hangs it in a gantry.
     base: str
-    imu: str
+    # The model: Drake model directives, or a URDF whose shapes are not needed. Relative to the description's file; may begin with
+    # an environment variable, as ${FBSE_DATA_DIR}/ur10/ur10_robot.urdf.
+    directives: str = ""
+    urdf: str = ""
+    fixed_base: bool = False
+    # Frame in whose axes the IMU measures; by default that of the base.
+    imu: str = ""
     # What the joints of every leg are called in a scenario, from hip to foot.
-    leg_joints: list[str]
-    legs: dict[str, Leg]
+    leg_joints: list[str] = field(default_factory=list)
+    legs: dict[str, Leg] = field(default_factory=dict)
+    # Further joints: of arms, of a torso, of a machine that has no legs.
+    joints: list[str] = field(default_factory=list)
+    # Angles [rad] (or places [m]) of joints that are not named above; 0 by default.
+    held: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if bool(self.directives) == bool(self.urdf):
+            raise InputError("expected either directives or urdf")
         for side, leg in self.legs.items():
             if len(leg.joints) != len(self.leg_joints):
                 raise InputError(f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}")
+        twice = [name for name, count in Counter(self.joint_names).items() if count > 1]
+        if twice:
+            raise InputError(f"joints: {twice[0]} is named twice")
+        if not self.joint_names:
+            raise InputError("expected legs, joints or both, found neither")
 
-    @property
+    @cached_property
     def joint_names(self) -> list[str]:
-        """Model names of all joints, in the order of every joint vector and log column."""
-        return [name for leg in self.legs.values() for name in leg.joints]
+        """Model names of all joints, in the order of every joint vector and log column: leg by leg, then the further ones."""
+        return [*(name for leg in self.legs.values() for name in leg.joints), *self.joints]
+
+    @cached_property
+    def roles(self) -> list[str]:
+        """What each joint is called in a scenario beside its name: a joint of a leg as in `leg_joints`."""
+        return [*(role for _ in self.legs for role in self.leg_joints), *self.joints]
 
     @property
     def sides(self) -> list[str]:
         return list(self.legs)
+
+    def counterparts(self, joint: str) -> tuple[str, ...]:
+        """The same joint of every leg; a further joint has itself alone."""
+        role = self.roles[self.joint_names.index(joint)]
+        return tuple(name for name, other in zip(self.joint_names, self.roles, strict=True) if other == role)
 
     def per_joint(self, values: Mapping[str, float], *, key: str, default: float | None = None) -> np.ndarray:
         """A value for each joint, shape (n,), from `{all: ..., <leg joint>: ..., <joint>: ...}`; the more special key wins.
@@ -55,17 +102,17 @@ class RobotDescription:
         Raises:
             InputError: unknown joint, or (without a default) a joint that has no value.
         """
-        allowed = ["all", *self.leg_joints, *self.joint_names]
+        allowed = dict.fromkeys(["all", *self.leg_joints, *self.joint_names])
         for name in values:
             if name not in allowed:
                 raise InputError(f"{key}.{name}: unknown joint (allowed: {', '.join(allowed)})")
         result = []
-        for leg in self.legs.values():
-            for role, joint in zip(self.leg_joints, leg.joints, strict=True):
-                value = values.get(joint, values.get(role, values.get("all", default)))
-                if value is None:
-                    raise InputError(f"{key}: no value for {joint} (give {joint}, {role} or all)")
-                result.append(value)
+        for joint, role in zip(self.joint_names, self.roles, strict=True):
+            value = values.get(joint, values.get(role, values.get("all", default)))
+            if value is None:
+                keys = " or ".join(", ".join(dict.fromkeys([joint, role, "all"])).rsplit(", ", 1))
+                raise InputError(f"{key}: no value for {joint} (give {keys})")
+            result.append(value)
         return np.array(result, dtype=float)
 
 

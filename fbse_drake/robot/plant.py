@@ -4,18 +4,21 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
+from os.path import expandvars
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import Frame, Joint, PrismaticJoint, RevoluteJoint, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.robot.description import RobotDescription, load_description
 
 # Between a body's name and the number in the names of the bodies that carry its point masses.
@@ -74,7 +77,12 @@ class Robot:
 
     @cached_property
     def imu(self) -> Frame:
-        return self.plant.GetFrameByName(self.description.imu)
+        return self.plant.GetFrameByName(self.description.imu or self.description.base)
+
+    @cached_property
+    def torque_units(self) -> list[str]:
+        """Unit of each joint's torque, or of the force of a prismatic joint."""
+        return ["N" if self.plant.GetJointByName(name).type_name() == PrismaticJoint.kTypeName else "Nm" for name in self.joint_names]
 
     @cached_property
     def body_names(self) -> list[str]:
@@ -92,8 +100,10 @@ class Robot:
         return self.plant.GetFrameByName(self.description.legs[side].sole)
 
     def pad_positions(self, side: str) -> np.ndarray:
-        """Places of the foot's force sensors in the sole frame F, shape (pads, 3) [m]."""
-        return np.array([X_FP.translation() for X_FP in self._pad_poses(side)])
+        """Places in the sole frame F where the ground's force is known: the foot's force sensors, or the corners of a foot with a
+        six-axis sensor, shape (points, 3) [m]."""
+        leg = self.description.legs[side]
+        return np.array(leg.corners or [X_FP.translation() for X_FP in self._pad_poses(side)])
 
     def _pad_poses(self, side: str) -> list[RigidTransform]:
         context = self.plant.CreateDefaultContext()
@@ -210,21 +220,16 @@ def make_robot(
     """
     names, path = load_description(description)
     plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), builder or DiagramBuilder())
-    parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
-    try:
-        ProcessModelDirectives(LoadModelDirectives(str(path.parent / names.directives)), parser)
-    except RuntimeError as error:
-        raise InputError(f"{path}: directives: {str(error).splitlines()[0]}") from None
-    _check_names(plant, names, path)
-
+    with located(f"{path}: "):
+        _add_model(plant, names, path)
+        _check_names(plant, names)
+        _hold_other_joints(plant, names)
     inertia = names.per_joint(rotor_inertia or {}, key="rotor_inertia", default=0.0)
-    actuators = {plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()}
-    for joint, value in zip(names.joint_names, inertia, strict=True):
-        actuators[joint].set_default_rotor_inertia(value)
-        actuators[joint].set_default_gear_ratio(1.0)
+    _add_actuators(plant, dict(zip(names.joint_names, inertia, strict=True)))
     _add_point_masses(plant, names, point_masses)
-    if gantry_height is not None:
+    if gantry_height is None and names.fixed_base:
+        gantry_height = 0.0
+    if gantry_height is not None and not _is_carried(plant, names.base):
         plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(names.base), RigidTransform([0, 0, gantry_height]))
     if ground is not None:
         _add_ground(plant, ground)
@@ -240,21 +245,99 @@ def make_robot(
     return robot, scene_graph
 
 
-def _check_names(plant: MultibodyPlant, names: RobotDescription, path: Path) -> None:
+def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> None:
+    key, file = ("urdf", names.urdf) if names.urdf else ("directives", names.directives)
+    source = path.parent / expandvars(file)
+    if "$" in str(source):
+        raise InputError(f"{key}: {file}: this environment variable is not set")
+    if not source.is_file():
+        raise InputError(f"{key}: {source}: no such file")
+    parser = Parser(plant)
+    try:
+        if names.urdf:
+            parser.AddModelsFromString(_without_shapes(source), "urdf")
+        else:
+            parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
+            ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
+    except (RuntimeError, ElementTree.ParseError) as error:
+        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
+
+
+def _without_shapes(urdf: Path) -> str:
+    """A URDF without what it says of shapes, whose meshes need not be there."""
+    tree = ElementTree.parse(urdf)
+    for link in tree.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    return ElementTree.tostring(tree.getroot(), encoding="unicode")
+
+
+def _moving_joints(plant: MultibodyPlant) -> list[Joint]:
+    return [joint for joint in (plant.get_joint(index) for index in plant.GetJointIndices()) if joint.num_velocities() > 0]
+
+
+def _is_carried(plant: MultibodyPlant, body: str) -> bool:
+    """Has a joint this body as its child?"""
+    return any(plant.get_joint(index).child_body().name() == body for index in plant.GetJointIndices())
+
+
+def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
     def check(key: str, name: str, exists: bool, kind: str) -> None:
         if not exists:
-            raise InputError(f"{path}: {key}: the model has no {kind} called {name}")
+            raise InputError(f"{key}: the model has no {kind} called {name}")
 
     check("base", names.base, plant.HasBodyNamed(names.base), "body")
-    check("imu", names.imu, plant.HasFrameNamed(names.imu), "frame")
-    actuated = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices()]
+    if names.imu:
+        check("imu", names.imu, plant.HasFrameNamed(names.imu), "frame")
+    single = [joint.name() for joint in _moving_joints(plant) if joint.type_name() in (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)]
     for side, leg in names.legs.items():
         for joint in leg.joints:
-            check(f"legs.{side}.joints", joint, joint in actuated, "actuated joint")
+            check(f"legs.{side}.joints", joint, joint in single, "revolute or prismatic joint")
         check(f"legs.{side}.foot", leg.foot, plant.HasBodyNamed(leg.foot), "body")
         check(f"legs.{side}.sole", leg.sole, plant.HasFrameNamed(leg.sole), "frame")
         for pad in leg.pads:
             check(f"legs.{side}.pads", pad, plant.HasJointNamed(pad), "joint")
+    for joint in names.joints:
+        check("joints", joint, joint in single, "revolute or prismatic joint")
+    for joint in names.held:
+        if joint not in single or joint in names.joint_names:
+            others = ", ".join(name for name in single if name not in names.joint_names) or "none"
+            raise InputError(f"held.{joint}: expected a joint of the model that is not named elsewhere (there are: {others})")
+
+
+def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
+    """Welds the joints that the description does not name."""
+    others = [joint for joint in _moving_joints(plant) if joint.name() not in names.joint_names]
+    idle = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    for actuator in idle:
+        if actuator.joint() in others:
+            plant.RemoveJointActuator(actuator)
+    for joint in others:
+        place = names.held.get(joint.name(), 0.0)
+        if isinstance(joint, RevoluteJoint):
+            X_FM = RigidTransform(AngleAxis(place, joint.revolute_axis()), np.zeros(3))
+        elif isinstance(joint, PrismaticJoint):
+            X_FM = RigidTransform(place * joint.translation_axis())
+        else:
+            raise InputError(f"joint {joint.name()} is {joint.type_name()}: expected only revolute and prismatic joints")
+        parent, child = joint.frame_on_parent(), joint.frame_on_child()
+        plant.RemoveJoint(joint)
+        plant.WeldFrames(parent, child, X_FM)
+
+
+def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) -> None:
+    """Gives every named joint an actuator and its rotor inertia.
+
+    Damping and limits of torque that the model file has are dropped: friction is an effect, and torque is limited by the controller.
+    """
+    actuators = {plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()}
+    for name, inertia in rotor_inertia.items():
+        joint = plant.GetJointByName(name)
+        actuator = actuators[name] if name in actuators else plant.AddJointActuator(name, joint)
+        actuator.set_default_rotor_inertia(inertia)
+        actuator.set_default_gear_ratio(1.0)
+        actuator.set_effort_limit(np.inf)
+        joint.set_default_damping(0.0)
 
 
 def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]) -> None:
