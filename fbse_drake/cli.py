@@ -23,7 +23,7 @@ from fbse_drake.discrepancy.diagnose import Finding, diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import SIZES, hide, reveal
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.sanity import check_sensors
-from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.discrepancy.study import study, study_json, train_and_rest
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_text
@@ -111,6 +111,10 @@ def _parser() -> argparse.ArgumentParser:
         run = commands.add_parser(name, help=short, description=f"{description} Writes {name}.json and a report.")
         _add_scenario(run)
         run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), from a simulation or from a robot")
+        if function is _study:
+            run.add_argument(
+                "--test", metavar="LOG", type=Path, action="append", default=[], help="another log to test on; nothing is fitted to it"
+            )
         _add_output(run, f"as for simulate, with _{name} at its end")
         run.set_defaults(run=function)
 
@@ -204,7 +208,7 @@ def _estimate(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
     with _errors_located(options), console.status("comparing the model with the log"):
-        predictor = _checked(scenario, log)
+        predictor = _checked(scenario, train_and_rest(scenario, log)[0])
         comparison = compare(predictor)
     _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
     with console.status("writing the report"):
@@ -219,7 +223,7 @@ def _compare(options: argparse.Namespace) -> int:
 def _diagnose(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
     with _errors_located(options), console.status("comparing the model with the log") as status:
-        predictor = _checked(scenario, log)
+        predictor = _checked(scenario, train_and_rest(scenario, log)[0])
         comparison = compare(predictor)
         diagnosis = diagnose(predictor, progress=status.update)
     _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
@@ -231,23 +235,29 @@ def _diagnose(options: argparse.Namespace) -> int:
 
 def _study(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_study")
+    train, rest = train_and_rest(scenario, log)
+    tests = {"rest of the log": rest} if rest is not None else {}
+    tests |= {path.stem: Log.load(path) for path in options.test}
     with _errors_located(options), console.status("comparing the model with the log") as status:
-        predictor = _checked(scenario, log)
+        predictor = _checked(scenario, train)
         comparison = compare(predictor)
-        result = study(scenario, log, progress=status.update)
+        result = study(scenario, train, tests=tests, progress=status.update)
         status.update("comparing the completed model with the log")
-        after = Predictor(result.scenario, log) if result.found else predictor
+        after = Predictor(result.scenario, train) if result.found else predictor
         completed = (after, compare(after) if result.found else comparison)
     _write_findings(out, "study", study_json(result), scenario, inputs)
     if result.found:
         write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
     with console.status("writing the report"):
         write_study_report(out / "report.html", result, (predictor, comparison), completed, inputs)
-    table = Table("added", "held-out error / noise", "fitted error / noise", title=inputs.name, title_justify="left")
+    relative = [name for name, error in result.steps[0].errors.items() if np.isfinite(error.relative)] if tests else []
+    columns = [f"relative error, {name}" for name in relative]
+    table = Table("added", "held-out error / noise", "fitted error / noise", *columns, title=inputs.name, title_justify="left")
     for step in result.steps:
         effects = [f"{spaced(effect)} ({targets_text(targets)})" for effect, targets in by_effect(step.added).items()]
         added = ", ".join(effects) or "the model as given"
-        table.add_row(added, number(step.held_out_rmse), number(step.train_rmse))
+        shares = (f"{100 * step.errors[name].relative:.2f} %" for name in relative)
+        table.add_row(added, number(step.held_out_rmse), number(step.train_rmse), *shares)
     _conclude(console, out, f"{study_outcome(result)} Stopped because {result.stopped_because}.", table)
     return DONE
 

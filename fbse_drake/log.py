@@ -49,7 +49,7 @@ _CHANNELS: list[tuple[str, str, tuple[str | int, ...]]] = [
     (r"estimate/\w+/(covariance|innovation|innovation_variance)", "-", ("m",)),
     (r"estimate/friction/parameter(s|_variance)", "-", ("n", "m")),
 ]
-_REQUIRED = ("time", "joint/position", "joint/torque_command")
+_REQUIRED = ("time", "joint/position")
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,8 @@ class Log(Mapping[str, np.ndarray]):
     The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`, `joint/velocity` and
     `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force) and `imu/angular_velocity` (N, 3) in the IMU frame,
     `foot/<side>/pad_force` (N, pads, 3) in the sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
-    `reference/`, `estimate/` or `truth/`.
+    `reference/`, `estimate/` or `truth/`. A robot that does not know its joint torques has no `joint/torque_command`; nothing is said
+    about the torques of its joints then.
 
     Raises:
         InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.
@@ -81,7 +82,7 @@ class Log(Mapping[str, np.ndarray]):
         if samples == 0:
             raise InputError("no samples")
         for name, values in self.channels.items():
-            _, sample_shape = _channel_kind(name)
+            _, sample_shape = channel_kind(name)
             expected = (samples, *(n if size == "n" else size for size in sample_shape))
             if len(values.shape) != len(expected) or any(e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)):
                 raise InputError(f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}")
@@ -120,7 +121,11 @@ class Log(Mapping[str, np.ndarray]):
 
     def unit(self, name: str) -> str:
         """Unit of a channel, as `rad/s`."""
-        return _channel_kind(name)[0]
+        return channel_kind(name)[0]
+
+    def part(self, rows: slice) -> "Log":
+        """Some of its samples."""
+        return Log({name: values[rows] for name, values in self.channels.items()}, self.meta)
 
     def save(self, path: str | Path) -> None:
         """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""
@@ -163,7 +168,7 @@ class Log(Mapping[str, np.ndarray]):
             return cls(content, meta)
 
 
-def _channel_kind(name: str) -> tuple[str, tuple[str | int, ...]]:
+def channel_kind(name: str) -> tuple[str, tuple[str | int, ...]]:
     for pattern, unit, shape in _CHANNELS:
         if re.fullmatch(pattern, name):
             return unit, shape

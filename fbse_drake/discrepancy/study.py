@@ -1,7 +1,7 @@
 """The whole loop: diagnose, add, and again, until nothing is left."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from fbse_drake.discrepancy.add import add
 from fbse_drake.discrepancy.diagnose import Diagnosis, Finding, diagnose, diagnosis_json
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.residual import rms
 from fbse_drake.discrepancy.rollout import RolloutError, rollout
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
@@ -21,6 +22,35 @@ _MOST_ROUNDS = 4
 
 
 @dataclass(frozen=True)
+class ModelError:
+    """What a model leaves over on one log, averaged over blocks (`recording.block`)."""
+
+    # |residual| / |torque|, 2-norms over all joints, and of each joint; NaN without torques.
+    relative: float
+    relative_by_joint: dict[str, float]
+    # Root mean square of every row, in its unit.
+    rms: dict[str, float]
+
+
+def model_error(predictor: Predictor) -> ModelError:
+    """What the model of a predictor leaves over on its log."""
+    residual, n = predictor.residual, len(predictor.robot.joint_names)
+    known = residual.known[:, :n]
+    left, torque = (rms(values[:, :n], known) * np.sqrt(known.sum(axis=0)) for values in (residual.value, residual.signals.torque_command))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_joint = dict(zip(predictor.robot.joint_names, (left / torque).tolist(), strict=True))
+        relative = float(np.sqrt(np.nansum(left**2)) / np.sqrt(np.nansum(torque**2)))
+    of_rows = rms(residual.value, residual.known).tolist()
+    return ModelError(relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True)))
+
+
+def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
+    """The share of a log that models are fitted to, and the rest if there is one; see `RecordingConfig.train_share`."""
+    split = int(np.searchsorted(log.time, log.time[0] + scenario.recording.train_share * (log.time[-1] - log.time[0]), side="right"))
+    return log.part(slice(0, split)), log.part(slice(split, None)) if split < len(log.time) else None
+
+
+@dataclass(frozen=True)
 class StudyStep:
     """The model after an addition. Errors of the residual are root mean squares in multiples of the sensors' noise."""
 
@@ -29,6 +59,8 @@ class StudyStep:
     train_rmse: float
     # Of the model with all that was added so far; None where it was not asked for.
     rollout: RolloutError | None
+    # By log: `train` is the one that is diagnosed, the others are not fitted to.
+    errors: dict[str, ModelError] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,6 +86,7 @@ def study(
     effects: Iterable[type[Effect]] | None = None,
     *,
     rollouts: bool = True,
+    tests: Mapping[str, Log] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Study:
     """Diagnoses a log and adds what is found to the model until nothing more is found.
@@ -61,6 +94,7 @@ def study(
     Args:
         effects: what is tried; by default the library.
         rollouts: also simulates the model after every round.
+        tests: logs on which the models are tested, by name; nothing is fitted to them.
         progress: called with a word on what is being done.
 
     Raises:
@@ -74,18 +108,25 @@ def study(
         say("simulating the model against the log")
         return rollout(scenario, log) if rollouts else None
 
+    def errors(predictor: Predictor) -> dict[str, ModelError]:
+        others = {name: Predictor(predictor.scenario, other) for name, other in (tests or {}).items()}
+        return {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
+
     effects = None if effects is None else list(effects)
+    predictor = Predictor(scenario, log)
     while len(diagnoses) < _MOST_ROUNDS:
         say(f"round {len(diagnoses) + 1}")
-        diagnosis = diagnose(Predictor(scenario, log), effects, progress=progress)
+        diagnosis = diagnose(predictor, effects, progress=progress)
         diagnoses.append(diagnosis)
         if not steps:
-            steps.append(StudyStep((), diagnosis.held_out_before, diagnosis.held_out_before, rolled()))
+            steps.append(StudyStep((), diagnosis.held_out_before, diagnosis.held_out_before, rolled(), errors(predictor)))
         worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
         if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis.chosen)
-        steps.append(StudyStep(tuple(diagnosis.chosen), diagnosis.held_out_after, diagnosis.train_after, rolled()))
+        predictor = Predictor(scenario, log)
+        step = StudyStep(tuple(diagnosis.chosen), diagnosis.held_out_after, diagnosis.train_after, rolled(), errors(predictor))
+        steps.append(step)
     return Study(tuple(steps), tuple(diagnoses), _reason(diagnoses), scenario)
 
 
@@ -111,6 +152,10 @@ def study_json(result: Study) -> dict[str, Any]:
                 "held_out_rmse": step.held_out_rmse,
                 "train_rmse": step.train_rmse,
                 "rollout_rmse": _rollout_json(step.rollout),
+                "errors": {
+                    name: {"relative": error.relative, "relative_by_joint": error.relative_by_joint, "rms": error.rms}
+                    for name, error in step.errors.items()
+                },
             }
             for step in result.steps
         ],
