@@ -349,6 +349,13 @@ _QUANTITY = {
     "load": ("torque command", "Nm"),
     "time": ("time", "s"),
 }
+# Of a prismatic joint.
+_QUANTITY_ALONG = _QUANTITY | {
+    "speed": ("|velocity|", "m/s"),
+    "velocity": ("velocity", "m/s"),
+    "position": ("position", "m"),
+    "load": ("force command", "N"),
+}
 _WAYS = {"x": ("forwards", "backwards"), "y": ("to the left", "to the right")}
 _UNITS = {"m/s^2": "m/s²"}
 
@@ -358,9 +365,10 @@ def words(name: str) -> str:
     return name.replace("/", " ").replace("_", " ")
 
 
-def range_text(where: Bin) -> str:
+def range_text(row: Row, where: Bin) -> str:
     """The range of a bin's variable, as `|velocity| < 0.1 rad/s`; empty if it is the whole range."""
-    name, unit = _QUANTITY.get(where.variable, (where.variable, "N"))
+    quantities = _QUANTITY_ALONG if row.kind == "joint" and row.unit == "N" else _QUANTITY
+    name, unit = quantities.get(where.variable, (where.variable, "N"))
     low, high = (f"{bound:.4g}" for bound in (where.low, where.high))
     from_below = np.isinf(where.low) or (where.variable == "speed" and where.low == 0)
     if from_below and np.isinf(where.high):
@@ -375,7 +383,7 @@ def range_text(where: Bin) -> str:
 def _place(row: Row, where: Bin) -> str:
     """Channel, phase and range, as `left knee pitch, swing, |velocity| < 0.1 rad/s`."""
     channel = words(row.name if row.kind == "joint" else row.name.split("/")[0])
-    return ", ".join(part for part in (channel, words(where.phase) if where.phase != "all" else "", range_text(where)) if part)
+    return ", ".join(part for part in (channel, words(where.phase) if where.phase != "all" else "", range_text(row, where)) if part)
 
 
 def _digits(value: float) -> str:
@@ -385,13 +393,14 @@ def _digits(value: float) -> str:
 
 def _text(row: Row, where: Bin) -> str:
     size, unit = _digits(abs(where.error)), _UNITS.get(row.unit, row.unit)
-    kind, axis = row.name.split("/")[-1].rsplit("_", 1)
+    # As force, z in base/force_z.
+    kind, _, axis = row.name.split("/")[-1].rpartition("_")
     more = where.error > 0
     if where.variable == "scatter":
         what = f"an error of {size} {unit} (root mean square) that follows neither phase nor any of the variables"
     elif row.kind == "joint":
         along = " along the motion" if where.variable == "speed" else ""
-        what = f"model torque {size} {unit} too {'low' if more else 'high'}{along}"
+        what = f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too {'low' if more else 'high'}{along}"
     elif kind == "force" and axis == "z":
         what = f"the feet push {size} N {'more' if more else 'less'} upwards than the model's masses need"
     elif kind == "force":

@@ -1,0 +1,198 @@
+"""Robots without legs: a crane of one prismatic and two revolute joints, by closed forms."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fbse_drake import InputError, Log, Scenario, simulate
+from fbse_drake.control.position_loop import PositionLoopConfig
+from fbse_drake.discrepancy.compare import compare
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.study import model_error, train_and_rest
+from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.robot.plant import make_robot
+from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
+from fbse_drake.sensors.encoders import EncoderConfig
+from fbse_drake.walking.reference import JointSines
+
+TROLLEY, LOAD, LENGTH, G = 6.0, 2.0, 0.5, 9.81
+# A trolley on a rail along x, a rope (a rod here) that swings about y, and a spoon below it that the description does not name. The shapes
+# name meshes that are nowhere.
+CRANE = f"""
+<robot name="crane">
+  <link name="rail"/>
+  <link name="trolley">
+    <inertial><mass value="{TROLLEY}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://nowhere/trolley.dae"/></geometry></visual>
+  </link>
+  <link name="rod">
+    <inertial><origin xyz="0 0 {-LENGTH}"/><mass value="{LOAD}"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <link name="spoon">
+    <inertial><origin xyz="0.1 0 0"/><mass value="1.0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="slide" type="prismatic">
+    <parent link="rail"/><child link="trolley"/><axis xyz="1 0 0"/>
+    <limit lower="-9" upper="9" effort="3" velocity="9"/><dynamics damping="50"/>
+  </joint>
+  <joint name="swing" type="revolute">
+    <parent link="trolley"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="3" velocity="9"/>
+  </joint>
+  <joint name="spoon_hinge" type="revolute">
+    <parent link="rod"/><child link="spoon"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="3" velocity="9"/>
+  </joint>
+  <transmission name="slide_drive">
+    <joint name="slide"/><actuator name="slide_motor"/>
+    <type>transmission_interface/SimpleTransmission</type>
+  </transmission>
+</robot>
+"""
+DESCRIPTION = {"urdf": "crane.urdf", "base": "rail", "fixed_base": True, "joints": ["swing", "slide"]}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("crane")
+    (folder / "crane.urdf").write_text(CRANE)
+    return folder
+
+
+def described(folder: Path, **changes: object) -> str:
+    """Path of the crane's description."""
+    path = folder / f"crane{abs(hash(str(changes)))}.yaml"
+    path.write_text(yaml.safe_dump(DESCRIPTION | changes))
+    return str(path)
+
+
+def crane(folder: Path, **effects: object) -> Scenario:
+    return Scenario(
+        duration=8.0,
+        robot=RobotConfig(described(folder), effects=effects),
+        reference=JointSines(amplitude={"swing": 0.6, "slide": 0.3}, frequency={"swing": 0.7, "slide": 0.45}, ramp=0.5),
+        control=PositionLoopConfig(kp={"all": 4000.0}, kd={"all": 80.0}),
+        sensors=SensorsConfig(encoders=EncoderConfig(velocity_noise=1e-4)),
+    )
+
+
+@pytest.fixture(scope="module")
+def rubbing(folder: Path) -> tuple[Scenario, Log]:
+    scenario = crane(folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5}))
+    return scenario, simulate(scenario).log
+
+
+def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(folder: Path, rubbing: tuple[Scenario, Log]):
+    """q_swing, x: (m + M) x.. + m l (q.. cos q - q.^2 sin q) = F and m l^2 q.. + m l x.. cos q + m g l sin q = T, plus the spoon's."""
+    log = rubbing[1]
+    rigid = dataclasses.replace(rubbing[0], model=RobotConfig(described(folder, held={"spoon_hinge": np.pi / 2})))
+    blocks = Predictor(rigid, log).motion.steps
+    q, (w, _), (q_dd, x_dd) = blocks.joint_position[:, 0], blocks.joint_velocity.T, blocks.joint_acceleration.T
+    # By a quarter turn about y the spoon's mass lies 0.1 m below the hinge, which is that of the rod.
+    moment = LOAD * LENGTH + 1.0 * 0.1
+    inertia = LOAD * LENGTH**2 + 1.0 * 0.1**2
+    # A rotation about +y takes what hangs down to -x.
+    force = (TROLLEY + LOAD + 1.0) * x_dd - moment * (q_dd * np.cos(q) - w**2 * np.sin(q))
+    torque = inertia * q_dd - moment * x_dd * np.cos(q) + moment * G * np.sin(q)
+    expected = blocks.torque_command - np.stack([torque, force], axis=1)
+    found = Predictor(rigid, log).motion.equation.residual(blocks)
+    # Drake's g has more digits.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_limits_and_damping_of_the_model_file_are_not_taken(folder: Path, rubbing: tuple[Scenario, Log]):
+    assert np.abs(rubbing[1]["joint/torque_command"]).max() > 4.0
+    robot, _ = make_robot(described(folder))
+    assert robot.torque_units == ["Nm", "N"]
+    free = simulate(crane(folder)).log
+    ideal = dataclasses.replace(crane(folder), sensors=SensorsConfig())
+    truth = Log(
+        {
+            name: free[f"truth/{name}" if "position" in name or "velocity" in name else name]
+            for name in free
+            if name in ("time", "joint/position", "joint/velocity", "joint/torque_command")
+        },
+        free.meta,
+    )
+    assert np.abs(Predictor(ideal, truth).residual.value).max() < 1e-9
+
+
+def test_hidden_friction_is_found_in_a_machine_without_legs(rubbing: tuple[Scenario, Log]):
+    scenario, log = rubbing
+    predictor = Predictor(scenario, log)
+    failures = compare(predictor).failures
+    assert {failure.row.name for failure in failures} == {"swing", "slide"}
+    texts = [failure.text for failure in failures]
+    assert any(text.startswith("slide: model force") for text in texts)
+    assert any("model torque" in text and "rad/s" in text for text in texts)
+    diagnosis = diagnose(predictor)
+    found = {finding.effect: finding for finding in diagnosis.chosen}
+    assert diagnosis.verdict == "effect_found"
+    assert {effect: finding.targets for effect, finding in found.items()} == {"CoulombFriction": ("slide",), "ViscousFriction": ("swing",)}
+    assert found["CoulombFriction"].parameters["coulomb"].value == pytest.approx(7.0, rel=0.02)
+    assert found["ViscousFriction"].parameters["viscous"].value == pytest.approx(1.5, rel=0.02)
+
+
+def test_nothing_is_found_where_nothing_is_hidden(folder: Path):
+    scenario = crane(folder)
+    assert diagnose(Predictor(scenario, simulate(scenario).log)).verdict == "nothing_missing"
+
+
+def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(rubbing: tuple[Scenario, Log]):
+    scenario, log = rubbing
+    scenario = dataclasses.replace(scenario, recording=RecordingConfig(train_share=0.75))
+    train, rest = train_and_rest(scenario, log)
+    assert train.time[-1] == pytest.approx(6.0)
+    np.testing.assert_array_equal(np.concatenate([train.time, rest.time]), log.time)
+    predictor = Predictor(scenario, rest)
+    error, residual = model_error(predictor), predictor.residual
+    torque = residual.signals.torque_command
+    assert error.relative == pytest.approx(np.linalg.norm(residual.value) / np.linalg.norm(torque))
+    assert error.relative_by_joint["slide"] == pytest.approx(np.linalg.norm(residual.value[:, 1]) / np.linalg.norm(torque[:, 1]))
+    assert train_and_rest(dataclasses.replace(scenario, recording=RecordingConfig()), log)[1] is None
+
+
+def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: Path):
+    """A recorder that samples torque and angles at once, every 8 ms, without velocities: exact motions give no residual."""
+    scenario = dataclasses.replace(
+        crane(folder), recording=RecordingConfig(block=0.04, rows="instantaneous", velocity="differenced", cutoff=25.0)
+    )
+    robot, _ = make_robot(described(folder))
+    period, a, f = 0.008, np.array([0.6, 0.3]), 2 * np.pi * np.array([0.7, 0.45])
+    t = np.arange(1000)[:, None] * period
+    q, v, dv = a * np.sin(f * t), a * f * np.cos(f * t), -a * f**2 * np.sin(f * t)
+    plant, context = robot.plant, robot.plant.CreateDefaultContext()
+    torque = np.empty_like(q)
+    for k in range(len(t)):
+        robot.set_state(context, q[k], v[k])
+        full = np.zeros(2)
+        full[robot.velocity_index] = dv[k]
+        bias = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
+        torque[k] = (plant.CalcMassMatrix(context) @ full + bias)[robot.velocity_index]
+    log = Log({"time": t[:, 0], "joint/position": q, "joint/torque_command": torque}, {"joints": robot.joint_names, "period": period})
+    wrong = dataclasses.replace(scenario, recording=dataclasses.replace(scenario.recording, rows="per_step"))
+    middle = slice(20, -20)
+    error = Predictor(scenario, log).motion.residual.value[middle]
+    late = Predictor(wrong, log).motion.residual.value[middle]
+    assert np.abs(error).max() < 2e-3 * np.abs(torque).max()
+    assert np.abs(late).max() > 5 * np.abs(error).max()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joints": ["swing", "lift"]}, "joints: the model has no revolute or prismatic joint called lift"),
+        ({"joints": ["swing", "swing"]}, "joints: swing is named twice"),
+        ({"joints": []}, "expected legs, joints or both, found neither"),
+        ({"held": {"slide": 0.1}}, r"held.slide: expected a joint of the model that is not named elsewhere \(there are: spoon_hinge\)"),
+        ({"urdf": "other.urdf"}, "other.urdf: no such file"),
+        ({"urdf": "${NOT_SET_ANYWHERE}/crane.urdf"}, "this environment variable is not set"),
+        ({"directives": "crane.dmd.yaml"}, "expected either directives or urdf"),
+        ({"base": "hook"}, "base: the model has no body called hook"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(folder: Path, changes: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        make_robot(described(folder, **changes))
