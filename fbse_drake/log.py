@@ -28,6 +28,9 @@ _CHANNELS: list[tuple[str, str, tuple[str | int, ...]]] = [
     (r"(truth/|reference/|estimate/)?joint/acceleration", "rad/s^2", ("n",)),
     (r"(truth/|reference/|estimate/)?joint/\w*torque\w*", "Nm", ("n",)),
     (r"joint/temperature", "degC", ("n",)),
+    (r"joint/voltage_command", "V", ("n",)),
+    # 1 where a motor is driven, 0 where its bridge is open.
+    (r"joint/enabled", "1", ("n",)),
     (r"imu/linear_acceleration", "m/s^2", (3,)),
     (r"imu/angular_velocity", "rad/s", (3,)),
     (r"(truth/)?foot/\w+/pad_force", "N", ("m", 3)),
@@ -69,6 +72,7 @@ class Log(Mapping[str, np.ndarray]):
     channels: dict[str, np.ndarray]
     # "joints": names in column order; "sides"; "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
     # "scenario": YAML text; "outcome"; "estimator_scenario": YAML text of the scenario whose estimator ran over the log afterwards.
+    # Of a converted recording: "segments": the stretch that each file became; "findings": what was left out, in words.
     meta: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -169,6 +173,11 @@ class Log(Mapping[str, np.ndarray]):
 
 
 def channel_kind(name: str) -> tuple[str, tuple[str | int, ...]]:
+    """Unit of a channel (of a revolute joint) and the shape of a sample: numbers, "n" for all joints, "m" for any number.
+
+    Raises:
+        InputError: no such channel.
+    """
     for pattern, unit, shape in _CHANNELS:
         if re.fullmatch(pattern, name):
             return unit, shape
