@@ -28,6 +28,7 @@ format: $(INSTALLED)
 bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop
 	$(VENV)/bin/python -m benchmarks.estimator_tick
+	$(VENV)/bin/python -m benchmarks.convert
 
 # How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores.
 fbse: $(INSTALLED)

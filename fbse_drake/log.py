@@ -70,7 +70,8 @@ class Log(Mapping[str, np.ndarray]):
     """
 
     channels: dict[str, np.ndarray]
-    # "joints": names in column order; "sides"; "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
+    # "joints": names in column order; "sides"; "legs": joints by side;
+    # "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
     # "scenario": YAML text; "outcome"; "estimator_scenario": YAML text of the scenario whose estimator ran over the log afterwards.
     # Of a converted recording: "segments": the stretch that each file became; "findings": what was left out, in words.
     meta: dict[str, Any]

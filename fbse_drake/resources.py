@@ -25,5 +25,6 @@ def find(name_or_path: str | Path, *, kind: str) -> Path:
     shipped = folder(kind) / f"{name_or_path}.yaml"
     if path.suffix == "" and shipped.is_file():
         return shipped
-    names = ", ".join(sorted(p.stem for p in folder(kind).glob("*.yaml") if not p.stem.endswith(".dmd")))
+    files = (p.relative_to(folder(kind)).with_suffix("") for p in folder(kind).rglob("*.yaml"))
+    names = ", ".join(sorted(p.as_posix() for p in files if p.suffix not in (".dmd", ".map")))
     raise InputError(f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {names})")

@@ -151,11 +151,11 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "joint/velocity": raw["measured_joint_state"][:, n:],
         "joint/torque_command": raw["torque_command"],
         **_imu_channels(robot, raw["measured_imu"]),
-        **_split_pads(robot, raw["measured_pad_force"], ""),
+        **_measured_forces(robot, raw["measured_pad_force"]),
         **_reference_channels(station, time),
         **({"joint/torque_measured": raw["measured_torque"]} if "measured_torque" in raw else {}),
         "truth/joint/friction_torque": raw["torque_loss"],
-        **_split_pads(robot, raw["true_pad_force"], "truth/"),
+        **_true_forces(robot, raw["true_pad_force"]),
         **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
     }
     if station.estimator is not None:
@@ -164,6 +164,7 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
     meta = {
         "joints": robot.joint_names,
         "sides": robot.description.sides,
+        "legs": {side: leg.joints for side, leg in robot.description.legs.items()},
         "frames": {
             "base": robot.description.base,
             "imu": robot.description.imu,
@@ -186,9 +187,28 @@ def _imu_channels(robot: Robot, readings: np.ndarray) -> dict[str, np.ndarray]:
     return {"imu/linear_acceleration": readings[:, :3], "imu/angular_velocity": readings[:, 3:]}
 
 
-def _split_pads(robot: Robot, pad_force: np.ndarray, prefix: str) -> dict[str, np.ndarray]:
-    parts = FootPads(robot).split(pad_force.reshape(len(pad_force), -1, 3))
-    return {f"{prefix}foot/{side}/pad_force": part for side, part in zip(robot.description.sides, parts, strict=True)}
+def _measured_forces(robot: Robot, pad_force: np.ndarray) -> dict[str, np.ndarray]:
+    """What each foot's sensors read: the forces on its pads, or the wrench on its sole."""
+    forces, wrenches = _by_foot(robot, pad_force)
+    pads = {f"foot/{side}/pad_force": force for side, force in forces.items() if side not in wrenches}
+    return pads | {f"foot/{side}/wrench": wrench for side, wrench in wrenches.items()}
+
+
+def _true_forces(robot: Robot, pad_force: np.ndarray) -> dict[str, np.ndarray]:
+    forces, wrenches = _by_foot(robot, pad_force)
+    pads = {f"truth/foot/{side}/pad_force": force for side, force in forces.items()}
+    return pads | {f"truth/foot/{side}/wrench": wrench for side, wrench in wrenches.items()}
+
+
+def _by_foot(robot: Robot, pad_force: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Forces at each foot's pads or corners, (N, points, 3), and the wrench on each foot with a six-axis sensor, (N, 6)."""
+    forces = dict(zip(robot.description.sides, FootPads(robot).split(pad_force.reshape(len(pad_force), -1, 3)), strict=True))
+    wrenches = {
+        side: force.reshape(len(force), -1) @ G.T
+        for (side, force), G in zip(forces.items(), robot.grasp_maps, strict=True)
+        if robot.description.legs[side].corners
+    }
+    return forces, wrenches
 
 
 def _reference_channels(station: Station, time: np.ndarray) -> dict[str, np.ndarray]:

@@ -20,17 +20,8 @@ class NoCompensation:
 class IntegralCompensation:
     """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor): the estimate through a low-pass of bandwidth k_i."""
 
-    # Integral gain by joint [rad/s]; the paper's.
-    gain: dict[str, float] = field(
-        default_factory=lambda: {
-            "hip_yaw": 2.0,
-            "hip_roll": 2.0,
-            "hip_pitch": 1.0,
-            "knee_pitch": 2.0,
-            "ankle_pitch": 2.0,
-            "ankle_roll": 4.0,
-        }
-    )
+    # Integral gain by joint [rad/s]; the paper has 1 in the hip pitch, 4 in the ankle roll and 2 elsewhere.
+    gain: dict[str, float] = field(default_factory=lambda: {"all": 2.0})
 
     def __post_init__(self) -> None:
         for joint, value in self.gain.items():

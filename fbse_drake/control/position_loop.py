@@ -14,19 +14,10 @@ from fbse_drake.sampling import is_tick
 
 @dataclass(frozen=True)
 class PositionLoopConfig:
-    """Gains by joint (see `RobotDescription.per_joint`); defaults are the paper's."""
+    """Gains by joint (see `RobotDescription.per_joint`)."""
 
     # Proportional gain [Nm/rad] and derivative gain [Nm s/rad].
-    kp: dict[str, float] = field(
-        default_factory=lambda: {
-            "hip_yaw": 6000.0,
-            "hip_roll": 2000.0,
-            "hip_pitch": 2000.0,
-            "knee_pitch": 3000.0,
-            "ankle_pitch": 3000.0,
-            "ankle_roll": 6000.0,
-        }
-    )
+    kp: dict[str, float] = field(default_factory=lambda: {"all": 3000.0})
     kd: dict[str, float] = field(default_factory=lambda: {"all": 1.0})
     # Largest torque in either direction [Nm].
     torque_limit: dict[str, float] = field(default_factory=lambda: {"all": 300.0})
@@ -60,12 +51,14 @@ class PositionLoop(LeafSystem):
         - desired_state
         - feedforward_torque
         - friction_estimate
+        - enabled
         output_ports:
         - torque_command
 
     States are [positions, velocities], shape (2n,) [rad, rad/s]; torques have shape (n,) [Nm]. The command is the position loop's
     torque plus feed-forward plus friction estimate, within the limits; `feedforward_torque` and `friction_estimate` may be left
-    unconnected and count as zero. At a tick the command is that of the tick's own inputs. Discrete state: the command being held.
+    unconnected and count as zero. `enabled` (n,) is 0 for a drive that is switched off, which commands no torque; unconnected, all are
+    on. At a tick the command is that of the tick's own inputs. Discrete state: the command being held.
     """
 
     def __init__(self, config: PositionLoopConfig, names: RobotDescription, time_step: float):
@@ -87,6 +80,7 @@ class PositionLoop(LeafSystem):
         self._desired_state = self.DeclareVectorInputPort("desired_state", 2 * n)
         self._feedforward = self.DeclareVectorInputPort("feedforward_torque", n)
         self._friction = self.DeclareVectorInputPort("friction_estimate", n)
+        self._enabled = self.DeclareVectorInputPort("enabled", n)
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
@@ -103,7 +97,8 @@ class PositionLoop(LeafSystem):
         for port in (self._feedforward, self._friction):
             if port.HasValue(context):
                 torque = torque + port.Eval(context)
-        output.SetFromVector(np.minimum(np.maximum(torque, -self._limit), self._limit))
+        torque = np.minimum(np.maximum(torque, -self._limit), self._limit)
+        output.SetFromVector(torque * self._enabled.Eval(context) if self._enabled.HasValue(context) else torque)
 
     def _hold(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._held).set_value(self.torque_command.Eval(context))

@@ -60,9 +60,9 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
 
 
 def leg_of_joint(robot: Robot) -> np.ndarray:
-    """Which leg each joint belongs to, shape (n,)."""
+    """Which leg each joint belongs to, shape (n,); -1 for a joint that is no leg's: what is asked of its leg is then asked of the last."""
     legs = list(robot.description.legs.values())
-    return np.array([next(k for k, leg in enumerate(legs) if name in leg.joints) for name in robot.joint_names])
+    return np.array([next((k for k, leg in enumerate(legs) if name in leg.joints), -1) for name in robot.joint_names])
 
 
 @njit(cache=True)

@@ -101,7 +101,7 @@ def run_figures(
         outlines, pads: see `footprints`.
     """
     planned_feet = has_feet(log, "reference/foot/{}/support") and has_feet(log, "reference/foot/{}/position")
-    loaded_feet = has_feet(log, "foot/{}/pad_force") and not _hangs(log)
+    loaded_feet = _feels_feet(log) and not _hangs(log)
     friction_known = "truth/joint/friction_torque" in log
     friction_estimated = "estimate/joint/friction_torque" in log
     com_known = "reference/com/position" in log and "truth/com/position" in log
@@ -158,7 +158,7 @@ def run_figures(
             "forces",
             "Foot forces",
             "Measured vertical load of each foot and of all feet together, how much of the friction cone the feet use "
-            "(tangential over vertical force), and the vertical force on every pad.",
+            "(tangential over vertical force), and the vertical force on every pad, or the centre of pressure under a six-axis sensor.",
             loaded_feet,
             lambda: foot_forces(log),
         ),
@@ -289,7 +289,7 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
                     patch = Polygon(place + outlines[side], edgecolor=color, label=label.format(side))
                     patch.set(**({"facecolor": f"{color}38"} if source == "truth" else {"fill": False, "linestyle": "--"}))
                     axes.add_patch(patch)
-    if pads is not None and has_feet(log, "foot/{}/pad_force") and has_feet(log, "truth/foot/{}/position"):
+    if pads is not None and _feels_feet(log) and has_feet(log, "truth/foot/{}/position"):
         axes.plot(*_measured_zmp(log, pads)[_stride(log)].T, color=_ZMP, linewidth=0.7, alpha=0.7, label="measured ZMP")
     for channel, color, line, width, label in (
         ("reference/zmp", _ZMP, "--", 1.4, "planned ZMP"),
@@ -391,10 +391,10 @@ def torques(log: Log) -> Figure:
 
 
 def foot_forces(log: Log) -> Figure:
-    """Measured load of the feet: vertical, tangential over vertical, and vertical on each pad."""
+    """Measured load of the feet: vertical, tangential over vertical, and vertical on each pad, or where it acts."""
     figure, grid = _time_grid(log, 2 + len(log.sides), 1, height=5 + 1.9 * len(log.sides))
     vertical, ratio, *pad_axes = grid.flat
-    force = {side: log[f"foot/{side}/pad_force"].sum(axis=1) for side in log.sides}
+    force = {side: _force(log, side) for side in log.sides}
     total = np.sum([force[side][:, 2] for side in log.sides], axis=0)
     weight = total.mean()
     _plot(vertical, log, total, color=_TRUE, linewidth=0.8, alpha=0.6, label="all feet")
@@ -409,6 +409,12 @@ def foot_forces(log: Log) -> Figure:
     ratio.set_ylabel("tangential / vertical [1]")
     ratio.set_ylim(0, max(0.1, ratio.get_ylim()[1]))
     for side, axes in zip(log.sides, pad_axes, strict=True):
+        if f"foot/{side}/pad_force" not in log:
+            pressure = np.where(force[side][:, 2:] > _LOADED_SHARE * weight, _centre_of_pressure(log, side), np.nan)
+            for values, name, shade in zip(pressure.T, ("ahead", "to the left"), (1, 0.5), strict=True):
+                _plot(axes, log, 1e3 * values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=name)
+            axes.set_ylabel(f"{side} pressure, centre [mm]")
+            continue
         pads = log[f"foot/{side}/pad_force"][:, :, 2].T
         for pad, (values, shade) in enumerate(zip(pads, np.linspace(1, 0.3, len(pads)), strict=True), start=1):
             _plot(axes, log, values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=f"pad {pad}")
@@ -558,7 +564,7 @@ def base_velocity(log: Log) -> Figure:
 def support(log: Log) -> Figure:
     """Planned and estimated stance and measured load of each foot."""
     figure, grid = _time_grid(log, len(log.sides), 1, height=1.0 + 1.9 * len(log.sides), phases=False)
-    forces = {side: log[f"foot/{side}/pad_force"][:, :, 2].sum(axis=1) for side in log.sides if has_feet(log, "foot/{}/pad_force")}
+    forces = {side: _force(log, side)[:, 2] for side in log.sides} if _feels_feet(log) else {}
     weight = np.mean(sum(forces.values())) if forces else 0.0
     strips = [("estimated stance", log["estimate/support"].T > 0, 1.0)]
     if has_feet(log, "reference/foot/{}/support"):
@@ -711,10 +717,34 @@ def _footholds(log: Log, side: str, channel: str) -> Iterable[np.ndarray]:
 
 
 def _measured_zmp(log: Log, pads: Mapping[str, np.ndarray]) -> np.ndarray:
-    """ZMP of the measured pad forces, (N, 2) [m]; soles taken as level."""
-    force = np.concatenate([log[f"foot/{side}/pad_force"] for side in log.sides], axis=1)
-    place = np.concatenate([log[f"truth/foot/{side}/position"][:, None] + pads[side] for side in log.sides], axis=1)
-    return zero_moment_point(force, place)
+    """ZMP of the measured foot forces, (N, 2) [m]; soles taken as level."""
+    forces, places = [], []
+    for side in log.sides:
+        sole = log[f"truth/foot/{side}/position"][:, None]
+        if f"foot/{side}/pad_force" in log:
+            forces.append(log[f"foot/{side}/pad_force"])
+            places.append(sole + pads[side])
+        else:
+            forces.append(_force(log, side)[:, None])
+            places.append(sole + np.pad(_centre_of_pressure(log, side), ((0, 0), (0, 1)))[:, None])
+    return zero_moment_point(np.concatenate(forces, axis=1), np.concatenate(places, axis=1))
+
+
+def _feels_feet(log: Log) -> bool:
+    """Whether the forces on all feet were measured, by pads or by six-axis sensors."""
+    return bool(log.sides) and all(f"foot/{side}/pad_force" in log or f"foot/{side}/wrench" in log for side in log.sides)
+
+
+def _force(log: Log, side: str) -> np.ndarray:
+    """Measured force on a foot, in its sole frame, (N, 3) [N]."""
+    pads = f"foot/{side}/pad_force"
+    return log[pads].sum(axis=1) if pads in log else log[f"foot/{side}/wrench"][:, 3:]
+
+
+def _centre_of_pressure(log: Log, side: str) -> np.ndarray:
+    """Where the force under a six-axis sensor acts, in the sole frame, (N, 2) [m]; the sole's origin where there is hardly any."""
+    m_x, m_y, _, _, _, f_z = log[f"foot/{side}/wrench"].T
+    return np.stack([-m_y, m_x], axis=1) / np.where(f_z > 1.0, f_z, np.inf)[:, None]
 
 
 def _stride(log: Log) -> slice:

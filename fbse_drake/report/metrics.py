@@ -126,10 +126,12 @@ def has_feet(log: Log, channel: str) -> bool:
 
 
 def joint_sides(log: Log) -> list[str | None]:
-    """Whose leg each joint belongs to: by its name (`left_knee_pitch`), or by its place if no name begins with a side.
+    """Whose leg each joint belongs to: as the log says, else by its name (`left_knee_pitch`), or by its place.
 
     Legs follow one another in the order of the sides, with equally many joints.
     """
+    if "legs" in log.meta:
+        return [next((side for side, joints in log.meta["legs"].items() if joint in joints), None) for joint in log.joints]
     named = [next((side for side in log.sides if joint.startswith(f"{side}_")), None) for joint in log.joints]
     if log.sides and not any(named):
         return [log.sides[joint * len(log.sides) // len(log.joints)] for joint in range(len(log.joints))]

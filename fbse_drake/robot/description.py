@@ -28,7 +28,7 @@ class Leg:
 
     def __post_init__(self) -> None:
         if bool(self.pads) == bool(self.corners):
-            raise InputError("expected either pads (3-axis force sensors) or corners (of a foot with a six-axis sensor)")
+            raise InputError("pads: expected either these (3-axis force sensors) or corners (of a foot with a six-axis sensor)")
         for point in self.corners:
             if len(point) != 3:
                 raise InputError(f"corners: expected points of three coordinates, found {point}")

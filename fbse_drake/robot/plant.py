@@ -10,19 +10,21 @@ from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph
+from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, Joint, PrismaticJoint, RevoluteJoint, RigidBody, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import Frame, Joint, PrismaticJoint, RevoluteJoint, RigidBody, SpatialInertia, UnitInertia, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
-from fbse_drake.robot.description import RobotDescription, load_description
+from fbse_drake.robot.description import Leg, RobotDescription, load_description
 
 # Between a body's name and the number in the names of the bodies that carry its point masses.
 _POINT_MASS = "_point_mass_"
+# A corner of a foot with a six-axis sensor touches the ground in one point, and is far stiffer than any ground.
+_CORNER_RADIUS, _CORNER_STIFFNESS = 1e-9, 1e12
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,11 @@ class Robot:
             raise InputError(f"{name}: the model has no body of this name with a mass (there are: {', '.join(self.body_names)})")
         return self.plant.GetBodyByName(name)
 
+    def added_to(self, name: str) -> list[RigidBody]:
+        """Bodies that carry the point masses of a body, in its frame."""
+        bodies = [self.plant.get_body(index) for index in self.plant.GetBodyIndices(self.base.model_instance())]
+        return [body for body in bodies if body.name().rpartition(_POINT_MASS)[0] == name]
+
     def sole(self, side: str) -> Frame:
         return self.plant.GetFrameByName(self.description.legs[side].sole)
 
@@ -104,6 +111,16 @@ class Robot:
         six-axis sensor, shape (points, 3) [m]."""
         leg = self.description.legs[side]
         return np.array(leg.corners or [X_FP.translation() for X_FP in self._pad_poses(side)])
+
+    @cached_property
+    def grasp_maps(self) -> list[np.ndarray]:
+        """Of each foot, from the forces at these places to the wrench, (6, 3 points) each; see `grasp_map`."""
+        return [grasp_map(self.pad_positions(side)) for side in self.description.sides]
+
+    def pad_joints(self, side: str) -> list[Joint]:
+        """The fixed joints through which the ground's force passes at these places. (Corners have them only on a ground.)"""
+        leg = self.description.legs[side]
+        return [self.plant.GetJointByName(name) for name in leg.pads or _corner_joints(side, leg)]
 
     def _pad_poses(self, side: str) -> list[RigidTransform]:
         context = self.plant.CreateDefaultContext()
@@ -233,6 +250,8 @@ def make_robot(
         plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(names.base), RigidTransform([0, 0, gantry_height]))
     if ground is not None:
         _add_ground(plant, ground)
+        for side, leg in names.legs.items():
+            _add_corners(plant, side, leg, ground)
         if gantry_height is None:
             gravity = plant.mutable_gravity_field()
             gravity.set_gravity_vector(Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector()))
@@ -242,6 +261,8 @@ def make_robot(
         for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
             if not X_FP.rotation().IsNearlyIdentity(1e-9):
                 raise InputError(f"{path}: legs.{side}.pads: {pad} is not parallel to {names.legs[side].sole}")
+    if robot.has_floating_base and robot.imu.body() not in plant.GetBodiesWeldedTo(robot.base):
+        raise InputError(f"{path}: imu: {names.imu} moves against {names.base}; expected a frame that is fixed to it")
     return robot, scene_graph
 
 
@@ -255,7 +276,7 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
     parser = Parser(plant)
     try:
         if names.urdf:
-            parser.AddModelsFromString(_without_shapes(source), "urdf")
+            parser.AddModelsFromString(_bare(source), "urdf")
         else:
             parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
             ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
@@ -263,13 +284,18 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
 
 
-def _without_shapes(urdf: Path) -> str:
-    """A URDF without what it says of shapes, whose meshes need not be there."""
-    tree = ElementTree.parse(urdf)
-    for link in tree.iter("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
-    return ElementTree.tostring(tree.getroot(), encoding="unicode")
+# What is not taken from a URDF: shapes, whose meshes need not be there; friction, which is an effect; actuators, which every joint has that
+# is named; and that one joint mimics another, for what is not named is held.
+_NOT_TAKEN = ("visual", "collision", "dynamics", "transmission", "mimic")
+
+
+def _bare(urdf: Path) -> str:
+    """A URDF with bodies, joints and frames only."""
+    root = ElementTree.parse(urdf).getroot()
+    for element in [root, *root.iter("link"), *root.iter("joint")]:
+        for part in [part for part in element if part.tag in _NOT_TAKEN]:
+            element.remove(part)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _moving_joints(plant: MultibodyPlant) -> list[Joint]:
@@ -343,8 +369,10 @@ def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) ->
 def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]) -> None:
     instance = plant.GetBodyByName(names.base).model_instance()
     inertias: dict[str, SpatialInertia] = {}
-    # What takes mass away comes last: Drake does not add to a composite without mass.
-    for number, point in enumerate(sorted(point_masses, key=lambda point: -point.mass)):
+    # One carrier for all that is added to a body, one for all that is taken away. What takes mass away comes last: Drake does not add to a
+    # composite without mass.
+    carried: dict[tuple[str, bool], SpatialInertia] = {}
+    for point in sorted(point_masses, key=lambda point: -point.mass):
         if not plant.HasBodyNamed(point.body, instance):
             raise InputError(f"{point.body}: the model has no body of this name")
         body = plant.GetBodyByName(point.body, instance)
@@ -354,11 +382,37 @@ def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_mass
         if inertia.get_mass() + point.mass <= 0:
             raise InputError(f"{point.body}: expected a mass > 0, found {inertia.get_mass() + point.mass:g} kg")
         inertia += added
-        carrier = plant.AddRigidBody(f"{point.body}{_POINT_MASS}{number}", instance, added)
-        plant.WeldFrames(body.body_frame(), carrier.body_frame())
+        key = (point.body, point.mass < 0)
+        if key in carried:
+            carried[key] += added
+        else:
+            carried[key] = added
+    for number, ((name, _), added) in enumerate(carried.items()):
+        carrier = plant.AddRigidBody(f"{name}{_POINT_MASS}{number}", instance, added)
+        plant.WeldFrames(plant.GetBodyByName(name, instance).body_frame(), carrier.body_frame())
     for name, inertia in inertias.items():
         if not inertia.IsPhysicallyValid():
             raise InputError(f"{name}: expected the inertia of a body, found one that no distribution of mass has")
+
+
+def _corner_joints(side: str, leg: Leg) -> list[str]:
+    return [f"{side}_corner_{number}" for number in range(len(leg.corners))]
+
+
+def _add_corners(plant: MultibodyPlant, side: str, leg: Leg, ground: Ground) -> None:
+    """Lets a foot with a six-axis sensor meet the ground: each corner is a massless body, as the pads of other feet are."""
+    properties = ProximityProperties()
+    AddContactMaterial(
+        properties=properties,
+        friction=CoulombFriction(ground.friction, ground.friction),
+        point_stiffness=_CORNER_STIFFNESS,
+        dissipation=ground.dissipation,
+    )
+    sole = plant.GetFrameByName(leg.sole)
+    for name, p_FC in zip(_corner_joints(side, leg), leg.corners, strict=True):
+        corner = plant.AddRigidBody(name, sole.model_instance(), SpatialInertia.Zero())
+        plant.AddJoint(WeldJoint(name, sole, corner.body_frame(), RigidTransform(p_FC)))
+        plant.RegisterCollisionGeometry(corner, RigidTransform(), Sphere(_CORNER_RADIUS), name, properties)
 
 
 def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:

@@ -1,4 +1,4 @@
-"""Three-axis force sensors under the feet."""
+"""Force sensors under the feet: three-axis sensors in pads, or one six-axis sensor per foot."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,8 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import Adder, DiscreteTimeDelay, Gain, Saturation
+from pydrake.systems.primitives import Adder, DiscreteTimeDelay, Gain, MatrixGain, Saturation
+from scipy.linalg import block_diag
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.robot.plant import Robot
@@ -15,11 +16,12 @@ from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 
 @dataclass(frozen=True)
 class FootForceConfig:
-    """Errors of each axis of each pad; the defaults measure exactly."""
+    """Errors of each axis of each pad, or of a six-axis sensor; the defaults measure exactly."""
 
-    # Standard deviation of white noise [N].
+    # Standard deviation of white noise of a force [N], and of the moment of a six-axis sensor [Nm].
     noise: float = 0.0
-    # What is read per force.
+    moment_noise: float = 0.0
+    # What is read per force, and per moment.
     gain: float = 1.0
     # How late a reading comes [s], in whole plant steps.
     delay: float = 0.0
@@ -29,8 +31,28 @@ class FootForceConfig:
     period: float = 0.001
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "noise", "delay")
+        require_not_negative(self, "noise", "moment_noise", "delay")
         require_positive(self, "gain", "range", "period")
+
+
+def wrench_deviations(config: FootForceConfig, robot: Robot) -> list[np.ndarray]:
+    """Standard deviation of the noise in the wrench [moment, force] that is measured on each sole, shape (6,) each [Nm, N]."""
+    six_axis = np.repeat([config.moment_noise, config.noise], 3)
+    legs = robot.description.legs.values()
+    return [six_axis if leg.corners else config.noise * np.linalg.norm(G, axis=1) for leg, G in zip(legs, robot.grasp_maps, strict=True)]
+
+
+def force_noise(config: FootForceConfig, robot: Robot, samples: int, random: np.random.Generator) -> np.ndarray:
+    """Noise in the forces at the pads or corners of all feet, shape (samples, points, 3) [N]."""
+    legs = list(robot.description.legs.values())
+    noise = config.noise * random.standard_normal((samples, sum(leg.points for leg in legs), 3))
+    first = 0
+    for leg, G, deviation in zip(legs, robot.grasp_maps, wrench_deviations(config, robot), strict=True):
+        if leg.corners:
+            wrench = deviation * random.standard_normal((samples, 6))
+            noise[:, first : first + leg.points] = (wrench @ np.linalg.pinv(G).T).reshape(samples, -1, 3)
+        first += leg.points
+    return noise
 
 
 class PadForces(LeafSystem):
@@ -49,11 +71,12 @@ class PadForces(LeafSystem):
 
     def __init__(self, robot: Robot):
         super().__init__()
-        pads = [pad for leg in robot.description.legs.values() for pad in leg.pads]
-        self._joints = [int(robot.plant.GetJointByName(pad).index()) for pad in pads]
+        # Reactions are counted without the joints that were taken out of the model.
+        place = {index: number for number, index in enumerate(robot.plant.GetJointIndices())}
+        self._joints = [place[joint.index()] for side in robot.description.sides for joint in robot.pad_joints(side)]
         self._reaction_forces = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce.Zero()]))
         sources = {self.input_port_ticket(self._reaction_forces.get_index())}
-        self.DeclareVectorOutputPort("pad_force", 3 * len(pads), self._calc, sources)
+        self.DeclareVectorOutputPort("pad_force", 3 * len(self._joints), self._calc, sources)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         reactions = self._reaction_forces.Eval(context)
@@ -62,7 +85,7 @@ class PadForces(LeafSystem):
 
 
 class FootForceSensors(Diagram):
-    """Measures the force of the ground on each pad.
+    """Measures the force of the ground on each pad, or the wrench on the sole of a foot with a six-axis sensor.
 
     .. pydrake_system::
 
@@ -74,7 +97,8 @@ class FootForceSensors(Diagram):
         - measured_pad_force
 
     Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's attitude at the start of that step;
-    a delayed sensor reads zero at first.
+    a delayed sensor reads zero at first. A measured wrench [moment, force] at the sole's origin comes out as the smallest forces at the
+    foot's corners that have this wrench, see `corner_forces`.
     """
 
     def __init__(self, config: FootForceConfig, robot: Robot, time_step: float, seed: int, duration: float):
@@ -88,13 +112,25 @@ class FootForceSensors(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         true = builder.AddNamedSystem("true", PadForces(robot))
-        size = true.get_output_port().size()
-        noise = config.noise * white_noise(seed, "foot force", ticks_until(duration, config.period), size)
+        legs = list(robot.description.legs.values())
+        has_six_axes = any(leg.corners for leg in legs)
+        # What the sensors of each foot read of the forces at its pads or corners.
+        maps = [np.eye(3 * leg.points) if leg.pads else G for leg, G in zip(legs, robot.grasp_maps, strict=True)]
+        is_force = np.concatenate(
+            [np.ones(len(G), dtype=bool) if leg.pads else np.arange(6) >= 3 for leg, G in zip(legs, maps, strict=True)]
+        )
+        size = len(is_force)
+        deviation = np.where(is_force, config.noise, config.moment_noise)
+        noise = deviation * white_noise(seed, "foot force", ticks_until(duration, config.period), size)
         errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, size))
-        limit = np.full(size, config.range)
+        limit = np.where(is_force, config.range, np.inf)
         measured = builder.AddNamedSystem("measured", Saturation(-limit, limit))
         read = true.get_output_port()
+        if has_six_axes:
+            wrenches = builder.AddNamedSystem("wrenches", MatrixGain(block_diag(*maps)))
+            builder.Connect(read, wrenches.get_input_port())
+            read = wrenches.get_output_port()
         if config.delay > 0:
             # A discrete update sees the next step's force already, and its delay is read one step later: both together are even.
             steps = round(config.delay / time_step)
@@ -108,7 +144,12 @@ class FootForceSensors(Diagram):
         builder.Connect(read, noisy.get_input_port(0))
         builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
         builder.Connect(noisy.get_output_port(), measured.get_input_port())
+        told = measured.get_output_port()
+        if has_six_axes:
+            corner_forces = builder.AddNamedSystem("corner_forces", MatrixGain(block_diag(*(np.linalg.pinv(G) for G in maps))))
+            builder.Connect(told, corner_forces.get_input_port())
+            told = corner_forces.get_output_port()
         builder.ExportInput(true.get_input_port(), "reaction_forces")
         builder.ExportOutput(true.get_output_port(), "true_pad_force")
-        builder.ExportOutput(measured.get_output_port(), "measured_pad_force")
+        builder.ExportOutput(told, "measured_pad_force")
         builder.BuildInto(self)

@@ -1,24 +1,34 @@
-"""Analytic kinematics of a leg with hip yaw, roll, pitch in one point, knee pitch, and ankle pitch, roll in one point.
+"""Kinematics of a leg of six revolute joints, whatever their axes.
 
-All functions work on arrays over time. B is the base frame, F the sole frame; quantities are expressed in B's axes.
+A leg with hip yaw, roll, pitch in one point, knee pitch, and ankle pitch, roll in one point has a closed inverse; any other is
+inverted by Newton's method. All functions work on arrays over time. B is the base frame, F the sole frame; quantities are expressed
+in B's axes.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
+from pydrake.multibody.tree import RevoluteJoint
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 
-_AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]], dtype=float)
+# Axes of the leg with a closed inverse.
+_CLOSED_AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]], dtype=float)
 _AXIS_TOLERANCE = 1e-9
+# A sole's pose is found to this [rad, m].
+_POSE_TOLERANCE = 1e-12
+_MAX_ITERATIONS = 100
 
 
 class UnreachableError(ValueError):
-    """A foot pose that the leg cannot reach; holds the index in time and the distance asked for and allowed [m]."""
+    """A foot pose that the leg cannot reach; holds the index in time."""
 
-    def __init__(self, index: int, distance: float, limit: float):
-        super().__init__(f"hip to ankle {distance:.3f} m, the leg allows {limit:.3f} m")
+    def __init__(self, index: int, reason: str):
+        super().__init__(reason)
         self.index = index
 
 
@@ -40,39 +50,42 @@ class LegMotion:
 
 @dataclass(frozen=True)
 class LegKinematics:
-    """Geometry and masses of one leg, read from the plant by `from_robot`."""
+    """Geometry and masses of one leg, read from the plant by `from_robot`; all vectors in B's axes, in the zero posture."""
 
-    # Hip centre in B; then from joint to joint, last from the ankle to the sole; shape (7, 3) [m], zero posture.
+    # Unit axes of the joints, from hip to foot, shape (6, 3).
+    axes: np.ndarray
+    # First joint in B; then from joint to joint, last from the last joint to the sole; shape (7, 3) [m].
     offsets: np.ndarray
-    # Mass that moves with each joint but not the next [kg], (6,), and its centre from the joint, (6, 3) [m], zero posture.
+    # Attitude of the sole, R_BF, shape (3, 3).
+    sole: np.ndarray
+    # Mass that moves with each joint but not the next [kg], (6,), and its centre from the joint, (6, 3) [m].
     masses: np.ndarray
     centers: np.ndarray
+    # The middle of each joint's range, where it has one [rad], shape (6,): which way a knee bends.
+    middle: np.ndarray
 
     @classmethod
     def from_robot(cls, robot: Robot, side: str) -> "LegKinematics":
-        """Raises InputError where the leg is built otherwise than this module assumes."""
+        """Raises InputError where the leg has not six revolute joints, one behind the other, that begin at the base."""
         plant, leg = robot.plant, robot.description.legs[side]
         context = plant.CreateDefaultContext()
         robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
         base = robot.base.body_frame()
         joints = [plant.GetJointByName(name) for name in leg.joints]
+        if len(joints) != 6 or not all(isinstance(joint, RevoluteJoint) for joint in joints):
+            raise InputError(f"legs.{side}.joints: a walking robot's leg needs six revolute joints, found {len(joints)} joints")
         X_BJ = [joint.frame_on_parent().CalcPose(context, base) for joint in joints]
         axes = np.array([X.rotation() @ joint.revolute_axis() for X, joint in zip(X_BJ, joints, strict=True)])
         sole = robot.sole(side).CalcPose(context, base)
         origins = np.array([X.translation() for X in X_BJ] + [sole.translation()])
-        offsets = np.diff(origins, axis=0, prepend=np.zeros((1, 3)))
-        if len(joints) != 6 or np.abs(axes - _AXES).max() > _AXIS_TOLERANCE:
-            raise InputError(f"legs.{side}.joints: the analytic leg needs axes z, x, y, y, y, x from hip to foot, found {axes.tolist()}")
-        if not (
-            np.allclose(offsets[[1, 2, 5]], 0, atol=_AXIS_TOLERANCE)
-            and np.allclose(offsets[3:5, :2], 0, atol=_AXIS_TOLERANCE)
-            and sole.rotation().IsNearlyIdentity(_AXIS_TOLERANCE)
-        ):
-            raise InputError(
-                f"legs.{side}: the analytic leg needs hip axes in one point, knee and ankle straight below it, "
-                f"ankle axes in one point and a level sole in the zero posture"
-            )
-        moved = [set(plant.GetBodiesKinematicallyAffectedBy([joint.index()])) for joint in joints] + [set()]
+        moved = [set(plant.GetBodiesKinematicallyAffectedBy([joint.index()])) for joint in joints]
+        carried = {robot.sole(side).body().index()}
+        if not all(after <= before for before, after in pairwise([*moved, carried])):
+            raise InputError(f"legs.{side}.joints: expected them from hip to foot, one behind the other, found {', '.join(leg.joints)}")
+        for name in robot.description.joints:
+            if carried <= set(plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name).index()])):
+                raise InputError(f"joints: {name} carries the {side} leg; a walking robot's legs begin at its base")
+        moved.append(set())
         masses, centers = [], []
         for i, origin in enumerate(origins[:6]):
             bodies = [plant.get_body(index) for index in moved[i] - moved[i + 1]]
@@ -83,29 +96,60 @@ class LegKinematics:
             )
             masses.append(mass)
             centers.append(moment / mass - origin if mass > 0 else np.zeros(3))
-        return cls(offsets, np.array(masses), np.array(centers))
+        middle = np.array([0.5 * (joint.position_lower_limit() + joint.position_upper_limit()) for joint in joints])
+        return cls(
+            # An axis along one of the base's is exactly so.
+            np.where(np.abs(axes - axes.round()) < _AXIS_TOLERANCE, axes.round() + 0.0, axes),
+            np.diff(origins, axis=0, prepend=np.zeros((1, 3))),
+            sole.rotation().matrix(),
+            np.array(masses),
+            np.array(centers),
+            np.nan_to_num(middle, posinf=0.0, neginf=0.0),
+        )
 
-    @property
-    def thigh(self) -> float:
-        return float(-self.offsets[3, 2])
+    @cached_property
+    def has_closed_inverse(self) -> bool:
+        """Are the hip's axes z, x, y in one point, knee and ankle straight below, the ankle's axes y, x in one point, the sole level?"""
+        in_line = np.concatenate([self.offsets[[1, 2, 5]].ravel(), self.offsets[3:5, :2].ravel()])
+        return (
+            np.array_equal(self.axes, _CLOSED_AXES)
+            and np.allclose(in_line, 0, atol=_AXIS_TOLERANCE)
+            and np.allclose(self.sole, np.eye(3), atol=_AXIS_TOLERANCE)
+        )
 
-    @property
-    def shank(self) -> float:
-        return float(-self.offsets[4, 2])
-
-    def inverse(self, R_BF: np.ndarray, p_BF: np.ndarray) -> np.ndarray:
-        """Joint angles that put the sole at a pose; knee bent forward.
+    def inverse(self, R_BF: np.ndarray, p_BF: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """Joint angles that put the sole at a pose; the knee bent as its range has it.
 
         Args:
             R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m].
+            start: angles near the solution, shape (N, 6) [rad], if known; by default the middle of the joints' ranges.
 
         Returns:
-            Angles from hip yaw to ankle roll, shape (N, 6) [rad].
+            Angles from hip to foot, shape (N, 6) [rad].
 
         Raises:
             UnreachableError: the leg is too short or too long for a pose.
         """
-        a, b = self.thigh, self.shank
+        if self.has_closed_inverse:
+            return self._closed_inverse(R_BF, p_BF)
+        # Levenberg-Marquardt, damped by the error itself: robust far away, quadratic near the solution (Sugihara 2011, IEEE
+        # Transactions on Robotics 27(5)).
+        q = np.tile(self.middle, (len(p_BF), 1)) if start is None else start
+        for _ in range(_MAX_ITERATIONS):
+            R, p, J = self._pose(q)
+            turn = Rotation.from_matrix(R_BF @ R.transpose(0, 2, 1)).as_rotvec()
+            error = np.concatenate([turn, p_BF - p], axis=1)
+            size = np.linalg.norm(error, axis=1)
+            if size.max() < _POSE_TOLERANCE:
+                return q
+            normal = J @ J.transpose(0, 2, 1) + (0.5 * size**2)[:, None, None] * np.eye(6)
+            q = q + np.einsum("nji,nj->ni", J, np.linalg.solve(normal, error[:, :, None])[:, :, 0])
+        worst = int(size.argmax())
+        raise UnreachableError(worst, f"the leg misses it by {size[worst]:.3f} m or rad")
+
+    def _closed_inverse(self, R_BF: np.ndarray, p_BF: np.ndarray) -> np.ndarray:
+        """Knee bent forward."""
+        a, b = -self.offsets[3, 2], -self.offsets[4, 2]
         p_ankle = p_BF - R_BF @ self.offsets[6]
         # From ankle to hip, in the sole's axes.
         r = np.einsum("nij,ni->nj", R_BF, self.offsets[0] - p_ankle)
@@ -113,17 +157,28 @@ class LegKinematics:
         for limit, violation in ((a + b, distance - (a + b)), (abs(a - b), abs(a - b) - distance)):
             if violation.max() > 0:
                 worst = int(violation.argmax())
-                raise UnreachableError(worst, float(distance[worst]), limit)
+                raise UnreachableError(worst, f"hip to ankle {distance[worst]:.3f} m, the leg allows {limit:.3f} m")
         knee = np.arccos(np.clip((distance**2 - a**2 - b**2) / (2 * a * b), -1, 1))
         ankle_roll = np.arctan2(r[:, 1], r[:, 2])
         lean = np.arctan2(-a * np.sin(knee), b + a * np.cos(knee))
         ankle_pitch = lean - np.arctan2(r[:, 0], np.hypot(r[:, 1], r[:, 2]))
         # What the three hip joints must add: Rz(yaw) Rx(roll) Ry(pitch).
-        hip = R_BF @ _rotation(_AXES[5], -ankle_roll) @ _rotation(_AXES[4], -(knee + ankle_pitch))
+        hip = R_BF @ _rotation(self.axes[5], -ankle_roll) @ _rotation(self.axes[4], -(knee + ankle_pitch))
         hip_yaw = np.arctan2(-hip[:, 0, 1], hip[:, 1, 1])
         hip_roll = np.arctan2(hip[:, 2, 1], np.hypot(hip[:, 0, 1], hip[:, 1, 1]))
         hip_pitch = np.arctan2(-hip[:, 2, 0], hip[:, 2, 2])
         return np.stack([hip_yaw, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll], axis=1)
+
+    def _pose(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sole's rotation (N, 3, 3), position (N, 3) and Jacobian (N, 6, 6) for angles q (N, 6)."""
+        R, p, axes, origins = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3)), [], []
+        for i in range(6):
+            p = p + R @ self.offsets[i]
+            axes.append(R @ self.axes[i])
+            origins.append(p)
+            R = R @ _rotation(self.axes[i], q[:, i])
+        p = p + R @ self.offsets[6]
+        return R @ self.sole, p, _jacobian(axes, origins, p)
 
     def forward(self, q: np.ndarray, v: np.ndarray | None = None) -> LegMotion:
         """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes (N, 6) [rad, rad/s]."""
@@ -141,12 +196,12 @@ class LegKinematics:
         for i in range(6):
             r = R @ self.offsets[i]
             bias, position = carried(r), position + r
-            axis = R @ _AXES[i]
+            axis = R @ self.axes[i]
             axes.append(axis)
             origins.append(position)
             alpha = alpha + np.cross(omega, axis) * v[:, i, None]
             omega = omega + axis * v[:, i, None]
-            R = R @ _rotation(_AXES[i], q[:, i])
+            R = R @ _rotation(self.axes[i], q[:, i])
             r = R @ self.centers[i]
             moment = moment + self.masses[i] * (position + r)
             bias_moment = bias_moment + self.masses[i] * carried(r)
@@ -154,8 +209,13 @@ class LegKinematics:
                 J_moment[:, :, j] += self.masses[i] * np.cross(axes[j], position + r - origins[j])
         r = R @ self.offsets[6]
         bias, position = carried(r), position + r
-        J = np.stack([np.concatenate([e, np.cross(e, position - o)], axis=1) for e, o in zip(axes, origins, strict=True)], axis=2)
-        return LegMotion(R, position, J, np.concatenate([alpha, bias], axis=1), moment, J_moment, bias_moment)
+        J = _jacobian(axes, origins, position)
+        return LegMotion(R @ self.sole, position, J, np.concatenate([alpha, bias], axis=1), moment, J_moment, bias_moment)
+
+
+def _jacobian(axes: list[np.ndarray], origins: list[np.ndarray], point: np.ndarray) -> np.ndarray:
+    """Of a point's spatial velocity [angular, linear] with respect to the rates about the axes through the origins, (N, 6, joints)."""
+    return np.stack([np.concatenate([e, np.cross(e, point - o)], axis=1) for e, o in zip(axes, origins, strict=True)], axis=2)
 
 
 def _rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:

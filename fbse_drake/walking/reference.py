@@ -1,5 +1,6 @@
 """Reference motions for the joints: inverse kinematics, feed-forward torque, and the Drake source that plays them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from fbse_drake.errors import InputError, require_positive
+from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.walking.leg_kinematics import LegKinematics, LegMotion, UnreachableError
 from fbse_drake.walking.plan import PointMotion, TaskPlan
@@ -40,7 +42,17 @@ class JointSines:
         require_positive(self, "ramp")
 
 
-ReferenceConfig = Walk | Squat | Sway | JointSines
+@dataclass(frozen=True)
+class Recorded:
+    """What the robot was asked for is in its log, or nobody knows: for recordings, which are compared with the model but not simulated
+    without the log.
+    """
+
+    # Name of a number that the log keeps with each of its stretches and that multiplies the gains of `control`, as `kp`.
+    gain: str = ""
+
+
+ReferenceConfig = Walk | Squat | Sway | JointSines | Recorded
 
 
 @dataclass(frozen=True)
@@ -69,17 +81,19 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
     Raises:
         InputError: a step out of reach, the ZMP too near the edge, a joint beyond its limits, an unknown joint.
     """
+    if isinstance(config, Recorded):
+        raise InputError("a recorded motion is not simulated without its log: see fbse compare and fbse study")
     if isinstance(config, JointSines):
         return _joint_sines(config, robot, time)
     if not robot.has_floating_base:
         raise InputError(f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines")
     legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
-    lateral = {side: float(np.sign(leg.offsets[0, 1])) for side, leg in legs.items()}
+    lateral = {side: float(np.sign(leg.offsets[:, 1].sum())) for side, leg in legs.items()}
     corners = {side: robot.pad_positions(side) for side in legs}
     gravity = robot.plant.gravity_field().gravity_vector()
     plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
     try:
-        joint_motion, base, motions = _inverse_kinematics(robot, legs, plan)
+        joint_motion, base, motions = _inverse_kinematics(robot, legs, plan, _posture(config.posture, robot.description))
     except np.linalg.LinAlgError:
         raise InputError("a leg is stretched out straight, where its joint velocities are not defined; lower com_height") from None
     _check_limits(robot, time, joint_motion.position, plan)
@@ -87,26 +101,34 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
     return Reference(time, joint_motion.position, joint_motion.velocity, joint_motion.acceleration, torque, base, plan)
 
 
+def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarray:
+    """Positions of all joints, those of the legs at zero, shape (n,)."""
+    for joint in posture:
+        if joint not in names.joints:
+            raise InputError(f"posture.{joint}: expected a joint that is no leg's (there are: {', '.join(names.joints) or 'none'})")
+    return names.per_joint(posture, key="posture", default=0.0)
+
+
 def _inverse_kinematics(
-    robot: Robot, legs: dict[str, LegKinematics], plan: TaskPlan
+    robot: Robot, legs: dict[str, LegKinematics], plan: TaskPlan, posture: np.ndarray
 ) -> tuple[PointMotion, PointMotion, dict[str, LegMotion]]:
-    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk upright."""
+    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk upright, other joints still."""
     plant, samples = robot.plant, len(plan.time)
     context = plant.CreateDefaultContext()
     total_mass = plant.CalcTotalMass(context)
     plant.SetPositions(context, robot.base_pose_positions(RigidTransform()))
-    robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
+    robot.set_joint_positions(context, posture)
     # The legs' first moment is known in closed form; what is left belongs to the base.
     rest = {side: leg.forward(np.zeros((1, 6))).moment[0] for side, leg in legs.items()}
     base_moment = total_mass * plant.CalcCenterOfMassPositionInWorld(context) - sum(rest.values())
 
     level = np.broadcast_to(np.eye(3), (samples, 3, 3))
     p_WB = plan.com.position.copy()
+    q: dict[str, np.ndarray] = {}
     for _ in range(_MAX_ITERATIONS):
-        q = {}
         for side, leg in legs.items():
             try:
-                q[side] = leg.inverse(level, plan.feet[side].position - p_WB)
+                q[side] = leg.inverse(level, plan.feet[side].position - p_WB, start=q.get(side))
             except UnreachableError as error:
                 raise InputError(_unreachable(plan, side, error)) from None
         com = p_WB + (base_moment + sum(leg.forward(q[side]).moment for side, leg in legs.items())) / total_mass
@@ -139,7 +161,8 @@ def _inverse_kinematics(
     a_WB, relative = solve(plan.com.acceleration - com_bias, {side: plan.feet[side].acceleration for side in legs})
     a = {side: _solve_leg(motions[side].J, np.zeros((samples, 3)), relative[side]) - foot_bias[side] for side in legs}
 
-    joints = PointMotion(*(np.hstack([values[side] for side in legs]) for values in (q, v, a)))
+    others = np.tile(posture[6 * len(legs) :], (samples, 1))
+    joints = PointMotion(*(np.hstack([*values.values(), still]) for values, still in ((q, others), (v, 0 * others), (a, 0 * others))))
     return joints, PointMotion(p_WB, v_WB, a_WB), motions
 
 

@@ -1,6 +1,6 @@
 """Motions with both feet on the ground: squatting and swaying."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -42,6 +42,8 @@ class _Stand:
     zmp_forward: float = 0.025
     # Smallest distance of the planned ZMP to the edge of the support polygon [m].
     zmp_margin: float = 0.02
+    # Where joints that are no leg's are held, by joint [rad]; 0 by default.
+    posture: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_positive(self, "frequency", "ramp", "com_height", "foot_spacing")

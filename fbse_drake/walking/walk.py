@@ -1,6 +1,6 @@
 """Straight walking: footsteps, ZMP and swing feet, with the timing of the paper (Sec. 7.1, Fig. 5) as default."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import PPoly
@@ -41,6 +41,8 @@ class Walk:
     zmp_margin: float = 0.02
     # Where the sole frames stand first [m], in walking direction (Fig. 5).
     start: float = -0.025
+    # Where joints that are no leg's are held, by joint [rad]; 0 by default.
+    posture: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_positive(self, "initial_double_support", "single_support", "double_support", "com_height", "foot_spacing")
