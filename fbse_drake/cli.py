@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 from pydrake.geometry import Meshcat, StartMeshcat
 from rich.console import Console, Group
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -21,12 +22,16 @@ from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.compare import compare, comparison_json
 from fbse_drake.discrepancy.diagnose import Finding, diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import SIZES, hide, reveal
+from fbse_drake.discrepancy.hygiene import Hygiene, hygiene_json, inspect
+from fbse_drake.discrepancy.identify import identifiability_text, identification_json, identify
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.sanity import check_sensors
 from fbse_drake.discrepancy.study import study, study_json, train_and_rest
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_text
+from fbse_drake.interop.convert import read_log, read_logs
+from fbse_drake.interop.export import writer_for
 from fbse_drake.log import Log
 from fbse_drake.report.discrepancy import (
     Inputs,
@@ -41,6 +46,14 @@ from fbse_drake.report.discrepancy import (
 )
 from fbse_drake.report.discrepancy_figures import by_effect, spaced, targets_text
 from fbse_drake.report.html import number
+from fbse_drake.report.identification import (
+    BASE_HEADER,
+    ERROR_HEADER,
+    base_row,
+    error_rows,
+    identification_outcome,
+    write_identification_report,
+)
 from fbse_drake.report.metrics import run_metrics, write_json
 from fbse_drake.report.run import write_run_report
 from fbse_drake.scenario import Scenario, dump_scenario, read_scenario
@@ -94,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Runs a scenario's estimator over a recorded log; writes the log with the estimates, metrics and report.",
     )
     _add_scenario(run)
-    run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), from a simulation or from a robot")
+    _add_log(run)
     _add_output(run, "as for simulate, with _estimate at its end")
     run.set_defaults(run=_estimate)
 
@@ -106,17 +119,36 @@ def _parser() -> argparse.ArgumentParser:
             "which physical effect a model lacks",
             "Finds the physical effects that a scenario's model lacks, on a log.",
         ),
+        (
+            "identify",
+            _identify,
+            "inertial parameters and plain friction",
+            "Identifies the inertial parameters that a scenario does not trust (identify.inertia), with plain friction.",
+        ),
         ("study", _study, "diagnose, add, and again", "Adds what a scenario's model lacks until a log shows nothing more."),
     ):
         run = commands.add_parser(name, help=short, description=f"{description} Writes {name}.json and a report.")
         _add_scenario(run)
-        run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), from a simulation or from a robot")
-        if function is _study:
+        _add_log(run)
+        if function in (_study, _identify):
             run.add_argument(
                 "--test", metavar="LOG", type=Path, action="append", default=[], help="another log to test on; nothing is fitted to it"
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
         run.set_defaults(run=function)
+
+    run = commands.add_parser(
+        "convert",
+        help="make a log of a recording, or a bag of a log",
+        description="Makes a log of recordings (ROS bags, CSV, JSON, MATLAB, npz), or of a log a file for other programs (mcap, csv).",
+    )
+    run.add_argument("inputs", metavar="IN", type=Path, nargs="+", help="a recording or a log; several recordings become one log")
+    run.add_argument("out", metavar="OUT", type=Path, help="the file to write: .npz (a log), .mcap or .csv")
+    _add_map(run)
+    run.add_argument("--strict", action="store_true", help="refuse recordings of which something must be left out")
+    run.add_argument("--force", action="store_true", help="replace OUT if it exists")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.set_defaults(run=_convert)
 
     run = commands.add_parser(
         "add",
@@ -168,6 +200,15 @@ def _add_scenario(run: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_log(run: argparse.ArgumentParser) -> None:
+    run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), or a recording (see convert)")
+    _add_map(run)
+
+
+def _add_map(run: argparse.ArgumentParser) -> None:
+    run.add_argument("--map", metavar="MAP", help="what a recording's columns or topics mean (yaml); standard messages need none")
+
+
 def _add_output(run: argparse.ArgumentParser, default: str) -> None:
     run.add_argument("--out", metavar="DIR", type=Path, help=f"where the results go (default: {default})")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
@@ -191,7 +232,7 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _estimate(options: argparse.Namespace) -> int:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
-    log = Log.load(options.log)
+    log = read_log(options.log, options.map)
     out = _output_folder(options, "_estimate")
     if (out / "log.npz").exists() and (out / "log.npz").samefile(options.log):
         raise InputError(f"--out {out}: the log with the estimates would overwrite {options.log}")
@@ -209,6 +250,7 @@ def _compare(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
     with _errors_located(options), console.status("comparing the model with the log"):
         predictor = _checked(scenario, train_and_rest(scenario, log)[0])
+        inputs = replace(inputs, hygiene=inspect(predictor.motion))
         comparison = compare(predictor)
     _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
     with console.status("writing the report"):
@@ -216,7 +258,7 @@ def _compare(options: argparse.Namespace) -> int:
     table = Table("failure, worst first", title=inputs.name, title_justify="left")
     for failure in comparison.failures[:_SHOWN]:
         table.add_row(failure.text)
-    _conclude(console, out, compare_outcome(comparison), table)
+    _conclude(console, out, inputs.hygiene, compare_outcome(comparison), table)
     return DONE
 
 
@@ -224,22 +266,22 @@ def _diagnose(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
     with _errors_located(options), console.status("comparing the model with the log") as status:
         predictor = _checked(scenario, train_and_rest(scenario, log)[0])
+        inputs = replace(inputs, hygiene=inspect(predictor.motion))
         comparison = compare(predictor)
         diagnosis = diagnose(predictor, progress=status.update)
     _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
     with console.status("writing the report"):
         write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)
-    _conclude(console, out, diagnosis_outcome(diagnosis), _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]))
+    _conclude(console, out, inputs.hygiene, diagnosis_outcome(diagnosis), _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]))
     return DONE
 
 
 def _study(options: argparse.Namespace) -> int:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_study")
-    train, rest = train_and_rest(scenario, log)
-    tests = {"rest of the log": rest} if rest is not None else {}
-    tests |= {path.stem: Log.load(path) for path in options.test}
+    train, tests = _train_and_tests(scenario, log, options)
     with _errors_located(options), console.status("comparing the model with the log") as status:
         predictor = _checked(scenario, train)
+        inputs = replace(inputs, hygiene=inspect(predictor.motion), tests=tuple(map(str, options.test)))
         comparison = compare(predictor)
         result = study(scenario, train, tests=tests, progress=status.update)
         status.update("comparing the completed model with the log")
@@ -249,7 +291,7 @@ def _study(options: argparse.Namespace) -> int:
     if result.found:
         write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
     with console.status("writing the report"):
-        write_study_report(out / "report.html", result, (predictor, comparison), completed, inputs)
+        write_study_report(out / "report.html", result, (predictor, comparison), completed, inputs, tests)
     relative = [name for name, error in result.steps[0].errors.items() if np.isfinite(error.relative)] if tests else []
     columns = [f"relative error, {name}" for name in relative]
     table = Table("added", "held-out error / noise", "fitted error / noise", *columns, title=inputs.name, title_justify="left")
@@ -258,13 +300,69 @@ def _study(options: argparse.Namespace) -> int:
         added = ", ".join(effects) or "the model as given"
         shares = (f"{100 * step.errors[name].relative:.2f} %" for name in relative)
         table.add_row(added, number(step.held_out_rmse), number(step.train_rmse), *shares)
-    _conclude(console, out, f"{study_outcome(result)} Stopped because {result.stopped_because}.", table)
+    _conclude(console, out, inputs.hygiene, f"{study_outcome(result)} Stopped because {result.stopped_because}.", table)
+    return DONE
+
+
+def _identify(options: argparse.Namespace) -> int:
+    console, scenario, inputs, log, out = _scenario_and_log(options, "_identify")
+    train, tests = _train_and_tests(scenario, log, options)
+    with _errors_located(options), console.status("comparing the model with the log") as status:
+        inputs = replace(inputs, hygiene=inspect(_checked(scenario, train).motion))
+        result = identify(scenario, train, tests, progress=status.update)
+    _write_findings(out, "identify", identification_json(result), scenario, inputs)
+    write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
+    write_identification_report(out / "report.html", result, inputs.name)
+    console.print(identifiability_text(result.inertia), highlight=False)
+    table = Table(*BASE_HEADER, title=inputs.name, title_justify="left")
+    for base in result.inertia.base_parameters:
+        table.add_row(f"{base.body} {base.parameter}{', with others' if base.others else ''}", *base_row(base)[1:])
+    console.print(table)
+    errors = Table(*ERROR_HEADER)
+    for row in error_rows(result):
+        errors.add_row(*row)
+    _conclude(console, out, inputs.hygiene, identification_outcome(result), errors)
+    return DONE
+
+
+def _train_and_tests(scenario: Scenario, log: Log, options: argparse.Namespace) -> tuple[Log, dict[str, Log]]:
+    """What models are fitted to, and logs to test them on, by name."""
+    train, rest = train_and_rest(scenario, log)
+    tests = {"rest of the log": rest} if rest is not None else {}
+    return train, tests | {path.stem: read_log(path, options.map) for path in options.test}
+
+
+def _convert(options: argparse.Namespace) -> int:
+    out, console = options.out, Console(quiet=options.quiet)
+    write = writer_for(out)
+    if out.exists() and not options.force:
+        raise InputError(f"{out}: this exists already; --force replaces it")
+    if out.exists() and any(path.exists() and path.samefile(out) for path in options.inputs):
+        raise InputError(f"{out}: this is what is to be converted")
+    with console.status("reading") as status:
+        log = read_logs(options.inputs, options.map, progress=lambda text: status.update(escape(text)))
+        findings = log.meta.get("findings", [])
+        if findings and options.strict:
+            raise InputError(f"{findings[0]}{f' (and {len(findings) - 1} more findings)' if findings[1:] else ''}")
+        status.update(f"writing {escape(out.name)}")
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            write(log, out)
+        except OSError as error:
+            raise InputError(f"{out}: {error.strerror or error}") from None
+    table = Table(title=escape(str(out)), show_header=False, title_justify="left")
+    table.add_row("rows", f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} s apart")
+    table.add_row("joints", ", ".join(log.joints))
+    table.add_row("channels", ", ".join(name for name in log if name != "time"))
+    for finding in findings:
+        table.add_row("left out", escape(finding))
+    console.print(table)
     return DONE
 
 
 def _scenario_and_log(options: argparse.Namespace, suffix: str) -> tuple[Console, Scenario, Inputs, Log, Path]:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
-    log = Log.load(options.log)
+    log = read_log(options.log, options.map)
     out = _output_folder(options, suffix)
     return Console(quiet=options.quiet), scenario, Inputs(name, options.scenario, str(options.log), str(out)), log, out
 
@@ -282,16 +380,22 @@ def _checked(scenario: Scenario, log: Log) -> Predictor:
 
 def _write_findings(out: Path, kind: str, content: dict[str, Any], scenario: Scenario, inputs: Inputs) -> None:
     """Writes what was found, under its own name and as metrics.json, and the scenario."""
+    content = {**content, "hygiene": hygiene_json(inputs.hygiene)}
     write_json(out / f"{kind}.json", content)
     write_json(out / "metrics.json", content)
     write_text(out / "scenario.yaml", dump_scenario(scenario, inputs.name))
 
 
-def _conclude(console: Console, out: Path, outcome: str, table: Table) -> None:
-    """Prints the result."""
+def _conclude(console: Console, out: Path, hygiene: Hygiene, outcome: str, table: Table) -> None:
+    """Prints the result, after what is remarkable about the log."""
+    if hygiene.findings:
+        remarks = Table("data hygiene", "", title_justify="left")
+        for finding in hygiene.findings[:_SHOWN]:
+            remarks.add_row(finding.severity, finding.text)
+        console.print(remarks)
     if table.row_count:
         console.print(table)
-    console.print(outcome, highlight=False)
+    console.print(hygiene.before(outcome), highlight=False)
     console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
 
 

@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from fbse_drake import resources, schema
 from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
@@ -85,14 +85,23 @@ class RecordingConfig:
     velocity: str = "measured"
     # All channels go through a low-pass without delay (Butterworth of order 4, forwards and backwards) with this corner [Hz]; 0 for none.
     cutoff: float = 0.0
+    # Who recorded the torques has done so already, with this corner [Hz]: predicted torques go through the same before they are compared.
+    recorded_cutoff: float = 0.0
     # White noise of the torque of each joint, standard deviation of a sample [Nm].
     torque_noise: dict[str, float] = field(default_factory=dict)
+    # What such noise has beside, as a share of the torque: a torque that is had from a model of the motor is right but for a share of it.
+    torque_noise_share: dict[str, float] = field(default_factory=dict)
+    # A joint's row counts where the joint moves faster than this [rad/s]: at rest friction is whatever holds the joint, and no law says it.
+    least_speed: dict[str, float] = field(default_factory=dict)
+    # Rows of the residual, as compare.json names them (* stands for any text), that cannot close, for a channel of theirs is not to be
+    # trusted: nothing is fitted to them, and nothing is said about them.
+    unused_rows: list[str] = field(default_factory=list)
     # Models are fitted to this first share of the log and tested on the rest.
     train_share: float = 1.0
 
     def __post_init__(self) -> None:
         require_positive(self, "block")
-        require_not_negative(self, "cutoff")
+        require_not_negative(self, "cutoff", "recorded_cutoff")
         for key, allowed in (("rows", ("per_step", "instantaneous")), ("velocity", ("measured", "differenced"))):
             if getattr(self, key) not in allowed:
                 raise InputError(f"{key}: expected {' or '.join(allowed)}, found {getattr(self, key)}")
@@ -100,9 +109,25 @@ class RecordingConfig:
             raise InputError(f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found {self.block:g} s")
         if not 0 < self.train_share <= 1:
             raise InputError(f"train_share: expected a number in (0, 1], found {self.train_share:g}")
-        for joint, value in self.torque_noise.items():
-            if value < 0:
-                raise InputError(f"torque_noise.{joint}: expected a number >= 0, found {value:g}")
+        for key in ("torque_noise", "torque_noise_share", "least_speed"):
+            for joint, value in getattr(self, key).items():
+                if value < 0:
+                    raise InputError(f"{key}.{joint}: expected a number >= 0, found {value:g}")
+
+
+@dataclass(frozen=True)
+class IdentifyConfig:
+    """What of the model's own parameters is not trusted, so that it is identified together with the effects that a log shows."""
+
+    # Bodies whose inertial parameters are not trusted; `all` for every body with a mass.
+    inertia: list[str] = field(default_factory=list)
+    # Effects that are not tried, for the recording itself shows that they are not there (see its data hygiene).
+    ruled_out: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name in self.ruled_out:
+            if name not in library():
+                raise InputError(f"ruled_out: {name}: no such effect (there are: {', '.join(library())})")
 
 
 @dataclass(frozen=True)
@@ -137,7 +162,7 @@ class Scenario:
     # Drake's settings of the robot's plant, whose time_step must be > 0.
     plant: MultibodyPlantConfig = field(default_factory=_plant_config)
     ground: Ground = field(default_factory=Ground)
-    # The motion: !Walk, !Squat, !Sway or !JointSines.
+    # The motion: !Walk, !Squat, !Sway, !JointSines or !Recorded.
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
@@ -149,6 +174,7 @@ class Scenario:
     fall: FallConfig = field(default_factory=FallConfig)
     log: LogConfig = field(default_factory=LogConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
 
     def __post_init__(self) -> None:
         require_positive(self, "duration")
@@ -267,10 +293,9 @@ def check_joints(scenario: Scenario) -> None:
                 value.resolve(names, key=f"effects.{effect}")
     names, _ = load_description(scenario.robot.description)
     for key in ("kp", "kd", "torque_limit"):
-        # The default gains are those of the paper's legs; a recording of another robot needs none.
-        if getattr(scenario.control, key) != getattr(PositionLoopConfig(), key):
-            names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
-    names.per_joint(scenario.recording.torque_noise, key="recording.torque_noise", default=0.0)
+        names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
+    for key in ("torque_noise", "torque_noise_share", "least_speed"):
+        names.per_joint(getattr(scenario.recording, key), key=f"recording.{key}", default=0.0)
     if isinstance(scenario.compensation, IntegralCompensation):
         names.per_joint(scenario.compensation.gain, key="compensation.gain")
     if isinstance(scenario.estimator, FixedFriction):

@@ -14,7 +14,7 @@ from fbse_drake.discrepancy.diagnose import Diagnosis, EffectStatus, Estimate, F
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.rollout import RolloutError
 from fbse_drake.discrepancy.structure import Structure
-from fbse_drake.discrepancy.study import Study, StudyStep
+from fbse_drake.discrepancy.study import ModelError, Study, StudyStep
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
 
@@ -88,11 +88,13 @@ def test_study_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp
     assert "The model lacked Coulomb friction in left and right knee pitch." in text
     assert "falls from 4.20 to 1.01 times" in text
     assert "The noise floor is reached." in text
-    assert "YAML with the completed model" in text
-    # Joint angles of the simulated model [mrad].
+    assert "The scenario with the completed model" in text
+    # Joint positions of the simulated model [mrad].
     assert '<td class="number">12.0</td>' in text
     assert '<td class="number">2.00</td>' in text
-    assert "coulomb 1.5 Nm (1.4 to 1.6)" in text
+    assert "<td>1.50 [1.40,\u00a01.60]</td>" in text
+    # What was confusable when it was found stays so, whatever the last round says.
+    assert "4 effects: 1 present, 1 confusable, 1 absent, 1 not visible." in text
 
 
 @pytest.fixture
@@ -116,7 +118,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
                 "Presliding hysteresis explains this log as well as Coulomb friction in left and right knee pitch.",
                 "To tell them apart: Move by small amounts (fbse simulate squat",
                 "fbse add paper_walk out/a_walk --out",
-                "coulomb 1.5 Nm (1.4 to 1.6), transition 0.004 rad/s (0.001 to 0.007)",
+                "<td>1.50 [1.40,\u00a01.60]</td><td>0.00400 [0.00100,\u00a00.00700]</td>",
                 "<td>bias 0.02 Nm; none in right knee pitch</td>",
                 "<td>not visible</td><td>change none in left and right knee pitch</td>",
             ],
@@ -161,14 +163,153 @@ def test_study_that_finds_nothing_says_so(walk: tuple[Predictor, Comparison], tm
     assert "completed" not in text
 
 
-def test_falling_error_shows_both_errors_and_the_noise(walk: tuple[Predictor, Comparison]):
+def test_falling_error_shows_both_errors_and_the_noise():
     steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((MASS,), 1.01, 1.0, None))
-    (axes,) = figures.falling_error(Study(steps, (), "", walk[0].scenario)).axes
+    (axes,) = figures.falling_error(steps, "mrad").axes
     lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
     np.testing.assert_allclose(lines["held-out data"], [4.2, 1.3, 1.01])
     np.testing.assert_allclose(lines["data that it was fitted to"], [4.2, 1.2, 1.0])
     assert set(lines["sensors' noise"]) == {1.0}
     assert [label.get_text() for label in axes.get_xticklabels()][2] == "+ Body mass\n(trunk)"
+
+
+def test_torques_over_time_are_those_of_motors_and_of_both_models(walk: tuple[Predictor, Comparison]):
+    residual = walk[0].residual
+    halved = dataclasses.replace(residual, value=0.5 * residual.value)
+    knee, pitch = (residual.row_index[name] for name in ("left_knee_pitch", "left_ankle_pitch"))
+    shown = slice(100, 200)
+    figure = figures.torques_over_time(residual, halved, [knee, pitch], shown)
+    torques, _, errors, _ = figure.axes
+    lines = {line.get_label(): line.get_ydata() for line in torques.get_lines()}
+    measured, left = residual.signals.torque_command[shown, knee], residual.value[shown, knee]
+    np.testing.assert_allclose(lines["measured"], measured)
+    np.testing.assert_allclose(lines["the model as given"], measured - left)
+    np.testing.assert_allclose(lines["the completed model"], measured - 0.5 * left)
+    np.testing.assert_allclose([line.get_ydata() for line in errors.get_lines()], [left, 0.5 * left])
+    before, after = map(float, re.findall(r"([\d.]+) %", torques.get_title(loc="right")))
+    assert before == pytest.approx(100 * np.linalg.norm(left) / np.linalg.norm(measured), rel=0.05)
+    assert after == pytest.approx(0.5 * before, rel=0.1)
+    assert torques.get_ylabel() == "torque [Nm]"
+
+
+def test_channels_that_got_better_are_drawn_from_before_to_after(walk: tuple[Predictor, Comparison]):
+    channels = walk[1].channels[:2]
+    better = [dataclasses.replace(channels[0], rmse=channels[0].noise_floor), channels[1]]
+    (axes,) = figures.channel_errors(channels, better).axes
+    ratios = [channel.rmse / channel.noise_floor for channel in channels]
+    dots = [float(line.get_xdata()[0]) for line in axes.get_lines() if line.get_marker() == "o"]
+    np.testing.assert_allclose(dots, [ratios[0], 1.0, ratios[1]])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["left hip yaw", "left hip roll"]
+
+
+def rolled(size: float) -> RolloutError:
+    """Two recordings, joined, of a revolute and a prismatic joint."""
+    time = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
+    errors = {"knee": size, "slide": 2 * size}
+    shares = {"knee": 0.1 * size, "slide": 0.2 * size}
+    series = np.stack([np.full(200, error) for error in errors.values()], axis=1)
+    return RolloutError(errors, {}, {"knee": 3.0, "slide": 3.0}, 3.0, None, errors, shares, time, series)
+
+
+def test_errors_of_the_simulated_model_over_time_are_not_joined_over_gaps():
+    panels = figures.position_errors(rolled(0.02), rolled(0.005), ["Nm", "N"]).axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["knee", "slide"]
+    assert [axes.get_ylabel() for axes in panels] == ["error [mrad]", "error [mm]"]
+    lines = {line.get_label(): line.get_xydata() for line in panels[1].get_lines()}
+    before, after = lines["the model as given"], lines["the completed model"]
+    assert np.flatnonzero(np.isnan(before[:, 0])).tolist() == [100]
+    assert np.nanmax(before[:, 1]) == pytest.approx(40.0)
+    assert np.nanmax(after[:, 1]) == pytest.approx(10.0)
+
+
+def test_wide_intervals_do_not_hide_values():
+    wide = dataclasses.replace(FRICTION, parameters=FRICTION.parameters | {"coulomb": Estimate(2.0, (-1e6, 1e6), "Nm")})
+    axes = figures.parameters([(FRICTION, "first"), (wide, "second")]).axes[0]
+    low, high = axes.get_xlim()
+    assert -10 < low < high < 10
+    marks = {line.get_marker(): line.get_ydata().tolist() for line in axes.get_lines() if line.get_label() == "interval goes on"}
+    assert marks == {"<": [1], ">": [1]}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_errors_on_logs_that_were_not_fitted_are_told(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    given = {"train": ModelError(0.142, {"hip": 0.2, "knee": 0.1}, {}), "pulses": ModelError(0.25, {"hip": 0.3, "knee": 0.2}, {})}
+    completed = {name: ModelError(error.relative / 2, {"hip": 0.1, "knee": 0.05}, {}) for name, error in given.items()}
+    steps = (StudyStep((), 4.2, 4.2, None, given), StudyStep((FRICTION,), 1.3, 1.2, None, completed))
+    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    inputs = dataclasses.replace(INPUTS, tests=("pulses.npz",))
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, inputs, {"pulses": walk[0].motion.log})
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "On the log that was fitted 14.2 % before, 7.10 % after; on pulses (not fitted) 25.0 % before, 12.5 % after." in text
+    numbers = "".join(f'<td class="number">{value}</td>' for value in ("20.0", "10.0", "30.0", "10.0"))
+    assert f"<tr><td>hip</td>{numbers}</tr>" in text
+    assert "3.0 s of pulses (not fitted). Right above" in text
+    assert "fbse study out/a_walk/scenario.yaml walk.npz --test pulses.npz --out" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_positions_of_the_simulated_model_are_told_by_joint(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    def error(size: float) -> RolloutError:
+        by_joint = dict.fromkeys(walk[0].robot.joint_names, size)
+        return RolloutError(by_joint, {}, by_joint, 3.0, None, by_joint, by_joint, np.arange(3.0), np.full((3, 12), size))
+
+    steps = (StudyStep((), 4.2, 4.2, error(0.02)), StudyStep((FRICTION,), 1.01, 1.0, error(0.005)))
+    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    numbers = "".join(f'<td class="number">{value}</td>' for value in ("20.0", "5.00", "20.0", "5.00", "2.00", "0.500"))
+    assert f"<tr><td>left hip yaw</td><td>mrad</td>{numbers}</tr>" in text
+    assert "The simulated model, before and after" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_of_a_long_log_the_worst_stretch_is_shown(walk: tuple[Predictor, Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shown = []
+    monkeypatch.setattr(figures, "torques_over_time", lambda *arguments: shown.append(arguments) or figures.Figure())
+    monkeypatch.setattr(reports, "_SHOWN", 100)
+    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.01, 1.0, None))
+    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
+    (_, _, joints, stretch) = shown[0]
+    residual = walk[0].residual
+    power = (residual.value**2 / residual.variance)[:, joints].sum(axis=1)
+    assert stretch.stop - stretch.start == 100
+    assert power[stretch].sum() == pytest.approx(max(power[start : start + 100].sum() for start in range(len(power) - 99)))
+    assert "the part in which the model as given errs most" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_rounds_are_told_apart_and_what_is_left_is_said_once(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    again = dataclasses.replace(FRICTION, targets=("left_knee_pitch",), confusable_with=())
+    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((again,), 1.2, 1.1, None))
+    last = dataclasses.replace(UNKNOWN, ranking=(again,))
+    study = Study(steps, (made_diagnosis(), last), "no effect explains the rest", walk[0].scenario)
+    reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<th>Round</th>" in text
+    assert "<tr><td>left and right knee pitch</td><td>1</td>" in text
+    assert "<tr><td>left knee pitch</td><td>2</td>" in text
+    assert "no effect of the library explains, in left knee pitch (follows position)." in text
+    # It was added, so it is not lacking.
+    assert "The model also lacks" not in text
+    assert "fbse compare out/a_walk/completed.yaml" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_effects_without_a_place_on_the_robot_are_not_spoken_of(walk: tuple[Predictor, Comparison], tmp_path: Path):
+    """As feet on an arm."""
+    feet = EffectStatus("not_visible", "gain", "1", {}, "Stand on one foot.")
+    diagnosis = made_diagnosis(effects=STATUSES | {"FootForceGain": feet})
+    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "4 effects: 1 present, 1 confusable, 1 absent, 1 not visible." in text
+    assert "Foot force gain" not in text
+
+
+def test_effects_in_one_place_are_named_together():
+    bias = dataclasses.replace(FRICTION, effect="TorqueBias")
+    text = reports.diagnosis_outcome(made_diagnosis(ranking=(FRICTION, MASS, bias)))
+    assert text.startswith("The model lacks Coulomb friction and torque bias in left and right knee pitch and body mass in trunk;")
 
 
 def test_detectability_is_relative_to_what_is_plausible():
@@ -197,6 +338,12 @@ def test_an_effect_that_is_found_in_several_rounds_is_named_once(walk: tuple[Pre
     text = reports.study_outcome(Study(steps, (made_diagnosis(), made_diagnosis()), "", walk[0].scenario))
     assert text.startswith("The model lacked Coulomb friction in left knee pitch, right knee pitch, left hip yaw.")
     assert "the held-out error rises from 4.20 to 5.00 times" in text
+
+
+def test_many_targets_are_called_what_they_are():
+    bodies = [f"link_{k}" for k in range(5)]
+    assert figures.targets_text(bodies, "BodyMass") == "5 bodies"
+    assert figures.targets_text(bodies, "CoulombFriction") == "5 joints"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from fbse_drake.effects.friction import (
     CoulombFriction,
     CoulombViscousFriction,
     DirectionalFriction,
+    DirectionalViscousFriction,
     LoadDependentFriction,
     QuadraticDrag,
     ThermalDrift,
@@ -40,7 +41,7 @@ def recorded(samples: int = 300, joints: int = 2) -> JointMotion:
     velocity = 0.3 * np.sin(rate[0] * time + phase[0])
     position = 0.1 + np.cumsum(velocity, axis=0) * H
     command = 20.0 * np.sin(rate[1] * time + phase[1]) + generator.normal(size=(samples, joints))
-    return JointMotion(velocity, position, command, time + 2.0, H)
+    return JointMotion(velocity, position, command, time + 2.0, H, load=0.8 * command)
 
 
 def law(effect: JointTorqueEffect, motion: JointMotion) -> np.ndarray:
@@ -61,7 +62,8 @@ TRANSITION = {"all": 0.02}
         (ViscousFriction(viscous={"all": 2.0}), 2.0 * M.velocity),
         (CoulombViscousFriction({"all": 3.0}, {"all": 2.0}, TRANSITION), 3.0 * SIGN + 2.0 * M.velocity),
         (DirectionalFriction(asymmetry={"all": -1.5}, transition=TRANSITION), -1.5 * SIGN**2),
-        (LoadDependentFriction(coefficient={"all": 0.1}, transition=TRANSITION), 0.1 * np.abs(M.command) * SIGN),
+        (DirectionalViscousFriction(asymmetry={"all": -0.7}), -0.7 * np.abs(M.velocity)),
+        (LoadDependentFriction(coefficient={"all": 0.1}, transition=TRANSITION), 0.1 * np.abs(M.load) * SIGN),
         (QuadraticDrag(drag={"all": 4.0}), 4.0 * M.velocity**2 * np.sign(M.velocity)),
         (ThermalDrift({"all": -2.0}, {"all": 30.0}, TRANSITION), -2.0 * (1 - np.exp(-M.time / 30.0)) * SIGN),
         (TorqueRipple({"all": 1.0}, {"all": -0.5}, {"all": 80.0}), np.sin(80 * M.position) - 0.5 * np.cos(80 * M.position)),
@@ -82,6 +84,13 @@ def test_delay_shifts_the_command(steps: float):
     before = np.concatenate([np.repeat(M.command[:1], 31, axis=0), M.command])
     late = (1 - share) * before[31 - whole :][:300] + share * before[30 - whole :][:300]
     np.testing.assert_allclose(law(TorqueDelay(delay={"all": steps * H}), M), M.command - late, atol=1e-9)
+
+
+def test_past_commands_at_once_are_those_of_the_steps(monkeypatch: pytest.MonkeyPatch):
+    sets = np.array([[[0.0, 2e-3], [7.3e-3, 2.9e-2]]])
+    at_once = basis_over_time(TorqueDelay, M, sets)
+    monkeypatch.setattr(TorqueDelay, "memory_over_time", JointTorqueEffect.memory_over_time)
+    np.testing.assert_array_equal(at_once, basis_over_time(TorqueDelay, M, sets))
 
 
 @pytest.mark.parametrize("time_constant", [2e-4, 5e-3, 5e-2])
@@ -179,12 +188,15 @@ def swinging(effects: dict[str, Effect], *overrides: str) -> Log:
 
 def by_the_law(effects: dict[str, Effect], log: Log) -> np.ndarray:
     """Torque of each step from the recorded motion, shape (N - 1, n)."""
+    command, loss = log["joint/torque_command"], log["truth/joint/friction_torque"]
     motion = JointMotion(
         log["truth/joint/velocity"][1:],
         log["truth/joint/position"][:-1],
-        log["joint/torque_command"][:-1],
+        command[:-1],
         log.time[:-1, None],
         log.meta["period"],
+        # What passed the gear in the step before.
+        load=np.concatenate([command[:1], (command - loss)[:-2]]),
     )
     return sum(law(effect, motion) for effect in effects.values())
 
@@ -221,6 +233,7 @@ def test_every_effect_alone_spares_the_joints_that_are_not_named(kind: type[Join
         ThermalDrift(change={"all": 4.0}, warm_up={"all": 0.3}),
         PreslidingHysteresis(coulomb={"all": 2.0}),
         DirectionalFriction(asymmetry={"all": 1.0}, transition={"all": 0.05}),
+        DirectionalViscousFriction(asymmetry={"all": -2.0}),
     ],
     ids=lambda effect: type(effect).__name__,
 )

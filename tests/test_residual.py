@@ -145,7 +145,7 @@ def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
         ("imu__linear_acceleration", lambda x: -x, "sign is reversed"),
         ("imu__linear_acceleration", lambda x: x[:, [2, 1, 0]], "frame is wrong"),
         ("imu__linear_acceleration", lambda x: x / 9.81, "gravity is missing"),
-        ("foot__left__pad_force", lambda x: -x, "unit, scale"),
+        ("foot__left__pad_force", lambda x: -x, "foot/left: this foot pulls at the ground.*sign is reversed"),
         ("joint__torque_command", lambda x: -x, "sign is reversed"),
         ("joint__torque_command", lambda x: 1000 * x, "unit is wrong"),
         ("joint__position", np.rad2deg, "degrees"),

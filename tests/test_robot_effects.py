@@ -20,9 +20,13 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import BodyCentreOfMass, BodyMass, ReflectedInertia
 from fbse_drake.effects.sensor import (
     AccelerometerBias,
+    AccelerometerGain,
     EncoderOffset,
     FootForceBias,
     FootForceGain,
+    FootForceLag,
+    FootForceMisalignment,
+    FootMomentBias,
     GyroscopeBias,
     ImuMisalignment,
     SensorEffect,
@@ -41,6 +45,10 @@ POSE = RigidTransform(Quaternion(Rotation.from_rotvec([0.2, -0.3, 0.5]).as_quat(
 SENSOR_EFFECTS = [
     FootForceGain(gain={"left": 0.1, "right": -0.05}),
     FootForceBias(x={"left": 3.0}, z={"right": -4.0}),
+    FootMomentBias(y={"left": 1.0, "right": -0.5}),
+    FootForceMisalignment(x={"left": 0.05}, y={"all": 0.1}),
+    FootForceLag({"left": 0.004, "right": 0.02}),
+    AccelerometerGain(0.02),
     ImuMisalignment(0.02, -0.03, 0.1),
     AccelerometerBias(0.1, 0.2, -0.3),
     GyroscopeBias(0.01, -0.02, 0.03),
@@ -258,6 +266,55 @@ def test_foot_force_errors(plain: Robot):
     np.testing.assert_allclose(biased, np.broadcast_to(np.repeat([[0, 0, -1], [0, 2, -1]], 4, axis=0), force.shape), atol=1e-12)
 
 
+def wrenches(robot: Robot, force: np.ndarray) -> np.ndarray:
+    """By hand: [moment, force] of each foot from the forces on its pads or corners, (..., feet, 6)."""
+    places = [robot.pad_positions(side) for side in robot.description.sides]
+    parts = np.split(force, np.cumsum([len(p) for p in places])[:-1], axis=-2)
+    return np.stack(
+        [np.concatenate([np.cross(p, f).sum(axis=-2), f.sum(axis=-2)], axis=-1) for p, f in zip(places, parts, strict=True)], axis=-2
+    )
+
+
+@pytest.mark.parametrize("description", ["biped", "strider"])
+def test_foot_wrench_errors(description: str):
+    """Feet with pads and feet with six-axis sensors."""
+    robot = build_robot(RobotConfig(description))
+    n, points = len(robot.joint_names), sum(leg.points for leg in robot.description.legs.values())
+    first, second = robot.description.sides
+    force = np.random.default_rng(0).normal(scale=50, size=(400, points, 3))
+    none, still = np.zeros((400, n)), np.zeros((400, 3))
+    signals = SensorSignals(none, none, still, still, force, none)
+    true = wrenches(robot, force)
+
+    def read(effect: SensorEffect) -> np.ndarray:
+        return wrenches(robot, effect.distorted(signals, effect.resolve(robot.description), robot, TICK).pad_force)
+
+    moment = read(FootMomentBias(x={first: 2.0}, z={"all": -1.0})) - true
+    np.testing.assert_allclose(moment, np.broadcast_to([[2, 0, -1, 0, 0, 0], [0, 0, -1, 0, 0, 0]], moment.shape), atol=1e-10)
+    angle = np.array([0.1, -0.2, 0.3])
+    turned = read(FootForceMisalignment(*({second: value} for value in angle)))
+    R_FS = Rotation.from_rotvec(angle)
+    np.testing.assert_allclose(turned[:, 0], true[:, 0], atol=1e-9)
+    for part in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(turned[:, 1, part], R_FS.inv().apply(true[:, 1, part]), atol=1e-9)
+    # A low-pass of first order that starts with the first reading.
+    lag = FootForceLag({first: 0.03})
+    late, stays = read(lag), 0.03 / (0.03 + TICK)
+    expected = true[:, 0].copy()
+    for k in range(1, len(expected)):
+        expected[k] = stays * expected[k - 1] + (1 - stays) * true[k, 0]
+    np.testing.assert_allclose(late[:, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(late[:, 1], true[:, 1], atol=1e-9)
+    # And what was lost in it is had back.
+    resolved = lag.resolve(robot.description)
+    lagged = lag.distorted(signals, resolved, robot, TICK)
+    undone = lag.undone(lagged, lag.memory_over_time(lagged, resolved, robot, TICK), resolved, robot, TICK)
+    np.testing.assert_allclose(wrenches(robot, undone.pad_force), true, atol=1e-8)
+    if description == "strider":
+        offset = read(FootForceBias(x={first: 5.0}, z={second: -7.0})) - true
+        np.testing.assert_allclose(offset, np.broadcast_to([[0, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, -7]], offset.shape), atol=1e-10)
+
+
 def test_elastic_transmission_follows_the_command_as_a_low_pass():
     compliance, time_constant = 5e-5, 0.008
     log = simulated(
@@ -393,6 +450,7 @@ def test_effects_of_size_zero_change_no_bit():
     zero = [
         FootForceGain({"all": 0.0}),
         FootForceBias(x={"all": 0.0}),
+        AccelerometerGain(),
         ImuMisalignment(),
         AccelerometerBias(),
         GyroscopeBias(),

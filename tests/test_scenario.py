@@ -70,7 +70,7 @@ def test_the_model_is_the_robot_without_its_effects():
     [
         ("mine: {sed: 1}", r"mine\.yaml: mine: sed: unknown key, did you mean seed\? \(allowed: title, seed,"),
         ("mine: {reference: !Walk {step_lenght: 1}}", r"reference\.step_lenght: unknown key, did you mean step_length\?"),
-        ("mine: {reference: !Hop {}}", r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, found the tag !Hop"),
+        ("mine: {reference: !Hop {}}", r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop"),
         ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
         ("mine: {duration: .nan}", r"duration: expected a finite number, found nan"),
         ("mine: {duration: -1}", r"duration: expected a number > 0, found -1"),

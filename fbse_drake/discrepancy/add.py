@@ -7,6 +7,7 @@ from typing import Any
 
 from fbse_drake.discrepancy.diagnose import Estimate, Finding
 from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
 from fbse_drake.scenario import Scenario
 
@@ -52,15 +53,35 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
         InputError: an effect that the library does not have.
     """
     by_effect: dict[str, dict[str, dict[str, float]]] = {}
+    # Inertia was fitted beside just these values.
+    as_fitted = any(finding.effect == InertialParameters.__name__ for finding in findings)
     for finding in findings:
         values = by_effect.setdefault(finding.effect, {})
         for name, estimate in finding.parameters.items():
-            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, estimate.value))
+            value = estimate.value if as_fitted else _settled(finding.effect, name, estimate)
+            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, value))
     model = scenario.believed
     effects = dict(model.effects)
     for name, values in by_effect.items():
-        effects[_free_key(name, effects)] = _make(name, values)
+        effect = _make(name, values)
+        if isinstance(effect, InertialParameters):
+            earlier = {key: other for key, other in effects.items() if isinstance(other, InertialParameters)}
+            effect = sum(earlier.values(), effect)
+            effects = {key: other for key, other in effects.items() if key not in earlier}
+        effects[_free_key(name, effects)] = effect
     return replace(scenario, model=replace(model, effects=effects))
+
+
+def _settled(effect: str, name: str, estimate: Estimate) -> float:
+    """The value that a parameter gets. A velocity of transition of which the data do not say that the default is wrong keeps it: friction
+    must hold a joint at rest also where nobody saw how steep it is.
+    """
+    kind = library().get(effect)
+    if kind is None or name != "transition":
+        return estimate.value
+    default = kind().transition["all"]
+    low, high = estimate.interval
+    return default if low <= default <= high else estimate.value
 
 
 def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:

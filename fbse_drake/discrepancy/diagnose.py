@@ -7,11 +7,13 @@ from typing import Any, Literal
 import numpy as np
 
 from fbse_drake.discrepancy.experiment import Experiments
+from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.search import MARGIN, Candidate, Explanation, Search
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
@@ -88,6 +90,8 @@ class Diagnosis:
     held_out_before: float
     held_out_after: float
     train_after: float
+    # Inertial parameters that were identified along, of bodies whose own are not trusted; see `IdentifyConfig`.
+    inertia: IdentifiedInertia | None = None
 
     @property
     def chosen(self) -> list[Finding]:
@@ -101,6 +105,13 @@ def suspected_bodies(predictor: Predictor) -> list[str]:
     return [name for name in robot.body_names if robot.body(name).default_mass() > _LIGHT_BODY * total]
 
 
+def plausible_effects(predictor: Predictor) -> list[type[Effect]]:
+    """The library but for what the scenario rules out, and for what acts in the joints of a log without torques."""
+    torques = "joint/torque_command" in predictor.motion.log
+    known = {name: effect for name, effect in library().items() if name not in predictor.scenario.identify.ruled_out}
+    return [effect for effect in known.values() if torques or not issubclass(effect, JointTorqueEffect)]
+
+
 def diagnose(
     predictor: Predictor, effects: Iterable[type[Effect]] | None = None, *, progress: Callable[[str], None] | None = None
 ) -> Diagnosis:
@@ -110,14 +121,16 @@ def diagnose(
     is tried against all others in its place. An effect counts if it beats what chance would bring once in a thousand logs.
 
     Args:
-        effects: what is tried; by default the library.
+        effects: what is tried; by default `plausible_effects`.
         progress: called with a word on what is being done.
     """
     say = progress or (lambda _: None)
     say("predicting what each effect would do")
-    search = Search(predictor, library().values() if effects is None else effects, suspected_bodies(predictor))
+    search = Search(predictor, plausible_effects(predictor) if effects is None else effects, suspected_bodies(predictor))
+    before = search.white.sse
     path = select(search, say)
-    final = path[-1]
+    final, inertia = search.consistent(path[-1])
+    path[-1] = final
     say("looking at what is left")
     unexplained = leftover_structure(search, final)
     say("finding what would have been seen")
@@ -126,7 +139,7 @@ def diagnose(
     statuses = {e.__name__: _status(search, final, e, rivals, experiments) for e in search.effects}
     if unexplained and not _well_explained(search.white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif final.candidates:
+    elif final.candidates or (inertia is not None and final.deviance < search.white.deviance(search.white.sse) - MARGIN):
         verdict = "effect_found"
     else:
         hidden = sum(status.verdict == "not_visible" for status in statuses.values())
@@ -134,17 +147,21 @@ def diagnose(
     white = search.white
     return Diagnosis(
         verdict,
-        tuple(_ranking(search, path, rivals)),
+        (*_ranking(search, path, rivals), *inertia_findings(search.white, before, path[0], inertia)),
         statuses,
         tuple(unexplained),
         tuple(path),
-        *(_rms(white, sse) for sse in (path[0].held_out_sse, final.held_out_sse, final.sse)),
+        *(_rms(white, sse) for sse in (before, final.held_out_sse, final.sse)),
+        inertia,
     )
 
 
 def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[Explanation]:
     """Explanations by forward selection, from none to the last that improves significantly."""
     path = [search.explain([])]
+    if search.inertia is not None:
+        path.append(search.doubting(_pruned(search, search.plain_friction())))
+        say("fitted inertia and plain friction")
     while len(path[-1].candidates) < _MOST_EFFECTS:
         base = path[-1]
         additions = search.best_additions(base)
@@ -157,6 +174,15 @@ def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[
             break
         path.append(search.polished(search.doubting(chosen)))
     return path
+
+
+def _pruned(search: Search, explanation: Explanation) -> Explanation:
+    """An explanation without the members that bring no more than chance."""
+    for member in explanation.candidates:
+        rest = search.explain([c for c in explanation.candidates if c is not member])
+        if not search.is_significant(rest, search.explain([*rest.candidates, member]), member):
+            explanation = rest
+    return explanation
 
 
 def _spread(search: Search, additions: list[Explanation]) -> Explanation:
@@ -239,7 +265,7 @@ def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Exp
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
         equal = tuple(dict.fromkeys(e.candidates[-1].name for e in rivals[k] if e.deviance < final.deviance + MARGIN))
-        findings.append(_finding(white, rest, final, member, equal, chosen=True))
+        findings.append(finding_of(white, rest, final, member, equal, chosen=True))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted((e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance)
     for explanation in others:
@@ -247,15 +273,21 @@ def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Exp
         if (member.name, member.targets) not in seen:
             seen.add((member.name, member.targets))
             rest = search.explain(explanation.candidates[:-1])
-            findings.append(_finding(white, rest, explanation, member, (), chosen=False))
+            findings.append(finding_of(white, rest, explanation, member, (), chosen=False))
     return findings
 
 
-def _finding(
+def finding_of(
     white: WhitenedResidual, before: Explanation, after: Explanation, member: Candidate, equal: tuple[str, ...], *, chosen: bool
 ) -> Finding:
+    """What a member of an explanation brings.
+
+    Args:
+        before, after: explanations without and with it.
+        equal: effects that explain as much.
+    """
     values, intervals = after.values(member)
-    parameters = {name: Estimate(values[name], intervals[name], member.effect.parameters[name].unit) for name in values}
+    parameters = {name: Estimate(values[name], intervals[name], member.parameters[name].unit) for name in values}
     rows = member.signature.rows
     return Finding(
         member.name,
@@ -266,6 +298,26 @@ def _finding(
         equal,
         chosen,
     )
+
+
+def inertia_findings(white: WhitenedResidual, before: np.ndarray, alone: Explanation, inertia: IdentifiedInertia | None) -> list[Finding]:
+    """Changes of the inertial parameters of each body.
+
+    Args:
+        before: sum of squares of each row of the model as it is.
+        alone: the explanation by inertia alone.
+    """
+    if inertia is None:
+        return []
+    findings = []
+    for body, values, widths in zip(inertia.bodies, inertia.change, inertia.half_width, strict=True):
+        parameters = {
+            name: Estimate(float(value), (float(value - width), float(value + width)), InertialParameters.parameters[name].unit)
+            for name, value, width in zip(PARAMETERS, values, widths, strict=True)
+        }
+        errors = (_rms(white, sse) for sse in (before, alone.held_out_sse))
+        findings.append(Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True))
+    return findings
 
 
 def _well_explained(white: WhitenedResidual, final: Explanation, unexplained: Sequence[Structure]) -> bool:
@@ -293,12 +345,13 @@ def _status(
         verdict = "confusable"
         member = mistaken_for[0]
         scenario = experiments.that_separates(member.effect, member.targets, final.values(member)[0], effect)
-    elif min(smallest.values(), default=np.inf) > effect.largest_plausible():
+    elif all(size > search.largest_plausible(effect, target) for target, size in smallest.items()):
         verdict = "not_visible"
         scenario = experiments.that_shows(effect)
     else:
         verdict = "absent"
-    return EffectStatus(verdict, parameter, effect.parameters[parameter].unit, smallest, effect.experiment, scenario)
+    units = dict.fromkeys(search.parameters(effect, target)[parameter].unit for target in smallest) or [effect.parameters[parameter].unit]
+    return EffectStatus(verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario)
 
 
 def _equals(explanation: Explanation, final: Explanation, effect: type[Effect]) -> bool:

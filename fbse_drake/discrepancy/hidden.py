@@ -117,6 +117,7 @@ _RECIPES = {
         everywhere=True,
     ),
     "DirectionalFriction": Recipe((0.5, 5.0), lambda draw, size: {"asymmetry": draw.either(size), **_sharp(draw)}),
+    "DirectionalViscousFriction": Recipe((0.2, 8.0), _signed("asymmetry")),
     "LoadDependentFriction": Recipe((0.01, 0.2), lambda draw, size: {"coefficient": size, **_sharp(draw)}, everywhere=True),
     "QuadraticDrag": Recipe((0.5, 8.0), _one("drag")),
     "ThermalDrift": Recipe((1.0, 10.0), lambda draw, size: {"change": size, "warm_up": draw.between(2, 15), **_sharp(draw)}),

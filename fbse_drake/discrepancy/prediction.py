@@ -27,13 +27,14 @@ from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import located
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
+from fbse_drake.sensors.foot_force import force_noise
 
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take them.
 _SMOOTHING = 9
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
 _LAW_DOUBT = 8.0
-# How often the effect of a sensor is taken off its signals: it is small, and each time leaves a share of its own size.
-_UNDOING = 3
+# A column that is smaller than this share of the others is rounding.
+_ROUNDING = 1e-9
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
 
@@ -55,7 +56,7 @@ class Predictor:
         self.motion = RecordedMotion(self.robot, scenario.sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
-                memory = known.effect.memory_over_time(self.motion.signals, known, self.motion.period)
+                memory = known.effect.memory_over_time(self.motion.signals, known, self.robot, self.motion.period)
                 self.motion.signals = self._undone(known, memory)
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
 
@@ -96,7 +97,7 @@ class Predictor:
         Of a noise that is added to the measured forces once more.
         """
         force = self.motion.signals.pad_force
-        noise = self.motion.sensors.foot_force.noise * np.random.default_rng(0).standard_normal(force.shape)
+        noise = force_noise(self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0))
         motions = [
             [GroundCompliance.sole_motion(f, pads, self._sample_time) for f, pads in self._split_feet(forces)]
             for forces in (force, force + noise)
@@ -108,9 +109,12 @@ class Predictor:
         """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
 
         A law of the velocity does not say at which velocity within a step it holds: its torque is uncertain by its slope times what the
-        velocity changes in the step. This counts where a sticking joint trembles.
+        velocity changes in the step. This counts where a sticking joint trembles. Of rows that are sampled at an instant
+        nothing is doubted.
         """
         motion, joint_motion = self.motion, self.joint_motion
+        if motion.recording.rows == "instantaneous":
+            return np.zeros(motion.blocks.joint_position.shape)
         slope = np.zeros(joint_motion.velocity.shape)
         for law in laws:
             if not law.effect.has_memory:
@@ -154,7 +158,17 @@ class Predictor:
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
+            # A model whose inertia is not trusted does not know the load.
+            load=at.torque_command - (0.0 if self.scenario.identify.inertia else self._loss),
         )
+
+    @cached_property
+    def _loss(self) -> np.ndarray:
+        """What the links do not get of the command by the rigid model, smoothed over three blocks, step by step, (N - 1, n)."""
+        motion, n = self.motion, len(self.robot.joint_names)
+        loss = _smooth(motion.residual.value[:, :n])
+        time = motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
+        return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
 
     def joint_columns(
         self, effect: type[JointTorqueEffect], nonlinear: np.ndarray, joints: np.ndarray, *, noisier: bool = False
@@ -169,15 +183,15 @@ class Predictor:
         Returns:
             Shape (p, B, T), or (p, G, B, T).
         """
-        whole, length = self.noisier_joint_motion if noisier else self.joint_motion, self.motion.length
-        motion = replace(whole, **{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command")})
+        whole = self.noisier_joint_motion if noisier else self.joint_motion
+        motion = replace(whole, **{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command", "load")})
         if nonlinear.ndim == 2:
-            return np.stack([block_means(column, length) for column in basis_over_time(effect, motion, nonlinear)])
+            return np.stack([self.motion.averages(column) for column in basis_over_time(effect, motion, nonlinear)])
         sets = max(1, _CHUNK // motion.velocity.size)
         parts = []
         for start in range(0, nonlinear.shape[1], sets):
             columns = basis_over_time(effect, motion, nonlinear[:, start : start + sets])
-            parts.append([[block_means(column, length) for column in group] for group in columns])
+            parts.append([[self.motion.averages(column) for column in group] for group in columns])
         return np.concatenate([np.array(part) for part in parts], axis=1)
 
     def signature(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> Signature:
@@ -196,14 +210,22 @@ class Predictor:
             names = [name for name, parameter in effect.parameters.items() if parameter.linear]
             units = np.diag([_probe(effect, name) for name in names])
             columns = [self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units]
-            values = np.stack(columns, axis=2)
+            values = _without_rounding(np.stack(columns, axis=2))
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
 
     @cached_property
     def _smooth_blocks(self) -> Instants:
-        """Averages at which derivatives are taken. Accelerations are smoothed further: their noise is in the residual too."""
-        return _smoothed(self.motion.blocks)
+        """Averages at which derivatives are taken."""
+        return self._smoothed(self.motion.blocks)
+
+    def _smoothed(self, blocks: Instants) -> Instants:
+        """Averages with accelerations that are smoothed further, for their noise is in the residual too. Not those of a recording that is
+        low-passed: little noise is left in them, and smoothing would take motion."""
+        if self.motion.recording.cutoff > 0:
+            return blocks
+        smooth = {name: _smooth(getattr(blocks, name)) for name in ("joint_acceleration", "angular_acceleration")}
+        return replace(blocks, **smooth)
 
     @cached_property
     def _residual_at_blocks(self) -> np.ndarray:
@@ -217,11 +239,11 @@ class Predictor:
             "joint_velocity": joint_velocity_noise(sensors),
             "specific_force": sensors.imu.acceleration_noise,
             "angular_velocity": sensors.imu.angular_velocity_noise,
-            "pad_force": sensors.foot_force.noise,
         }
         more = {name: getattr(motion.signals, name) for name in noise}
         added = {name: values + noise[name] * random.standard_normal(values.shape) for name, values in more.items()}
-        return replace(motion.signals, **added)
+        noisy_force = motion.signals.pad_force + force_noise(sensors.foot_force, self.robot, len(motion.signals.pad_force), random)
+        return replace(motion.signals, pad_force=noisy_force, **added)
 
     @cached_property
     def _noisier_blocks(self) -> Instants:
@@ -234,7 +256,7 @@ class Predictor:
 
     def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
         """What that noise adds to the signature of an inertia effect: regressors are measured too."""
-        noisy = _smoothed(self._noisier_blocks)
+        noisy = self._smoothed(self._noisier_blocks)
         dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
         without = self.motion.equation.residual(noisy, kinematic=False)
         columns = np.zeros((len(without), self.rows, len(effect.parameters)))
@@ -267,7 +289,7 @@ class Predictor:
             moved = linear.copy()
             moved[k] += _probe(effect, name)
             slopes.append((self._addition(effect, target, moved, nonlinear) - here) / _probe(effect, name))
-        values = np.stack(slopes, axis=2)
+        values = _without_rounding(np.stack(slopes, axis=2))
         rows = elsewhere.rows
         return replace(elsewhere, values=values[:, rows], offset=(here - values @ linear)[:, rows])
 
@@ -288,22 +310,17 @@ class Predictor:
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self._undone(resolved, self._memory(effect, resolved))
         blocks = averaged(motion.steps_of(signals), motion.length)
-        return self._residual_at_blocks - motion.equation.residual(_smoothed(blocks))
+        return self._residual_at_blocks - motion.equation.residual(self._smoothed(blocks))
 
     def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
         """Signals that the effect turns into those of the log."""
-        measured = signals = self.motion.signals
-        for _ in range(_UNDOING):
-            read = effect.effect.reading(signals, memory, effect, self.robot)
-            off = {name: getattr(measured, name) - getattr(read, name) for name in vars(measured)}
-            signals = SensorSignals(**{name: getattr(signals, name) + off[name] for name in off})
-        return signals
+        return effect.effect.undone(self.motion.signals, memory, effect, self.robot, self.motion.period)
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
-        """What an effect remembers over the log. It depends on the nonlinear parameters alone."""
+        """What an effect remembers over the log. It depends on the nonlinear parameters alone, where `undone` needs it."""
         key = (effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
-            self._memories[key] = effect.memory_over_time(self.motion.signals, resolved, self.motion.period)
+            self._memories[key] = effect.memory_over_time(self.motion.signals, resolved, self.robot, self.motion.period)
         return self._memories[key]
 
     def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
@@ -367,15 +384,16 @@ class Predictor:
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
 
 
-def _smoothed(blocks: Instants) -> Instants:
-    """Averages with smoothed accelerations."""
-    return replace(blocks, joint_acceleration=_smooth(blocks.joint_acceleration), angular_acceleration=_smooth(blocks.angular_acceleration))
-
-
 def _smooth(values: np.ndarray) -> np.ndarray:
     """Binomial smoothing over three blocks."""
     padded = np.concatenate([values[:1], values, values[-1:]])
     return 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
+
+
+def _without_rounding(values: np.ndarray) -> np.ndarray:
+    """Columns (..., p) in which nothing but the rounding of the others is left, made zero: they would ask for boundless parameters."""
+    largest = np.abs(values).max(axis=tuple(range(values.ndim - 1)))
+    return np.where(largest > _ROUNDING * largest.max(), values, 0.0)
 
 
 def _probe(effect: type[Effect], name: str) -> float:

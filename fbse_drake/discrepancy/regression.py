@@ -11,9 +11,10 @@ from scipy.stats import t as student
 
 from fbse_drake.discrepancy.residual import Residual
 
-# Length of a stretch whose errors may be correlated in any way [s], and in how many folds these stretches are held out in turn. Folds and
-# stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
+# Length of a stretch whose errors may be correlated in any way [s], not less than so many blocks, and in how many folds these stretches are
+# held out in turn. Folds and stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
 STRETCH = 0.25
+_FEWEST_BLOCKS = 10
 FOLDS = 5
 # Long stretches are this many short ones.
 _LONG = 4
@@ -46,6 +47,8 @@ class Fit:
     deviation: np.ndarray
     # Degrees of freedom of each parameter's interval: stretches that bear on it, shape (P,).
     freedom: np.ndarray
+    # Covariance with these deviations, (P, P); correlations as of white noise.
+    covariance: np.ndarray
     # Sum of squares of the whitened residual in each row: over all blocks, and with each block predicted from the other folds, (R,).
     sse: np.ndarray
     held_out_sse: np.ndarray
@@ -77,7 +80,7 @@ class WhitenedResidual:
         # How many blocks' worth of each row's variance is doubt about laws rather than noise of sensors, (R,).
         self.doubt = np.where(residual.known, residual.doubt / np.maximum(residual.variance, 1e-18), 0.0).sum(axis=0)
         blocks = len(residual.time)
-        per_stretch = max(1, round(STRETCH / (residual.time[1] - residual.time[0])))
+        per_stretch = max(_FEWEST_BLOCKS, round(STRETCH / (residual.time[1] - residual.time[0])))
         self.stretch = np.arange(blocks) // per_stretch
         self.fold = self.stretch % FOLDS
 
@@ -121,6 +124,7 @@ class WhitenedResidual:
         sizes = [s.values.shape[2] for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         parameters, deviation, freedom = np.zeros(sum(sizes)), np.zeros(sum(sizes)), np.ones(sum(sizes))
+        covariance = np.zeros((sum(sizes), sum(sizes)))
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         # Those that share no row have nothing to do with each other.
         for group in _connected(signatures):
@@ -128,8 +132,9 @@ class WhitenedResidual:
             at = np.concatenate([places[k] for k in group])
             rows = np.unique(np.concatenate([signatures[k].rows for k in group]))
             parameters[at], deviation[at], freedom[at] = part.parameters, part.deviation, part.freedom
+            covariance[np.ix_(at, at)] = part.covariance
             sse[rows], held_out_sse[rows] = part.sse[rows], part.held_out_sse[rows]
-        return Fit(parameters, deviation, freedom, sse, held_out_sse)
+        return Fit(parameters, deviation, freedom, covariance, sse, held_out_sse)
 
     def _fit_together(self, signatures: Sequence[Signature]) -> Fit:
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
@@ -149,11 +154,11 @@ class WhitenedResidual:
         scale = self.scale(self.sse)[rows]
         for _ in range(_REWEIGHTINGS if len(rows) > 1 else 1):
             grams, rights = _moments(X, y, scale)
-            theta = _solve(grams.sum(axis=0) + prior, rights.sum(axis=0), lowest)
+            theta = bounded_least_squares(grams.sum(axis=0) + prior, rights.sum(axis=0), lowest)
             scale = np.maximum(((y - X @ theta) ** 2).sum(axis=0) / np.maximum(self.count[rows], 1), 1.0)
         grams, rights = _moments(X, y, scale)
         gram, right = grams.sum(axis=0) + prior, rights.sum(axis=0)
-        theta = _solve(gram, right, lowest)
+        theta = bounded_least_squares(gram, right, lowest)
         left = y - X @ theta
 
         # Sandwich: what is left in a stretch may be correlated in any way. Of many short stretches and few long ones, the wider counts.
@@ -174,10 +179,12 @@ class WhitenedResidual:
         held_out = np.empty_like(left)
         for fold in range(FOLDS):
             out = self.fold == fold
-            held_out[out] = y[out] - X[out] @ _solve(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest)
+            held_out[out] = y[out] - X[out] @ bounded_least_squares(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest)
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         sse[rows], held_out_sse[rows] = (left**2).sum(axis=0), (held_out**2).sum(axis=0)
-        return Fit(theta / norm, deviation / norm, freedom, sse, held_out_sse)
+        # White noise alone would give the deviations of the bread.
+        wider = deviation / np.maximum(np.sqrt(np.diag(bread)), 1e-300) / norm
+        return Fit(theta / norm, deviation / norm, freedom, bread * np.outer(wider, wider), sse, held_out_sse)
 
 
 def _connected(signatures: Sequence[Signature]) -> list[list[int]]:
@@ -201,7 +208,7 @@ def _moments(X: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarra
     return weighted @ X, (weighted @ y[:, :, None])[:, :, 0]
 
 
-def _solve(gram: np.ndarray, right: np.ndarray, lowest: np.ndarray) -> np.ndarray:
+def bounded_least_squares(gram: np.ndarray, right: np.ndarray, lowest: np.ndarray) -> np.ndarray:
     """Least squares with parameters not below their bounds: what would be below is held there."""
     free, theta = np.ones(len(right), dtype=bool), np.zeros(len(right))
     while free.any():

@@ -12,8 +12,10 @@ noise whose covariance is known: white noise (accelerometer, forces) stays white
 average of order one, so that each row's covariance is tridiagonal.
 """
 
+import fnmatch
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -27,6 +29,7 @@ from fbse_drake.estimators.foot_pads import FootPads, measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
+from fbse_drake.sensors.foot_force import wrench_deviations
 
 # Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
 _ORDER, _PADDING = 4, 100
@@ -66,7 +69,8 @@ def residual_rows(robot: Robot) -> list[Row]:
 def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
-    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced.
+    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced; without
+    `joint/torque_command` torques are 0.
 
     Returns:
         The signals, N samples, and which of them are measured (not interpolated over a gap), shape (N,).
@@ -83,16 +87,12 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
     known = np.ones(len(grid), dtype=bool)
     if not even:
         known = (time[after] - time[after - 1] < 1.5 * period) | (time[after] - grid < 1e-3 * period)
-    stretches = _stretches(known)
+    # What is smoothed or differenced is not so across the switching of a drive, where torques jump.
+    latest = np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)
+    stretches = _stretches(known, log["joint/enabled"][latest] if "joint/enabled" in log else None)
 
     def low_passed(values: np.ndarray) -> np.ndarray:
-        if recording.cutoff == 0:
-            return values
-        result = values.copy()
-        filter_ = butter(_ORDER, recording.cutoff, fs=1 / period, output="sos")
-        for stretch in stretches:
-            result[stretch] = sosfiltfilt(filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING))
-        return result
+        return _low_passed(values, recording.cutoff, period, stretches)
 
     def on_grid(values: np.ndarray) -> np.ndarray:
         if even:
@@ -102,7 +102,7 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
         return low_passed((1 - share) * values[after - 1] + share * values[after])
 
     def held(values: np.ndarray) -> np.ndarray:
-        return low_passed(values if even else values[np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)])
+        return low_passed(values if even else values[latest])
 
     def rate(values: np.ndarray) -> np.ndarray:
         result = np.zeros_like(values)
@@ -122,7 +122,7 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
         pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
     measured = "joint/velocity" in log and recording.velocity == "measured"
-    torque = log["joint/torque_command"]
+    torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
     signals = SensorSignals(
         joint_position=q,
         joint_velocity=on_grid(log["joint/velocity"]) if measured else rate(q),
@@ -134,10 +134,34 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
     return signals, known
 
 
-def _stretches(known: np.ndarray) -> list[slice]:
-    """Runs of samples between gaps."""
-    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
-    return [slice(start, stop) for start, stop in edges.reshape(-1, 2)]
+def _low_passed(values: np.ndarray, cutoff: float, period: float, stretches: list[slice]) -> np.ndarray:
+    """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a corner of 0."""
+    if cutoff == 0:
+        return values
+    result = values.copy()
+    filter_ = _butterworth(cutoff, period)
+    for stretch in stretches:
+        result[stretch] = sosfiltfilt(filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING))
+    return result
+
+
+@cache
+def _butterworth(cutoff: float, period: float) -> np.ndarray:
+    return butter(_ORDER, cutoff, fs=1 / period, output="sos")
+
+
+def _stretches(known: np.ndarray, enabled: np.ndarray | None = None) -> list[slice]:
+    """Runs of samples between gaps, in which no drive is switched on or off.
+
+    Args:
+        enabled: which drives are on, (N, n).
+    """
+    switched = np.zeros(len(known), dtype=bool)
+    if enabled is not None:
+        switched[1:] = np.any(np.diff(enabled, axis=0) != 0, axis=1)
+    run = np.where(known, 1 + np.cumsum(switched), 0)
+    edges = np.flatnonzero(np.diff(run, prepend=0, append=0))
+    return [slice(start, stop) for start, stop in pairwise(edges) if known[start]]
 
 
 @dataclass(frozen=True)
@@ -246,30 +270,17 @@ class EquationOfMotion:
         """
         robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
         M, v = len(at.joint_position), len(order)
-        state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
-        q_index, v_index = robot.position_index, plant.num_positions() + order
+        states, accelerations = self.plant_motion(at)
+        rates = states[:, plant.num_positions() + order]
         forces = MultibodyForces(plant)
-        rates = np.zeros((M, v))
-        accelerations = np.zeros((M, plant.num_velocities()))
-        rates[:, self._joints] = at.joint_velocity
-        accelerations[:, robot.velocity_index] = at.joint_acceleration
         floating = robot.has_floating_base
-        if floating:
-            R_BI, p_BI = self.R_BI, self.p_BI
-            w, w_dot = at.angular_velocity @ R_BI.T, at.angular_acceleration @ R_BI.T
-            # Specific force of the base's origin: less the lever arm's turning.
-            f = at.specific_force @ R_BI.T - np.cross(w_dot, p_BI) - np.cross(w, np.cross(w, p_BI))
-            rates[:, :3] = w
-            accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
         wrenches = self.wrenches(at.pad_force) if floating else []
         soles = [robot.sole(side) for side in robot.description.sides] if floating else []
         extra = len(residual_rows(robot)) - v if kinematic else 0
         result = np.empty((M, v + extra))
         world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
         for k in range(M):
-            state[q_index] = at.joint_position[k]
-            state[v_index] = rates[k]
-            plant.SetPositionsAndVelocities(context, state)
+            plant.SetPositionsAndVelocities(context, states[k])
             if not floating:
                 plant.CalcForceElementsContribution(context, forces)
             generalized = plant.CalcInverseDynamics(context, accelerations[k], forces)[order]
@@ -293,6 +304,31 @@ class EquationOfMotion:
         # Joints first.
         return np.concatenate([result[:, self._joints.start : v], result[:, : self._joints.start], result[:, v:]], axis=1)
 
+    @property
+    def row_velocities(self) -> np.ndarray:
+        """Place in the plant's velocities of each joint and base row."""
+        return np.concatenate([self._order[self._joints], self._order[: self._joints.start]])
+
+    def plant_motion(self, at: Instants) -> tuple[np.ndarray, np.ndarray]:
+        """States (M, positions + velocities) and accelerations (M, velocities) of the plant, with a floating base's origin at rest and its
+        specific force in the place of its acceleration."""
+        robot, plant, order = self.robot, self.robot.plant, self._order
+        states = np.zeros((len(at.joint_position), plant.num_multibody_states()))
+        positions, rates = states[:, : plant.num_positions()], states[:, plant.num_positions() :]
+        accelerations = np.zeros_like(rates)
+        positions[:] = self._upright
+        positions[:, robot.position_index] = at.joint_position
+        rates[:, robot.velocity_index] = at.joint_velocity
+        accelerations[:, robot.velocity_index] = at.joint_acceleration
+        if robot.has_floating_base:
+            R_BI, p_BI = self.R_BI, self.p_BI
+            w, w_dot = at.angular_velocity @ R_BI.T, at.angular_acceleration @ R_BI.T
+            # Specific force of the base's origin: less the lever arm's turning.
+            f = at.specific_force @ R_BI.T - np.cross(w_dot, p_BI) - np.cross(w, np.cross(w, p_BI))
+            rates[:, order[:3]] = w
+            accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
+        return states, accelerations
+
     def noise(self, at: Instants, sensors: SensorsConfig) -> tuple[np.ndarray, np.ndarray]:
         """Variance that sensor noise puts into each row of one step, to first order.
 
@@ -306,12 +342,11 @@ class EquationOfMotion:
         white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
         velocity_noise = joint_velocity_noise(sensors)
         gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
-        force_noise = sensors.foot_force.noise
         floating = robot.has_floating_base
         state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
         soles = [robot.sole(side) for side in robot.description.sides] if floating else []
         world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
-        wrench_variance = [force_noise**2 * (G**2).sum(axis=1) for G in self._grasp] if floating else []
+        wrench_variance = [deviation**2 for deviation in wrench_deviations(sensors.foot_force, robot)] if floating else []
         scale = np.concatenate([np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)])
         joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
         lever = _skew(self.p_BI) if floating else None
@@ -356,7 +391,7 @@ class Residual:
     rows: list[Row]
     # Centre of each block [s], shape (B,).
     time: np.ndarray
-    # (B, R); and which are known: no gap in the log, and for kinematic rows a sole that stands.
+    # (B, R); and which are known: no gap in the log, for joint rows a torque, for kinematic rows a sole that stands; no unused row.
     value: np.ndarray
     known: np.ndarray
     # Noise of the sensors: variance of each average, and its covariance with the next block's, each (B, R).
@@ -410,6 +445,10 @@ class RecordedMotion:
         self.length = max(1, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed")
+        names = [row.name for row in residual_rows(robot)]
+        for pattern in recording.unused_rows:
+            if not fnmatch.filter(names, pattern):
+                raise InputError(f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})")
         self.start = float(log.time[0])
         self.equation = EquationOfMotion(robot)
 
@@ -420,6 +459,11 @@ class RecordedMotion:
     def steps_of(self, signals: SensorSignals) -> Instants:
         """Steps of other signals on the same grid."""
         return steps(signals, self.period, self.recording.rows)
+
+    def averages(self, predicted: np.ndarray) -> np.ndarray:
+        """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
+        stretches = _stretches(self.measured[:-1] & self.measured[1:])
+        return block_means(_low_passed(predicted, self.recording.recorded_cutoff, self.period, stretches), self.length)
 
     @cached_property
     def blocks(self) -> Instants:
@@ -442,6 +486,11 @@ class RecordedMotion:
         rows = residual_rows(self.robot)
         in_gap = block_means(1.0 - (self.measured[:-1] & self.measured[1:]), self.length) > 0
         known = np.repeat(~in_gap[:, None], len(rows), axis=1)
+        if "joint/torque_command" not in self.log:
+            known[:, [row.kind == "joint" for row in rows]] = False
+        known[:, [any(fnmatch.fnmatch(row.name, pattern) for pattern in self.recording.unused_rows) for row in rows]] = False
+        least = self.robot.description.per_joint(self.recording.least_speed, key="recording.least_speed", default=0.0)
+        known[:, : len(least)] &= block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
         kinematic = np.array([row.kind == "kinematic" for row in rows])
         known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
         for foot, side in enumerate(self.robot.description.sides):
@@ -452,11 +501,18 @@ class RecordedMotion:
     @cached_property
     def residual(self) -> Residual:
         """The residual of the model's rigid bodies; what its effects explain is not taken off."""
-        value = block_means(self.equation.residual(self.steps), self.length)
+        value = self.equation.residual(self.steps)
+        if self.recording.recorded_cutoff > 0:
+            measured = np.zeros_like(value)
+            measured[:, : len(self.robot.joint_names)] = self.steps.torque_command
+            value = block_means(measured, self.length) + self.averages(value - measured)
+        else:
+            value = block_means(value, self.length)
         white, differenced = self.equation.noise(self.blocks, self.sensors)
         names = self.robot.description
         torque_noise = names.per_joint(self.recording.torque_noise, key="recording.torque_noise", default=0.0)
-        white[:, : len(torque_noise)] += torque_noise**2
+        torque_share = names.per_joint(self.recording.torque_noise_share, key="recording.torque_noise_share", default=0.0)
+        white[:, : len(torque_noise)] += torque_noise**2 + (torque_share * self.blocks.torque_command) ** 2
         duration = self.length * self.period
         variance = white / self.length + 2 * differenced / duration**2
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2

@@ -1,15 +1,31 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, LogVectorOutput, MatrixGain, Multiplexer, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 
-from fbse_drake.errors import InputError
+from fbse_drake.control.position_loop import PositionLoop, PositionLoopConfig
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorEffects, SensorSignals
+from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
+from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.log import Log
-from fbse_drake.scenario import Scenario
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.simulate import simulate
+from fbse_drake.walking.reference import Recorded
+
+# Where velocities were not measured, that at the start of a stretch is the slope of a parabola through so many samples.
+_STARTING_SAMPLES = 10
+# A sample that is late by less than this share of a step still belongs to it.
+_EARLY = 0.1
 
 
 @dataclass(frozen=True)
@@ -23,6 +39,12 @@ class RolloutError:
     # Simulated time [s], and why it ended early, or None.
     time: float
     failure: str | None
+    # By joint: mean absolute error of the position [rad], and |simulated - recorded| / |recorded| of it, 2-norms.
+    mean_absolute_position: dict[str, float] = field(default_factory=dict)
+    relative_position: dict[str, float] = field(default_factory=dict)
+    # Error over time: N sample times [s], and simulated less recorded position (N, n) [rad].
+    sample_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    position_error: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def mean_position(self) -> float:
@@ -35,14 +57,21 @@ class RolloutError:
         return float(np.sqrt(np.mean(np.square(list(self.torque_command.values())))))
 
 
-def rollout(scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None) -> RolloutError:
+def rollout(scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
-    Reference and controller are the scenario's; sensor noise is drawn anew.
+    Reference and controller are the scenario's; sensor noise is drawn anew. A `!Recorded` reference is that of the log: the model starts
+    where each stretch of the log starts, and its position loop gets what the robot's got. Played open loop, a recorded torque would say
+    little: its errors add up, and what is not stable in itself falls.
+
+    Returns:
+        None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
 
     Raises:
         InputError: see `simulate`; or the log and the simulation share no time.
     """
+    if isinstance(scenario.reference, Recorded):
+        return _recorded_rollout(scenario, scenario.reference, log, progress) if "reference/joint/position" in log else None
     duration = min(scenario.duration, float(log.time[-1]))
     believed = replace(scenario, robot=scenario.believed, estimator=NoEstimator(), seed=scenario.seed + 1, duration=duration)
     result = simulate(believed, progress=progress)
@@ -51,11 +80,155 @@ def rollout(scenario: Scenario, log: Log, *, progress: Callable[[float], None] |
     shared = (rows < len(simulated.time)) & (np.abs(simulated.time[np.minimum(rows, len(simulated.time) - 1)] - log.time) < 1e-6)
     if not shared.any():
         raise InputError("the log and the simulated model have no sample time in common")
-    errors = []
-    for channel in ("joint/position", "joint/velocity", "joint/torque_command"):
-        if channel not in log:
-            errors.append({})
-            continue
-        difference = simulated[channel][rows[shared]] - log[channel][shared]
-        errors.append(dict(zip(log.joints, np.sqrt((difference**2).mean(axis=0)).tolist(), strict=True)))
-    return RolloutError(*errors, time=float(simulated.time[-1]), failure=result.failure)
+    there = {name: simulated[name][rows[shared]] for name in _COMPARED if name in log}
+    return _rollout_error(log, shared, there, float(simulated.time[-1]), result.failure)
+
+
+_COMPARED = ("joint/position", "joint/velocity", "joint/torque_command")
+
+
+def _rollout_error(log: Log, rows: np.ndarray, simulated: Mapping[str, np.ndarray], time: float, failure: str | None) -> RolloutError:
+    """The error of what was simulated.
+
+    Args:
+        rows: which of the log's samples were simulated, (N,).
+        simulated: channels at these samples.
+    """
+
+    def by_joint(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(log.joints, values.tolist(), strict=True))
+
+    error = {name: values - log[name][rows] for name, values in simulated.items()}
+    rms = [by_joint(np.sqrt((error[name] ** 2).mean(axis=0))) if name in error else {} for name in _COMPARED]
+    q = error["joint/position"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.linalg.norm(q, axis=0) / np.linalg.norm(log["joint/position"][rows], axis=0)
+    return RolloutError(*rms, time, failure, by_joint(np.abs(q).mean(axis=0)), by_joint(relative), log.time[rows], q)
+
+
+def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None) -> RolloutError:
+    rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
+    for stretch, constants in _stretches(log):
+        with located("control: "):
+            control = _scaled(scenario.control, recorded, constants)
+        done, failure = _simulate_stretch(scenario, control, log.part(stretch))
+        count = len(next(iter(done.values())))
+        rows[stretch.start : stretch.start + count] = True
+        channels.append(done)
+        if count:
+            simulated_time += float(log.time[stretch.start + count - 1] - log.time[stretch.start])
+        if progress is not None:
+            progress(simulated_time)
+        if failure is not None:
+            break
+    names = [name for name in _COMPARED if name in log]
+    return _rollout_error(log, rows, {name: np.concatenate([c[name] for c in channels]) for name in names}, simulated_time, failure)
+
+
+def _stretches(log: Log) -> Iterator[tuple[slice, Mapping[str, Any]]]:
+    """The log's stretches that follow each other without a break, with their constants."""
+    whole = {"start": float(log.time[0]), "end": float(log.time[-1])}
+    for segment in log.meta.get("segments", [whole]):
+        start, stop = np.searchsorted(log.time, [segment["start"] - 1e-9, segment["end"] + 1e-9])
+        if stop - start > _STARTING_SAMPLES:
+            yield slice(int(start), int(stop)), segment
+
+
+def _scaled(control: PositionLoopConfig, recorded: Recorded, constants: Mapping[str, Any]) -> PositionLoopConfig:
+    if not recorded.gain:
+        return control
+    factor = constants.get(recorded.gain)
+    if not isinstance(factor, int | float):
+        numbers = [name for name, value in constants.items() if isinstance(value, int | float)]
+        raise InputError(f"gain {recorded.gain}: expected a number that is kept with the log's stretches (there are: {', '.join(numbers)})")
+    gains = {key: {joint: factor * value for joint, value in getattr(control, key).items()} for key in ("kp", "kd")}
+    return replace(control, **gains)
+
+
+def _simulate_stretch(scenario: Scenario, control: PositionLoopConfig, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
+    """The model in the log's place, from the log's first state on.
+
+    Returns:
+        What it did at the log's sample times, by channel; and why these are fewer than the log's, or None.
+    """
+    builder, time_step, start = DiagramBuilder(), scenario.plant.time_step, float(log.time[0])
+    with located("model: "):
+        robot = build_robot(scenario.believed, builder=builder, plant=scenario.plant)
+    if robot.has_floating_base:
+        raise InputError("reference: a recorded motion is only simulated for a robot with a fixed base")
+    plant, names, n = robot.plant, robot.description, len(robot.joint_names)
+    effects = {
+        kind: [e.resolve(names, key=f"model.effects.{key}") for key, e in scenario.believed.effects.items() if isinstance(e, kind)]
+        for kind in (JointTorqueEffect, SensorEffect)
+    }
+    inertia = conservative_inertia(robot.joint_compliance(plant.CreateDefaultContext()))
+
+    joint_state = builder.AddSystem(MatrixGain(robot.joint_state_selector))
+    losses = builder.AddSystem(JointTorqueEffects(effects[JointTorqueEffect], inertia, time_step))
+    loss_to_force = builder.AddSystem(MatrixGain(-robot.joint_force_selector))
+    sensors = builder.AddSystem(SensorEffects(effects[SensorEffect], robot, control.period))
+    others = sensors.get_output_port().size() - 2 * n
+    measured = builder.AddSystem(Demultiplexer([2 * n, others]))
+    controller = builder.AddSystem(PositionLoop(control, names, time_step))
+    actuation = builder.AddSystem(MatrixGain(robot.actuation_selector))
+    at_rest = np.zeros_like(log["reference/joint/position"])
+    held = {"desired_state": np.hstack([log["reference/joint/position"], log.get("reference/joint/velocity", at_rest)])}
+    if control.feedforward and "reference/joint/feedforward_torque" in log:
+        held["feedforward_torque"] = log["reference/joint/feedforward_torque"]
+    if "joint/enabled" in log:
+        held["enabled"] = log["joint/enabled"]
+    for name, values in held.items():
+        source = builder.AddSystem(TrajectorySource(PiecewisePolynomial.ZeroOrderHold(log.time - start - _EARLY * time_step, values.T)))
+        builder.Connect(source.get_output_port(), controller.GetInputPort(name))
+    for name in ("imu", "pad_force"):
+        unread = builder.AddSystem(ConstantVectorSource(np.zeros(sensors.GetInputPort(name).size())))
+        builder.Connect(unread.get_output_port(), sensors.GetInputPort(name))
+
+    builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
+    builder.Connect(joint_state.get_output_port(), losses.GetInputPort("joint_state"))
+    builder.Connect(joint_state.get_output_port(), sensors.GetInputPort("joint_state"))
+    builder.Connect(losses.get_output_port(), loss_to_force.get_input_port())
+    builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
+    builder.Connect(sensors.get_output_port(), measured.get_input_port())
+    builder.Connect(measured.get_output_port(0), controller.GetInputPort("estimated_state"))
+    for port in (losses.GetInputPort("torque_command"), sensors.GetInputPort("torque_command"), actuation.get_input_port()):
+        builder.Connect(controller.get_output_port(), port)
+    builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port())
+    record = builder.AddSystem(Multiplexer([2 * n, n]))
+    builder.Connect(measured.get_output_port(0), record.get_input_port(0))
+    builder.Connect(controller.get_output_port(), record.get_input_port(1))
+    sink = LogVectorOutput(record.get_output_port(), builder, time_step)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    robot.set_state(plant.GetMyMutableContextFromRoot(context), *_first_state(robot, effects[SensorEffect], log, control.period))
+
+    failure = None
+    try:
+        simulator.AdvanceTo(float(log.time[-1]) - start + time_step)
+    except RuntimeError as error:
+        failure = f"t = {start + context.get_time():.3f} s: the solver failed: {str(error).splitlines()[0]}"
+    found = sink.FindLog(context)
+    time, rows = found.sample_times(), found.data().T
+    finite = np.logical_and.accumulate(np.isfinite(rows).all(axis=1))
+    if failure is None and not finite.all():
+        failure = f"t = {start + time[finite.argmin()]:.3f} s: the state is not finite any more"
+    time, rows = time[finite], rows[finite]
+    wanted = (log.time - start)[log.time - start <= time[-1] + 1e-9]
+    # Motion between the steps, and the command of the step that a sample is in.
+    motion = np.stack([np.interp(wanted, time, column) for column in rows[:, : 2 * n].T], axis=1)
+    command = rows[np.clip(np.searchsorted(time, wanted + 1e-9) - 1, 0, None), 2 * n :]
+    return dict(zip(_COMPARED, (motion[:, :n], motion[:, n:], command), strict=True)), failure
+
+
+def _first_state(robot: Robot, effects: list[Any], log: Log, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
+    few = slice(0, _STARTING_SAMPLES)
+    q = log["joint/position"][0]
+    v = log["joint/velocity"][0] if "joint/velocity" in log else np.polyfit(log.time[few] - log.time[0], log["joint/position"][few], 2)[1]
+    points = sum(leg.points for leg in robot.description.legs.values())
+    signals = SensorSignals(q[None], v[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, points, 3)), np.zeros_like(q)[None])
+    for effect in reversed(effects):
+        memory = np.zeros((effect.effect.memory_size, 1, len(effect.targets)))
+        signals = effect.effect.undone(signals, memory, effect, robot, period)
+    return signals.joint_position[0], signals.joint_velocity[0]

@@ -1,12 +1,13 @@
 """The whole loop: diagnose, add, and again, until nothing is left."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fbse_drake.discrepancy.add import add
+from fbse_drake.discrepancy.compare import words
 from fbse_drake.discrepancy.diagnose import Diagnosis, Finding, diagnose, diagnosis_json
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import rms
@@ -14,6 +15,7 @@ from fbse_drake.discrepancy.rollout import RolloutError, rollout
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario
+from fbse_drake.walking.reference import Recorded
 
 # Share by which a later round must lower the held-out error: the first one finds what there is, the others mend what is not linear.
 _LEAST_GAIN = 0.01
@@ -61,6 +63,13 @@ class StudyStep:
     rollout: RolloutError | None
     # By log: `train` is the one that is diagnosed, the others are not fitted to.
     errors: dict[str, ModelError] = field(default_factory=dict)
+    # Of those others, where they say what the robot was asked for.
+    test_rollouts: dict[str, RolloutError] = field(default_factory=dict)
+
+    @property
+    def rollouts(self) -> dict[str, RolloutError]:
+        """All simulations of the model against a log, by log."""
+        return ({} if self.rollout is None else {"train": self.rollout}) | self.test_rollouts
 
 
 @dataclass(frozen=True)
@@ -104,13 +113,17 @@ def study(
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
 
-    def rolled() -> RolloutError | None:
-        say("simulating the model against the log")
-        return rollout(scenario, log) if rollouts else None
-
-    def errors(predictor: Predictor) -> dict[str, ModelError]:
-        others = {name: Predictor(predictor.scenario, other) for name, other in (tests or {}).items()}
-        return {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
+    def measured_step(added: Sequence[Finding], held_out_rmse: float, train_rmse: float) -> StudyStep:
+        others = {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
+        errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
+        rolled, test_rolled = None, {}
+        if rollouts:
+            say("simulating the model against the log")
+            rolled = rollout(scenario, log)
+            if isinstance(scenario.reference, Recorded):
+                candidates = ((name, rollout(scenario, other)) for name, other in (tests or {}).items())
+                test_rolled = {name: error for name, error in candidates if error is not None}
+        return StudyStep(tuple(added), held_out_rmse, train_rmse, rolled, errors, test_rolled)
 
     effects = None if effects is None else list(effects)
     predictor = Predictor(scenario, log)
@@ -119,14 +132,13 @@ def study(
         diagnosis = diagnose(predictor, effects, progress=progress)
         diagnoses.append(diagnosis)
         if not steps:
-            steps.append(StudyStep((), diagnosis.held_out_before, diagnosis.held_out_before, rolled(), errors(predictor)))
+            steps.append(measured_step((), diagnosis.held_out_before, diagnosis.held_out_before))
         worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
         if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis.chosen)
         predictor = Predictor(scenario, log)
-        step = StudyStep(tuple(diagnosis.chosen), diagnosis.held_out_after, diagnosis.train_after, rolled(), errors(predictor))
-        steps.append(step)
+        steps.append(measured_step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after))
     return Study(tuple(steps), tuple(diagnoses), _reason(diagnoses), scenario)
 
 
@@ -135,7 +147,7 @@ def _reason(diagnoses: list[Diagnosis]) -> str:
     if last.chosen and len(diagnoses) == _MOST_ROUNDS:
         return f"{len(diagnoses)} rounds were made and each found something: the library does not fit this robot well"
     if last.verdict == "unknown_effect":
-        rows = ", ".join(structure.row for structure in last.unexplained)
+        rows = ", ".join(words(structure.row) for structure in last.unexplained)
         return f"no effect of the library explains what is left in {rows}"
     if last.verdict == "not_visible":
         return "this data does not excite what could still be missing"
@@ -152,6 +164,14 @@ def study_json(result: Study) -> dict[str, Any]:
                 "held_out_rmse": step.held_out_rmse,
                 "train_rmse": step.train_rmse,
                 "rollout_rmse": _rollout_json(step.rollout),
+                "rollouts": {
+                    name: {
+                        "mean_absolute_position": error.mean_absolute_position,
+                        "relative_position": error.relative_position,
+                        "failure": error.failure,
+                    }
+                    for name, error in step.rollouts.items()
+                },
                 "errors": {
                     name: {"relative": error.relative, "relative_by_joint": error.relative_by_joint, "rms": error.rms}
                     for name, error in step.errors.items()

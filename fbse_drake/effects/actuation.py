@@ -82,6 +82,13 @@ class TorqueDelay(JointTorqueEffect):
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
         return np.concatenate([np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory[:-1]])
 
+    @staticmethod
+    def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        rows, samples = int(np.floor(nonlinear.max() / motion.time_step)) + 1, len(motion.command)
+        command = np.concatenate([np.repeat(motion.command[:1], rows, axis=0), motion.command])
+        past = np.stack([command[rows - k : rows - k + samples] for k in range(1, rows + 1)])
+        return past.reshape(rows, *[1] * (nonlinear.ndim - 3), *motion.command.shape)
+
 
 @in_library
 @dataclass(frozen=True)
@@ -142,3 +149,53 @@ class TorqueSaturation(JointTorqueEffect):
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (motion.command - np.clip(motion.command, -nonlinear[0], nonlinear[0]),), (0.0,)
+
+
+@in_library
+@dataclass(frozen=True)
+class TorqueRollOff(JointTorqueEffect):
+    """The motor gives ever less of what is commanded: u = command - command / (1 + |command| / half)."""
+
+    description: ClassVar[str] = "The harder a motor is driven, the less of the command it gives: iron saturates, the supply gives way."
+    signature: ClassVar[str] = "Torque that grows with the square of the command."
+    experiment: ClassVar[str] = "Load each joint up to its rated torque."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        # The command of which half arrives.
+        "half": Parameter("Nm", linear=False, plausible=(0.5, 2000.0), bounds=(1e-9, np.inf), neutral=np.inf, grid=30),
+    }
+
+    half: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        return (motion.command - motion.command / (1.0 + np.abs(motion.command) / nonlinear[0]),), (0.0,)
+
+
+@in_library
+@dataclass(frozen=True)
+class DcMotor(JointTorqueEffect):
+    """A DC motor of which the voltage is commanded, behind its gear: torque = kt / R (voltage - kt w).
+
+    `torque_command` is then the torque at standstill, kt / R times the voltage, and what the motor's own voltage takes off it is the loss
+    u = kt^2 / R w. A limited voltage is a limited command (`control.torque_limit`). A command of exactly zero is a drive that is switched
+    off: the motor is open, and nothing brakes it.
+    """
+
+    description: ClassVar[str] = "A motor that is driven by a voltage has less torque the faster it turns."
+    signature: ClassVar[str] = "Torque rises linearly with the velocity, but not while the drive is switched off."
+    experiment: ClassVar[str] = "Move each joint at several constant speeds, and let it swing with the drive switched off."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        # At the joint: of the motor's own constant, times the gear ratio.
+        "kt": Parameter("Nm/A", linear=False, plausible=(1e-2, 20.0), neutral=0.0),
+        "resistance": Parameter("ohm", linear=False, plausible=(1e-2, 20.0), bounds=(1e-9, np.inf), neutral=np.inf),
+    }
+    composite: ClassVar[bool] = True
+
+    kt: dict[str, float] = field(default_factory=dict)
+    resistance: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        kt, resistance = nonlinear
+        damping = kt * kt / resistance * (np.asarray(motion.command) != 0)
+        return (damping * motion.velocity,), (damping,)

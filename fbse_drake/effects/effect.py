@@ -13,13 +13,29 @@ An effect of a user's own is a subclass of one of them behind `@in_library`; fro
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.description import RobotDescription
+
+# A prismatic joint is to a revolute one as the end of a lever of this length to its axis [m]: plausible values are converted with it.
+_LEVER = 0.1
+# Units at a revolute joint: that at a prismatic one, and the power of the lever's length by which values are multiplied.
+_AT_PRISMATIC_JOINT = {
+    "Nm": ("N", -1),
+    "Nm/rad": ("N/m", -2),
+    "Nm s/rad": ("N s/m", -2),
+    "Nm s^2/rad^2": ("N s^2/m^2", -3),
+    "rad": ("m", 1),
+    "rad/s": ("m/s", 1),
+    "s/rad": ("s/m", -1),
+    "rad/Nm": ("m/N", 2),
+    "1/revolution": ("rad/m", -1),
+    "kg m^2": ("kg", -2),
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +53,18 @@ class Parameter:
     grid: int = 9
     # For a nonlinear one: the value with which there is no effect; targets that are not named get it.
     neutral: float | None = None
+
+    @property
+    def lever_factor(self) -> float:
+        """What a value at a revolute joint is multiplied with to make that of a prismatic joint."""
+        return _LEVER ** _AT_PRISMATIC_JOINT.get(self.unit, (self.unit, 0))[1]
+
+    @property
+    def at_prismatic_joint(self) -> "Parameter":
+        """The same for a prismatic joint, with m and N in the place of rad and Nm; its bounds, which are of no size, stay."""
+        unit, _ = _AT_PRISMATIC_JOINT.get(self.unit, (self.unit, 0))
+        low, high = self.plausible
+        return replace(self, unit=unit, plausible=(self.lever_factor * low, self.lever_factor * high))
 
 
 @dataclass(frozen=True)
@@ -62,9 +90,14 @@ class Effect(ABC):
         return tuple(_LIBRARY.values())
 
     @classmethod
-    def largest_plausible(cls) -> float:
-        """Largest plausible size of its first parameter, which says how strong it is."""
-        return max(abs(bound) for bound in next(iter(cls.parameters.values())).plausible)
+    def parameters_at(cls, unit: str) -> dict[str, Parameter]:
+        """Its parameters at a joint whose torque has this unit: Nm, or N for a prismatic joint."""
+        return cls.parameters if unit == "Nm" else {name: parameter.at_prismatic_joint for name, parameter in cls.parameters.items()}
+
+    @classmethod
+    def largest_plausible(cls, unit: str = "Nm") -> float:
+        """Largest plausible size of its first parameter, which says how strong it is; at a joint whose torque has this unit."""
+        return max(abs(bound) for bound in next(iter(cls.parameters_at(unit).values())).plausible)
 
     @classmethod
     def from_values(cls, targets: Sequence[str], values: Mapping[str, Sequence[float]]) -> "Effect":

@@ -145,8 +145,34 @@ class DirectionalFriction(JointTorqueEffect):
 
 @in_library
 @dataclass(frozen=True)
+class DirectionalViscousFriction(JointTorqueEffect):
+    """What viscous friction has more in one direction than in the other: u = asymmetry |w|.
+
+    Beside viscous friction, whose coefficient is then viscous + asymmetry forwards and viscous - asymmetry backwards.
+    """
+
+    description: ClassVar[str] = "Friction grows faster with speed in one direction of motion than in the other."
+    signature: ClassVar[str] = "Torque of the same sign in both directions that rises with the speed."
+    experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "asymmetry": Parameter("Nm s/rad", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
+    }
+
+    asymmetry: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:  # noqa: ARG004
+        return (np.abs(motion.velocity),), (np.sign(motion.velocity),)
+
+
+@in_library
+@dataclass(frozen=True)
 class LoadDependentFriction(JointTorqueEffect):
-    """Coulomb friction in proportion to what the gear transmits: u = coefficient |command| tanh(w / transition)."""
+    """Coulomb friction in proportion to what the gear transmits: u = coefficient |load| tanh(w / transition).
+
+    The load is what reaches the link. To lift it slowly takes a command of (1 + coefficient) load, to let it down one of
+    (1 - coefficient) load.
+    """
 
     description: ClassVar[str] = "Friction that grows with the torque through the gear."
     signature: ClassVar[str] = "Torque against the motion that is large in stance and small in swing."
@@ -161,7 +187,7 @@ class LoadDependentFriction(JointTorqueEffect):
 
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        load = np.abs(motion.command)
+        load = np.abs(motion.load)
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (load * sign,), (load * slope,)
 

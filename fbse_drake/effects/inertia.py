@@ -8,11 +8,14 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import RigidBody, SpatialInertia
 
 from fbse_drake.effects.effect import Effect, Parameter, in_library
-from fbse_drake.errors import located
+from fbse_drake.errors import InputError, located
 from fbse_drake.robot.plant import PointMass, Robot
+
+# Share of an inertia that may be lost in rounding.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -125,3 +128,91 @@ class BodyCentreOfMass(InertiaEffect):
     def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:
         mass, com = body.default_mass(), body.default_com()
         return [PointMass(body.name(), -mass, com), PointMass(body.name(), mass, com + values)]
+
+
+# Parameters of a body's inertia: mass, first moment and rotational inertia about the origin of the body's frame, in that frame.
+_INERTIAL = {
+    "mass": ("kg", 10.0),
+    **{f"m{axis}": ("kg m", 1.0) for axis in "xyz"},
+    **{f"i{axes}": ("kg m^2", 1.0) for axes in ("xx", "yy", "zz", "xy", "xz", "yz")},
+}
+
+
+@in_library
+@dataclass(frozen=True)
+class InertialParameters(InertiaEffect):
+    """All ten inertial parameters of a body, as changes from what the model says, in the body's frame B: mass, first moment m p_BoBcm, and
+    rotational inertia about Bo (ixy is the element of the matrix).
+
+    A log shows them only in combinations; see `fbse_drake.discrepancy.inertial`, which finds values that some distribution of mass has.
+    """
+
+    description: ClassVar[str] = "Mass, centre of mass and rotational inertia of a body are not what the model says."
+    signature: ClassVar[str] = "Torque with posture, velocity and acceleration, in all joints that carry the body."
+    experiment: ClassVar[str] = "Move all joints that carry the body at once, through many postures and fast."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
+    composite: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        name: Parameter(unit, linear=True, plausible=(-size, size), bounds=(-np.inf, np.inf)) for name, (unit, size) in _INERTIAL.items()
+    }
+
+    mass: dict[str, float] = field(default_factory=dict)
+    mx: dict[str, float] = field(default_factory=dict)
+    my: dict[str, float] = field(default_factory=dict)
+    mz: dict[str, float] = field(default_factory=dict)
+    ixx: dict[str, float] = field(default_factory=dict)
+    iyy: dict[str, float] = field(default_factory=dict)
+    izz: dict[str, float] = field(default_factory=dict)
+    ixy: dict[str, float] = field(default_factory=dict)
+    ixz: dict[str, float] = field(default_factory=dict)
+    iyz: dict[str, float] = field(default_factory=dict)
+
+    def __add__(self, further: "InertialParameters") -> "InertialParameters":
+        """Both changes at once."""
+        values = {}
+        for name in self.parameters:
+            ours, theirs = getattr(self, name), getattr(further, name)
+            values[name] = {body: ours.get(body, 0.0) + theirs.get(body, 0.0) for body in dict.fromkeys([*ours, *theirs])}
+        return InertialParameters(**values)
+
+    @staticmethod
+    def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:
+        before = pseudo_inertia(inertial_parameters(body.default_spatial_inertia()))
+        # The body as it shall be, and against it as it is.
+        return [
+            PointMass(body.name(), sign * mass, position)
+            for sign, J in ((1.0, before + pseudo_inertia(values)), (-1.0, before))
+            for mass, position in equal_point_masses(J, body.name())
+        ]
+
+
+def inertial_parameters(inertia: SpatialInertia) -> np.ndarray:
+    """The ten parameters of a spatial inertia in the order of `InertialParameters`, shape (10,)."""
+    mass, I_BBo = inertia.get_mass(), inertia.CalcRotationalInertia()
+    return np.array([mass, *(mass * inertia.get_com()), *I_BBo.get_moments(), *I_BBo.get_products()])
+
+
+def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
+    """Pseudo-inertia [[integral of p p^T dm, m c], [m c^T, m]], (..., 4, 4), of parameters (..., 10); linear in them.
+
+    A distribution of mass has these parameters just if it is positive semidefinite (Wensing, Kim and Slotine 2018).
+    """
+    m, mx, my, mz, xx, yy, zz, xy, xz, yz = np.moveaxis(np.asarray(parameters), -1, 0)
+    half = 0.5 * (xx + yy + zz)
+    rows = [[half - xx, -xy, -xz, mx], [-xy, half - yy, -yz, my], [-xz, -yz, half - zz, mz], [mx, my, mz, m]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def equal_point_masses(J: np.ndarray, name: str) -> list[tuple[float, np.ndarray]]:
+    """Four equal masses [kg] and their places [m] that have a pseudo-inertia: the corners of a tetrahedron.
+
+    Raises:
+        InputError: no distribution of mass has it; `name` is the body's.
+    """
+    mass = J[3, 3]
+    spread, axes = np.linalg.eigh(J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / mass) if mass > 0 else (np.array([-1.0]), None)
+    if spread.min() < -_ROUNDING * np.trace(J):
+        raise InputError(f"{name}: expected the inertia of a body, found one that no distribution of mass has")
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    places = J[:3, 3] / mass + corners * np.sqrt(np.maximum(spread, 0.0) / mass) @ axes.T
+    return [(mass / 4, place) for place in places]

@@ -38,6 +38,8 @@ class JointMotion:
     time_step: float = 0.0
     # What the effect remembers at its start, (rows, ..., n).
     memory: np.ndarray | tuple[()] = ()
+    # Torque that passes the gear: the command less what was lost just before [Nm].
+    load: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)

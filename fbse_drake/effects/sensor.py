@@ -11,12 +11,15 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.effects.effect import Effect, Parameter, ResolvedEffect, in_library
 from fbse_drake.robot.plant import Robot
 
 _ANY = (-np.inf, np.inf)
+# How often the effect of a sensor is taken off its signals.
+_UNDOING = 3
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class SensorEffect(Effect):
         """
 
     @staticmethod
-    def remembered(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, period: float) -> np.ndarray:
+    def remembered(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
         """The memory at the next tick, shape (memory_size, targets).
 
         Args:
@@ -68,7 +71,7 @@ class SensorEffect(Effect):
         raise NotImplementedError
 
     @classmethod
-    def memory_over_time(cls, signals: SensorSignals, values: ResolvedEffect, period: float) -> np.ndarray:
+    def memory_over_time(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
         """What is remembered at each tick of a log, shape (memory_size, ticks, targets).
 
         Args:
@@ -81,13 +84,48 @@ class SensorEffect(Effect):
         if cls.memory_size:
             for k in range(ticks - 1):
                 tick = SensorSignals(*(channel[k] for channel in vars(signals).values()))
-                memory[:, k + 1] = cls.remembered(tick, memory[:, k], values, period)
+                memory[:, k + 1] = cls.remembered(tick, memory[:, k], values, robot, period)
         return memory
+
+    @classmethod
+    def undone(cls, measured: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:  # noqa: ARG003
+        """What the sensors ought to read over a whole log if this is what they read.
+
+        By taking off, again and again, what the effect adds: it is small, and each time leaves a share of its own size.
+
+        Args:
+            measured: with the ticks as the leading axis.
+            memory: what is remembered at each tick; see `memory_over_time`.
+        """
+        signals = measured
+        for _ in range(_UNDOING):
+            read = cls.reading(signals, memory, values, robot)
+            signals = SensorSignals(
+                **{name: signal + getattr(measured, name) - getattr(read, name) for name, signal in vars(signals).items()}
+            )
+        return signals
 
     @classmethod
     def distorted(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:
         """What the sensors read over a whole log; see `memory_over_time` and `reading`."""
-        return cls.reading(signals, cls.memory_over_time(signals, values, period), values, robot)
+        return cls.reading(signals, cls.memory_over_time(signals, values, robot, period), values, robot)
+
+
+def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
+    """Wrench [moment, force] on each foot in its sole frame, (..., feet, 6) [Nm, N], from (..., P, 3)."""
+    parts, start = [], 0
+    for grasp in robot.grasp_maps:
+        stop = start + grasp.shape[1] // 3
+        parts.append(pad_force[..., start:stop, :].reshape(*pad_force.shape[:-2], -1) @ grasp.T)
+        start = stop
+    return np.stack(parts, axis=-2)
+
+
+def _with_wrenches(signals: SensorSignals, added: np.ndarray, robot: Robot) -> SensorSignals:
+    """Signals with wrenches (..., feet, 6) added to those on the feet, by the smallest forces that have them."""
+    forces = [added[..., foot, :] @ np.linalg.pinv(grasp).T for foot, grasp in enumerate(robot.grasp_maps)]
+    more = np.concatenate([force.reshape(*force.shape[:-1], -1, 3) for force in forces], axis=-2)
+    return replace(signals, pad_force=signals.pad_force + more)
 
 
 def _pads_of(values: np.ndarray, robot: Robot) -> np.ndarray:
@@ -117,7 +155,7 @@ class FootForceGain(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class FootForceBias(SensorEffect):
-    """Each pad of a foot reads this force too much, in the axes of the sole."""
+    """Each pad of a foot, or its six-axis sensor, reads this force too much, in the axes of the sole."""
 
     description: ClassVar[str] = "The force sensors of a foot read a constant force too much."
     signature: ClassVar[str] = "Force on the foot while it is in the air."
@@ -131,7 +169,126 @@ class FootForceBias(SensorEffect):
 
     @staticmethod
     def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
-        return replace(signals, pad_force=signals.pad_force + _pads_of(values.linear, robot).T)
+        has_pads = np.array([bool(leg.pads) for leg in robot.description.legs.values()])
+        signals = replace(signals, pad_force=signals.pad_force + _pads_of(has_pads * values.linear, robot).T)
+        if has_pads.all():
+            return signals
+        return _with_wrenches(signals, np.concatenate([np.zeros_like(values.linear), ~has_pads * values.linear]).T, robot)
+
+
+@in_library
+@dataclass(frozen=True)
+class FootMomentBias(SensorEffect):
+    """The force sensors of a foot together read this moment too much, about the origin of the sole and in its axes."""
+
+    description: ClassVar[str] = "The force sensors of a foot read a constant moment too much."
+    signature: ClassVar[str] = "Moment on the foot while it is in the air."
+    experiment: ClassVar[str] = "Lift each foot."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
+    parameters: ClassVar[dict[str, Parameter]] = {axis: Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=_ANY) for axis in "xyz"}
+
+    x: dict[str, float] = field(default_factory=dict)
+    y: dict[str, float] = field(default_factory=dict)
+    z: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+        return _with_wrenches(signals, np.concatenate([values.linear, np.zeros_like(values.linear)]).T, robot)
+
+
+@in_library
+@dataclass(frozen=True)
+class FootForceMisalignment(SensorEffect):
+    """The force sensors of a foot are turned against the sole by this rotation vector, about its origin; force and moment are read in the
+    turned axes. As a rotation it is linear for small angles only.
+    """
+
+    description: ClassVar[str] = "The force sensors of a foot are mounted askew."
+    signature: ClassVar[str] = "Horizontal force under a foot in proportion to its load, that no motion needs."
+    experiment: ClassVar[str] = "Stand still on level ground, on one foot and then on the other."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
+    parameters: ClassVar[dict[str, Parameter]] = {
+        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi)) for axis in "xyz"
+    }
+
+    x: dict[str, float] = field(default_factory=dict)
+    y: dict[str, float] = field(default_factory=dict)
+    z: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+        wrenches = _wrenches(signals.pad_force, robot)
+        # S: the axes that the sensors really have.
+        R_FS = Rotation.from_rotvec(values.linear.T).as_matrix()
+        turned = np.einsum("...fki,fij->...fkj", wrenches.reshape(*wrenches.shape[:-1], 2, 3), R_FS).reshape(wrenches.shape)
+        return _with_wrenches(signals, turned - wrenches, robot)
+
+
+@in_library
+@dataclass(frozen=True)
+class FootForceLag(SensorEffect):
+    """The wrench that the force sensors of a foot read follows the true one through a low-pass of first order.
+
+    In steps of the sampling period, so that a log shows the time constant linearly: the true wrench is the one that is read, plus
+    time_constant times its rate.
+    """
+
+    description: ClassVar[str] = "The force sensors of a foot are read through a low-pass, and so come late."
+    signature: ClassVar[str] = "Force under the foot that lags behind what the motion needs, and is smoother, at touch-down most of all."
+    experiment: ClassVar[str] = "Shift the weight to and fro fast; step on the spot."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
+    parameters: ClassVar[dict[str, Parameter]] = {"time_constant": Parameter("s", linear=True, plausible=(0.0, 0.1))}
+    # The wrench that was read last, and the share of it that stays.
+    memory_size: ClassVar[int] = 7
+
+    time_constant: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+        read_last, stays = np.moveaxis(memory[:6], 0, -1), memory[6][..., None]
+        return _with_wrenches(signals, stays * (read_last - _wrenches(signals.pad_force, robot)), robot)
+
+    @classmethod
+    def remembered(cls, signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+        read = _wrenches(cls.reading(signals, memory, values, robot).pad_force, robot)
+        return np.concatenate([read.T, [_what_stays(values.linear[0], period)]])
+
+    @classmethod
+    def memory_over_time(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+        true, stays = _wrenches(signals.pad_force, robot), _what_stays(values.linear[0], period)
+        memory = np.zeros((cls.memory_size, *true.shape[:2]))
+        for foot, share in enumerate(stays):
+            read = lfilter([1.0 - share], [1.0, -share], true[:, foot], axis=0, zi=share * true[:1, foot])[0]
+            memory[:6, 1:, foot], memory[6, 1:, foot] = read[:-1].T, share
+        return memory
+
+    @classmethod
+    def undone(cls, measured: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:  # noqa: ARG003
+        read, stays = _wrenches(measured.pad_force, robot), _what_stays(values.linear[0], period)[:, None]
+        return _with_wrenches(measured, stays / (1.0 - stays) * np.diff(read, axis=0, prepend=read[:1]), robot)
+
+
+def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
+    """Share of what a low-pass of first order holds that is left after a period, as by an implicit Euler step."""
+    return time_constant / (time_constant + period)
+
+
+@in_library
+@dataclass(frozen=True)
+class AccelerometerGain(SensorEffect):
+    """The accelerometer reads (1 + gain) times the specific force."""
+
+    description: ClassVar[str] = "The accelerometer reads a share more or less than the specific force."
+    signature: ClassVar[str] = "A resting robot whose specific force is not gravity, in whatever way it is tilted."
+    experiment: ClassVar[str] = "Stand still, then with the trunk tilted."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
+    parameters: ClassVar[dict[str, Parameter]] = {"gain": Parameter("1", linear=True, plausible=(-0.05, 0.05), bounds=(-1.0, np.inf))}
+
+    gain: float = 0.0
+
+    @staticmethod
+    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+        return replace(signals, specific_force=(1.0 + values.linear[0, 0]) * signals.specific_force)
 
 
 @in_library
@@ -256,7 +413,13 @@ class TransmissionElasticity(SensorEffect):
         )
 
     @staticmethod
-    def remembered(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, period: float) -> np.ndarray:
+    def remembered(
+        signals: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
+        period: float,
+    ) -> np.ndarray:
         """Torque that the spring has followed so far, and the command of the tick's step, (2, n) [Nm]."""
         command = signals.torque_command
         return np.stack([command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command])
@@ -322,6 +485,6 @@ class SensorEffects(LeafSystem):
         for place, effect in enumerate(self._effects):
             memory = self._memory(context, place)
             if effect.effect.memory_size:
-                later = effect.effect.remembered(signals, memory, effect, self._period)
+                later = effect.effect.remembered(signals, memory, effect, self._robot, self._period)
                 state.get_mutable_discrete_state(self._memories[place]).set_value(later.ravel())
             signals = effect.effect.reading(signals, memory, effect, self._robot)

@@ -130,6 +130,7 @@ class JointTorqueEffects(LeafSystem):
         last_position, last_v, last_command, last_torque, last_free, last_end, last_gain = last[:_ROWS]
         state = np.empty_like(last)
         first = math.isnan(last_v[0])
+        load = command if first else last_command - last_torque
         for effect, rows in self._remembering:
             if first:
                 now = JointMotion(v, position, command, time, time_step)
@@ -142,7 +143,7 @@ class JointTorqueEffects(LeafSystem):
         def torque_and_slope(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             torque = slope = np.zeros(n)
             for effect, rows in self._effects:
-                more = effect.torque_and_slope(JointMotion(velocity, position, command, time, time_step, state[rows]))
+                more = effect.torque_and_slope(JointMotion(velocity, position, command, time, time_step, state[rows], load))
                 torque, slope = torque + more[0], slope + more[1]
             return torque, slope
 

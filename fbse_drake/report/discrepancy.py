@@ -1,25 +1,36 @@
 """The reports of compare, diagnose and study."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
+from platform import python_version
 
 import numpy as np
 
-from fbse_drake.discrepancy.compare import Comparison, words
+from fbse_drake.discrepancy.compare import Channel, Comparison, words
 from fbse_drake.discrepancy.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.hygiene import Hygiene
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import joint_velocity_noise
-from fbse_drake.discrepancy.study import Study
+from fbse_drake.discrepancy.structure import Structure
+from fbse_drake.discrepancy.study import Study, StudyStep
 from fbse_drake.effects.effect import library
+from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures
-from fbse_drake.report.discrepancy_figures import by_effect, spaced, targets_text
+from fbse_drake.report.discrepancy_figures import by_effect, finding_name, spaced, targets_text
 from fbse_drake.report.html import Details, FigureBlock, Report, Section, Table, number, write_report
-from fbse_drake.scenario import SensorsConfig, dump_scenario
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, dump_scenario
 
-# Pictures show this many of the worst channels, and of alternatives.
+# Pictures show this many of the worst channels, of alternatives, and of joints' torques; and of a log this many averages.
 _CHANNELS = 4
 _ALTERNATIVES = 8
+_JOINTS = 6
+_SHOWN = 500
+# Tables show this many failures, others are folded away.
+_FAILURES = 8
 
 
 @dataclass(frozen=True)
@@ -32,27 +43,25 @@ class Inputs:
     log: str
     # Folder of the results.
     out: str
+    # Further logs to test on.
+    tests: tuple[str, ...] = ()
+    # What is remarkable about the log.
+    hygiene: Hygiene = field(default_factory=Hygiene)
 
 
 def write_compare_report(path: str | Path, comparison: Comparison, predictor: Predictor, inputs: Inputs) -> None:
     """Writes where a model fails as one HTML file."""
-    outcome = compare_outcome(comparison)
-    next_step = f"fbse diagnose {inputs.scenario} {inputs.log}" if comparison.failures else "none: there is nothing to explain"
-    summary = Table(
-        ("", ""),
+    outcome = inputs.hygiene.before(compare_outcome(comparison))
+    rows = (
+        ("Error of the whole residual", _times_noise(comparison.rmse)),
+        ("Is it a mere offset?", f"A constant taken off every channel leaves {_times_noise(comparison.held_out_rmse)} on held-out data."),
+        ("Where it fails", _kinds(comparison)),
         (
-            ("Outcome", outcome),
-            ("Error of the whole residual", _times_noise(comparison.rmse)),
-            ("The same with a constant taken off each channel, on held-out data", _times_noise(comparison.held_out_rmse)),
-            ("What to do next", next_step),
+            "What to do next",
+            f"fbse diagnose {inputs.scenario} {inputs.log}" if comparison.failures else "Nothing: there is nothing to explain.",
         ),
     )
-    sections = [
-        Section("Summary", tables=(summary,)),
-        *_where(comparison, predictor),
-        Section("Channels", _CHANNELS_TEXT, tables=(_channel_table(comparison),)),
-        *_closing(predictor, inputs),
-    ]
+    sections = [_summary(rows), _where(comparison, predictor), _hygiene(predictor, inputs), _reproduce("compare", predictor, inputs)]
     write_report(path, Report(f"{inputs.name}: model against log", not comparison.failures, outcome, tuple(sections)))
 
 
@@ -62,60 +71,61 @@ def write_diagnosis_report(path: str | Path, diagnosis: Diagnosis, comparison: C
     Args:
         comparison: of the model as it is.
     """
-    outcome = diagnosis_outcome(diagnosis)
+    outcome, statuses = inputs.hygiene.before(diagnosis_outcome(diagnosis)), _applicable(diagnosis.effects)
     rows = (
-        ("Outcome", outcome),
-        ("How sure", how_sure(diagnosis)),
-        ("What else it could be", _what_else(diagnosis)),
+        ("How sure", how_sure(diagnosis.chosen, diagnosis.held_out_before, diagnosis.held_out_after, diagnosis.train_after)),
+        ("What else it could be", _what_else(diagnosis.chosen)),
+        ("What was looked for", _verdicts(statuses)),
         ("What to do next", next_step(diagnosis, inputs)),
     )
     sections = [
-        Section("Summary", tables=(Table(("", ""), rows),)),
-        *_why(diagnosis.ranking, diagnosis),
-        *_where(comparison, predictor),
-        _all_effects(diagnosis),
-        *_closing(predictor, inputs),
+        _summary(rows),
+        _where(comparison, predictor),
+        *_why([diagnosis.chosen], diagnosis.ranking, diagnosis.unexplained),
+        _what_was_looked_for(statuses),
+        *_path(diagnosis, predictor.robot),
+        _hygiene(predictor, inputs),
+        _reproduce("diagnose", predictor, inputs),
     ]
     passed = diagnosis.verdict in ("effect_found", "nothing_missing")
     write_report(path, Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)))
 
 
 def write_study_report(
-    path: str | Path, study: Study, before: tuple[Predictor, Comparison], after: tuple[Predictor, Comparison], inputs: Inputs
+    path: str | Path,
+    study: Study,
+    before: tuple[Predictor, Comparison],
+    after: tuple[Predictor, Comparison],
+    inputs: Inputs,
+    tests: Mapping[str, Log] | None = None,
 ) -> None:
     """Writes how a model was completed as one HTML file.
 
     Args:
         before, after: the model as it was, and with all that was added, against the log.
+        tests: logs that nothing was fitted to, by name.
     """
-    first, last = study.steps[0], study.steps[-1]
-    found = [finding for step in study.steps for finding in step.added]
-    verdict = study.diagnoses[-1 if not found else 0]
-    outcome = study_outcome(study)
+    first, last, statuses = study.steps[0], study.steps[-1], _statuses(study)
     rows = (
-        ("Outcome", outcome),
+        *_relative_fall(study),
         ("Why it stopped there", _sentence(study.stopped_because)),
-        ("Error on held-out data", f"{number(first.held_out_rmse)} times the sensors' noise before, {number(last.held_out_rmse)} after"),
-        ("How sure", how_sure(verdict)),
-        ("What else it could be", _what_else(verdict)),
+        ("How sure", how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse)),
+        ("What else it could be", _what_else(study.found)),
+        ("What was looked for", _verdicts(statuses)),
         ("What to do next", _after_study(study, inputs)),
     )
-    caption = (
-        "Above: root mean square of what the equation of motion leaves over, on stretches of the log that the values were not fitted to. "
-        "Below: the model with everything added so far is simulated in the place of the robot; its joint angles against the log's."
-    )
-    falling = FigureBlock("The error, step by step", caption, figures.falling_error(study))
+    completed = dump_scenario(study.scenario, inputs.name) if study.found else None
     sections = [
-        Section("Summary", tables=(Table(("", ""), rows),)),
-        Section("The error falls", tables=(_step_table(study),), figures=(falling,)),
-        *_why(found, verdict),
-        *_where(before[1], before[0], " before"),
-        *(_where(after[1], after[0], " after") if found else ()),
-        _all_effects(study.diagnoses[-1]),
-        *_closing(before[0], inputs, after=dump_scenario(study.scenario, inputs.name) if found else None),
+        _summary(rows),
+        _where(before[1], before[0]),
+        *_why([step.added for step in study.steps[1:]], study.diagnoses[0].ranking, study.diagnoses[-1].unexplained),
+        _what_was_looked_for(statuses),
+        *([_fall(study, before, after, tests or {})] if study.found else []),
+        _hygiene(before[0], inputs),
+        _reproduce("study", before[0], inputs, completed),
     ]
     passed = study.diagnoses[-1].verdict in ("effect_found", "nothing_missing")
-    write_report(path, Report(f"{inputs.name}: the missing physics", passed, outcome, tuple(sections)))
+    write_report(path, Report(f"{inputs.name}: the missing physics", passed, inputs.hygiene.before(study_outcome(study)), tuple(sections)))
 
 
 def compare_outcome(comparison: Comparison) -> str:
@@ -138,11 +148,16 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "nothing_missing":
         return f"Nothing is missing: what the model leaves over is the sensors' noise ({number(diagnosis.held_out_before)} times it)."
     if diagnosis.verdict == "not_visible":
-        hidden = sum(status.verdict == "not_visible" for status in diagnosis.effects.values())
-        return f"This log cannot tell whether something is missing: {hidden} of {len(diagnosis.effects)} effects would not show in it."
-    places = ", ".join(f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained)
+        statuses = _applicable(diagnosis.effects)
+        hidden = sum(status.verdict == "not_visible" for status in statuses.values())
+        return f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} effects would not show in it."
     known = f" The model also lacks {found}." if found else ""
-    return f"Something is missing that no effect of the library explains, in {places}.{known}"
+    return f"{_unexplained(diagnosis)}{known}"
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    places = ", ".join(f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained)
+    return f"Something is missing that no effect of the library explains, in {places}."
 
 
 def study_outcome(study: Study) -> str:
@@ -151,35 +166,31 @@ def study_outcome(study: Study) -> str:
         return diagnosis_outcome(study.diagnoses[-1])
     first, last = study.steps[0], study.steps[-1]
     course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
-    rest = f" {diagnosis_outcome(study.diagnoses[-1])}" if study.diagnoses[-1].verdict == "unknown_effect" else ""
+    rest = f" {_unexplained(study.diagnoses[-1])}" if study.diagnoses[-1].verdict == "unknown_effect" else ""
     return (
         f"The model lacked {_listed(study.found)}. With it, the held-out error {course} from {number(first.held_out_rmse)} to "
         f"{number(last.held_out_rmse)} times the sensors' noise.{rest}"
     )
 
 
-def how_sure(diagnosis: Diagnosis) -> str:
-    """What supports the verdict."""
-    before, after = number(diagnosis.held_out_before), number(diagnosis.held_out_after)
-    if diagnosis.chosen:
+def how_sure(found: Sequence[Finding], before: float, after: float, train: float) -> str:
+    """What supports a verdict.
+
+    Args:
+        before, after, train: error on held-out data without and with what was found, and on the data that it was fitted to, in multiples of
+            the sensors' noise.
+    """
+    if found:
         return (
-            f"On data that nothing was fitted to, the error of all channels falls from {before} to {after} times the sensors' noise "
-            f"({number(diagnosis.train_after)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
+            f"On data that nothing was fitted to, the error of all channels falls from {number(before)} to {number(after)} times the "
+            f"sensors' noise ({number(train)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
         )
-    return f"The error of all channels is {before} times the sensors' noise, and no effect makes it smaller on held-out data."
+    return f"The error of all channels is {number(before)} times the sensors' noise, and no effect makes it smaller on held-out data."
 
 
 def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
     """What to do, with the command."""
-    doubtful = {name for finding in diagnosis.chosen for name in finding.confusable_with}
-    steps = []
-    if diagnosis.verdict == "unknown_effect":
-        steps.append("Look at the pictures of the channels that are left, and register an effect of your own that looks like them.")
-    if doubtful:
-        steps.append(f"To tell them apart: {_experiments({name: diagnosis.effects[name] for name in doubtful})}")
-    if diagnosis.verdict == "not_visible":
-        hidden = {name: status for name, status in diagnosis.effects.items() if status.verdict == "not_visible"}
-        steps.append(f"Record a motion that shows more: {_experiments(hidden)}")
+    steps = _experiments_next(diagnosis, diagnosis.chosen)
     if diagnosis.chosen:
         steps.append(f"Add it to the model: fbse add {inputs.scenario} {inputs.out} --out {inputs.name}_completed.yaml")
     return " ".join(steps) or "Nothing. A motion that loads and moves the joints more would show smaller effects."
@@ -187,9 +198,26 @@ def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
 
 def _after_study(study: Study, inputs: Inputs) -> str:
     last = study.diagnoses[-1]
-    if not study.found or last.verdict == "unknown_effect":
+    if not study.found:
         return next_step(last, inputs)
-    return f"Use the completed model, {inputs.out}/completed.yaml, and try it on a log that it has not seen: fbse compare"
+    steps = _experiments_next(last, study.found)
+    steps.append(f"Try the completed model on a log that it has not seen: fbse compare {inputs.out}/completed.yaml ANOTHER_LOG")
+    return " ".join(steps)
+
+
+def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[str]:
+    """What to look at and which experiments to make."""
+    statuses = _applicable(diagnosis.effects)
+    doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
+    steps = []
+    if diagnosis.verdict == "unknown_effect":
+        steps.append("Look at the pictures of the channels that are left, and register an effect of your own that looks like them.")
+    if doubtful:
+        steps.append(f"To tell them apart: {_experiments(doubtful)}")
+    if diagnosis.verdict == "not_visible":
+        hidden = {name: status for name, status in statuses.items() if status.verdict == "not_visible"}
+        steps.append(f"Record a motion that shows more: {_experiments(hidden)}")
+    return steps
 
 
 def parameter_text(name: str, estimate: Estimate) -> str:
@@ -213,8 +241,14 @@ def _sentence(text: str) -> str:
 
 
 def _listed(findings: Sequence[Finding]) -> str:
-    """Effects and where, as `Coulomb friction in left knee pitch and torque bias in 3 joints`; effects in lower case inside a sentence."""
-    names = [_effect_in(effect, targets) for effect, targets in by_effect(findings).items()]
+    """Effects and where, as `Coulomb friction and torque bias in left knee pitch and body mass in trunk`; for the inside of a sentence."""
+    by_place: dict[tuple[str, ...], list[str]] = {}
+    for effect, targets in by_effect(findings).items():
+        by_place.setdefault(tuple(targets), []).append(effect)
+    return _enumerated([_effects_in(effects, targets) for targets, effects in by_place.items()])
+
+
+def _enumerated(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
 
 
@@ -222,9 +256,9 @@ def _listed(findings: Sequence[Finding]) -> str:
 _NAMES = ("Coulomb", "Stribeck", "IMU")
 
 
-def _effect_in(effect: str, targets: Sequence[str]) -> str:
-    name = _inside(effect)
-    return name if list(targets) == ["robot"] else f"{name} in {targets_text(targets)}"
+def _effects_in(effects: Sequence[str], targets: Sequence[str]) -> str:
+    names = _enumerated([_inside(effect) for effect in effects])
+    return names if list(targets) == ["robot"] else f"{names} in {targets_text(targets, effects[0])}"
 
 
 def _inside(effect: str) -> str:
@@ -237,15 +271,16 @@ def _either(effects: Iterable[str]) -> str:
     return " or ".join(_inside(effect) for effect in effects)
 
 
-def _what_else(diagnosis: Diagnosis) -> str:
+def _what_else(found: Sequence[Finding]) -> str:
+    equal: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in found:
+        equal.setdefault(finding.confusable_with, []).append(finding)
     told = [
-        f"{_sentence(_either(f.confusable_with))[:-1]} explains this log as well as {_effect_in(f.effect, f.targets)}."
-        for f in diagnosis.chosen
-        if f.confusable_with
+        f"{_sentence(_either(names))[:-1]} explains this log as well as {_listed(findings)}." for names, findings in equal.items() if names
     ]
     if told:
         return " ".join(told)
-    if not diagnosis.chosen:
+    if not found:
         return "Nothing else in the library: an effect smaller than the sizes below would not have shown."
     return "No other effect of the library explains this log as well."
 
@@ -259,94 +294,175 @@ def _experiments(statuses: dict[str, EffectStatus]) -> str:
     return " ".join(f"{text} [{', '.join(names)}]" for text, names in texts.items())
 
 
-def _where(comparison: Comparison, predictor: Predictor, when: str = "") -> list[Section]:
+def _summary(rows: Sequence[tuple[str, str]]) -> Section:
+    return Section("Summary", tables=(Table(("", ""), tuple(rows)),))
+
+
+_KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of the soles"}
+
+
+def _kinds(comparison: Comparison) -> str:
+    """How many channels of each kind stand out from the noise."""
+    failing = {failure.row.name for failure in comparison.failures}
+    counts = {kind: [c.row.name in failing for c in comparison.channels if c.row.kind == kind] for kind in _KINDS}
+    return "In " + ", ".join(f"{sum(fails)} of {len(fails)} {_KINDS[kind]}" for kind, fails in counts.items() if fails) + "."
+
+
+def _applicable(statuses: Mapping[str, EffectStatus]) -> dict[str, EffectStatus]:
+    """Effects that there is a place for on this robot: an arm has no feet."""
+    return {name: status for name, status in statuses.items() if status.smallest_detectable}
+
+
+def _statuses(study: Study) -> dict[str, EffectStatus]:
+    """What all rounds together say of every effect: the last one, but for what was found before and what stood for it as well."""
+    found = {finding.effect for finding in study.found}
+    equal = {name for finding in study.found for name in finding.confusable_with}
+    return {
+        name: replace(status, verdict="present" if name in found else "confusable" if name in equal else status.verdict)
+        for name, status in _applicable(study.diagnoses[-1].effects).items()
+    }
+
+
+def _verdicts(statuses: Mapping[str, EffectStatus]) -> str:
+    """How many effects of the library have each verdict."""
+    verdicts = [status.verdict for status in statuses.values()]
+    counts = ", ".join(f"{verdicts.count(name)} {words(name)}" for name in figures.VERDICT_COLORS if name in verdicts)
+    return f"{len(verdicts)} effects: {counts}. Absent means that it would have been seen."
+
+
+def _where(comparison: Comparison, predictor: Predictor) -> Section:
     """Where the model fails: in words, on the robot, against each variable and over time."""
-    by_name = {channel.row.name: channel for channel in comparison.channels}
-    worst = [by_name[name] for name in dict.fromkeys(failure.row.name for failure in comparison.failures)][:_CHANNELS]
-    blocks = [
-        FigureBlock(
-            "Error over noise, by joint and by phase",
-            "Root mean square of what the equation of motion leaves over, in multiples of the sensors' noise: about 1 is noise alone. "
-            "No joint effect can show in the base's channels: what does is mass, foot sensor, IMU or contact. The soles' channels are the "
-            "motion of feet that stand.",
-            figures.robot_errors(predictor.robot, comparison, predictor.motion.blocks.joint_position.mean(axis=0)),
-        )
-    ]
-    if worst:
+    robot, residual, motion = predictor.robot, predictor.residual, predictor.motion
+    known = [channel for channel in comparison.channels if not np.isnan(channel.rmse)]
+    if robot.description.legs:
+        drawn = figures.robot_errors(robot, comparison, motion.blocks.joint_position.mean(axis=0))
+        blocks = [FigureBlock("Error over noise, by joint and by phase", _BY_PHASE, drawn)]
+    else:
+        blocks = [FigureBlock("Error over noise, by joint", _RATIOS, figures.channel_errors(known))] if len(known) > 1 else []
+    if worst := _worst(comparison):
         blocks += [
             FigureBlock(
                 "The worst channels against what they may depend on",
                 "Mean error in bins. Where the interval is narrow and away from zero, the error follows that variable; where it is "
-                "wide, the error depends on something else. A positive error means that the model's torque is too low.",
+                "wide, the error depends on something else. A positive error means that the model's torque (or force) is too low.",
                 figures.error_bins(worst),
             ),
             FigureBlock(
                 "The worst channels over time",
-                "Averages over 10 ms. Inside the grey band is what the sensors' noise explains.",
-                figures.errors_over_time(predictor.residual, predictor.robot.description.sides, worst),
+                f"Averages over {number(1e3 * motion.length * motion.period)} ms. Inside the grey band is what sensor noise explains.",
+                figures.errors_over_time(residual, robot.description.sides, worst),
             ),
         ]
-    rows = tuple(
-        (f.text, f.where.error, f"{f.where.interval[0]:.3g} to {f.where.interval[1]:.3g}", f.where.noise_floor, f.row.unit)
-        for f in comparison.failures
-    )
-    header = ("Failure, worst first", "Mean error", "95 % interval", "Noise in it", "Unit")
-    text = "" if rows else "No failure above the noise."
-    return [Section(f"Where the model fails{when}", text, tables=(Table(header, rows),) if rows else (), figures=tuple(blocks))]
+    text = _METHOD if comparison.failures else f"{_METHOD} No failure above the noise."
+    return Section("Where the model fails", text, (*_failure_tables(comparison), _channel_table(known)), tuple(blocks))
 
 
-_CHANNELS_TEXT = (
-    "NRMSE is beside the zero predictor, a model without any forces: 1 means that the model explains nothing. The channels of the soles "
-    "have none, for any model predicts that a foot that stands does not move."
+def _worst(comparison: Comparison) -> list[Channel]:
+    by_name = {channel.row.name: channel for channel in comparison.channels}
+    return [by_name[name] for name in dict.fromkeys(failure.row.name for failure in comparison.failures)][:_CHANNELS]
+
+
+_METHOD = (
+    "The recorded motion is put into the model's equation of motion. What it leaves over, the residual, is what the model does not "
+    "explain; it stands beside the noise that the sensors must put into it."
+)
+_RATIOS = "Root mean square of what the equation of motion leaves over, in multiples of the sensors' noise: about 1 is noise alone."
+_BY_PHASE = (
+    f"{_RATIOS} No joint effect can show in the base's channels: what does is mass, foot sensor, IMU or contact. The soles' channels "
+    "are the motion of feet that stand."
 )
 
 
-def _channel_table(comparison: Comparison) -> Table:
-    rows = [(words(c.row.name), c.rmse, c.noise_floor, c.row.unit, c.rmse / c.noise_floor, c.nrmse) for c in comparison.channels]
-    known = tuple(row for row in rows if not np.isnan(row[1]))
-    return Table(("Channel", "RMSE", "Noise floor", "Unit", "RMSE over noise", "NRMSE"), known)
-
-
-def _why(findings: Sequence[Finding], diagnosis: Diagnosis) -> list[Section]:
-    """What was found, with its values and the alternatives."""
-    chosen = [finding for finding in findings if finding.chosen]
-    shown = [*chosen, *[finding for finding in diagnosis.ranking if not finding.chosen][:_ALTERNATIVES]]
-    if not shown:
-        return []
-    known = library()
-    blocks = [
-        FigureBlock(
-            "What explains the error",
-            "Error on held-out data of the channels that an effect moves, without it and with it. The broken line is the sensors' noise.",
-            figures.ranking(shown),
-        )
-    ]
-    if any(finding.parameters for finding in chosen):
-        blocks.append(FigureBlock("Fitted values", "With their 95 % intervals.", figures.parameters(chosen)))
+def _failure_tables(comparison: Comparison, caption: str = "What stands out from the noise, in words.") -> list[Table]:
+    """The worst failures, and the others folded away."""
     rows = tuple(
-        (
-            spaced(finding.effect),
-            targets_text(finding.targets),
-            parameters_text(finding),
-            finding.held_out_before,
-            finding.held_out_after,
-            known[finding.effect].signature if finding.effect in known else "",
-        )
-        for finding in chosen
+        (f.text, f.where.error, "\u00a0to\u00a0".join(map(_short, f.where.interval)), f.where.noise_floor, f.row.unit)
+        for f in comparison.failures
     )
-    header = ("Effect", "In", "Values (95 % interval)", "Before", "After", "What it looks like in data")
-    left = tuple((words(u.row), u.ratio, u.variable, 100 * u.share) for u in diagnosis.unexplained)
-    tables = [Table(header, rows)] if rows else []
-    if left:
-        tables.append(Table(("Left over in", "Over noise", "Follows most", "Which explains [%]"), left))
-    return [Section("What explains it", tables=tuple(tables), figures=tuple(blocks))]
+    header = ("Failure, worst first", "Mean error", "95 % interval", "Noise in it", "Unit")
+    tables = [Table(header, rows[:_FAILURES], caption)] if rows else []
+    more = rows[_FAILURES:]
+    return [*tables, Table(header, more, f"{len(more)} more {'failures' if len(more) > 1 else 'failure'}", folded=True)] if more else tables
 
 
-def _all_effects(diagnosis: Diagnosis) -> Section:
+def _channel_table(channels: Sequence[Channel]) -> Table:
+    rows = [
+        (words(c.row.name), c.rmse, c.noise_floor, c.row.unit, c.rmse / c.noise_floor, "" if np.isnan(c.nrmse) else 100 * c.nrmse)
+        for c in channels
+    ]
+    header = ("Channel", "Error, RMS", "Noise, RMS", "Unit", "Error over noise", "Relative error [%]")
+    caption = "All channels. The relative error is that beside a model without any forces, which has 100 %."
+    return Table(header, tuple(rows), caption, folded=True)
+
+
+def _why(rounds: Sequence[Sequence[Finding]], alternatives: Sequence[Finding], unexplained: Sequence[Structure]) -> list[Section]:
+    """What was found in each round, with its values and the alternatives, and what is left without an explanation."""
+    chosen = [finding for found in rounds for finding in found]
+    others = [finding for finding in alternatives if not finding.chosen][:_ALTERNATIVES]
+    of_round = [f", round {k}" * (k > 1) for k, found in enumerate(rounds, start=1) for _ in found]
+    tables, blocks = _value_tables(rounds), []
+    if unexplained:
+        rows = tuple((words(u.row), u.ratio, u.variable, 100 * u.share) for u in unexplained)
+        header = ("Left over in", "Error over noise", "Follows most", "Which explains [%]")
+        tables.append(Table(header, rows, "What no effect of the library explains, and the variable that it follows."))
+    if chosen or others:
+        caption = (
+            "Error on held-out data of the channels that an effect moves, without it and with it, everything else being equal. "
+            "The broken line is the sensors' noise. An alternative stands in the place of what was chosen."
+        )
+        names = [f"{finding_name(f)}{when}" for f, when in zip(chosen + others, of_round + [""] * len(others), strict=True)]
+        blocks.append(FigureBlock("What explains the error", caption, figures.ranking([*chosen, *others], names)))
+    valued = [
+        (finding, f"{targets_text(finding.targets, finding.effect)}{when}")
+        for finding, when in zip(chosen, of_round, strict=True)
+        if finding.parameters
+    ]
+    if valued:
+        caption = "With their 95 % intervals, which respect what is left of correlation in time."
+        blocks.append(FigureBlock("Fitted values", caption, figures.parameters(valued)))
+    text = "" if chosen else "No effect of the library makes the error smaller on data that it was not fitted to."
+    return [Section("Why it fails", text, tuple(tables), tuple(blocks))] if tables or blocks else []
+
+
+def _value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
+    """A table for each effect: its values where it was found. What a later round finds in the same place comes on top."""
+    known = library()
+    where: dict[str, list[tuple[int, Finding]]] = {}
+    for number_of, found in enumerate(rounds, start=1):
+        for finding in found:
+            where.setdefault(finding.effect, []).append((number_of, finding))
+    several = len(rounds) > 1
+    tables = []
+    for effect, findings in where.items():
+        rows = []
+        for number_of, finding in findings:
+            values = map(_value_text, finding.parameters.values())
+            errors = (finding.held_out_before, finding.held_out_after)
+            place = (targets_text(finding.targets, effect), *([str(number_of)] * several))
+            rows.append((*place, *values, *errors, _either(finding.confusable_with) or "no other"))
+        units = [f"{words(name)} [{estimate.unit}]" for name, estimate in findings[0][1].parameters.items()]
+        header = ("In", *(["Round"] * several), *units, "Held-out error / noise before", "after", "Explains as much")
+        says = [f"{spaced(effect)}."] + ([known[effect].description, known[effect].signature] if effect in known else [])
+        tables.append(Table(header, tuple(rows), f"{' '.join(says)} Values with 95 % intervals."))
+    return tables
+
+
+def _value_text(estimate: Estimate) -> str:
+    low, high = map(_short, estimate.interval)
+    return f"{_short(estimate.value)} [{low},\u00a0{high}]"
+
+
+def _short(value: float) -> str:
+    """A number for a narrow column; very small and very large ones with an exponent. With a minus sign, at which no line breaks."""
+    text = number(value) if value == 0 or 1e-4 <= abs(value) < 1e5 else f"{value:.2e}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
     """What the data says of every effect of the library."""
     known = library()
     rows = []
-    for name, status in diagnosis.effects.items():
+    for name, status in statuses.items():
         reach = f"{words(status.parameter)} {_reach(status, name)}"
         does = known[name].description if name in known else ""
         show = f"{status.experiment} ({status.command})" if status.command else status.experiment
@@ -356,15 +472,11 @@ def _all_effects(diagnosis: Diagnosis) -> Section:
         "What this log can show",
         "How small an effect could be and still be found, against what is plausible on a robot of this kind. What lies in the grey area is "
         "not visible in this log, which is not the same as absent.",
-        figures.detectability(diagnosis.effects),
+        figures.detectability(statuses),
     )
-    order = ("present", "confusable", "absent", "not visible")
-    return Section(
-        "All effects of the library",
-        "Beside what was found.",
-        tables=(Table(header, tuple(sorted(rows, key=lambda row: order.index(row[1])))),),
-        figures=(block,),
-    )
+    order = [words(verdict) for verdict in figures.VERDICT_COLORS]
+    table = Table(header, tuple(sorted(rows, key=lambda row: order.index(row[1]))), "All effects of the library, one by one", folded=True)
+    return Section("What else was looked for", _verdicts(statuses), (table,), (block,))
 
 
 def _reach(status: EffectStatus, effect: str) -> str:
@@ -379,50 +491,222 @@ def _reach(status: EffectStatus, effect: str) -> str:
     return "; ".join([*shown, *([f"none in {targets_text(hidden)}"] if hidden else [])])
 
 
-def _step_table(study: Study) -> Table:
-    rows = []
-    for step in study.steps:
-        rolled = step.rollout
-        rows.append(
-            (
-                _sentence(_listed(step.added)) if step.added else "The model as given.",
-                step.held_out_rmse,
-                step.train_rmse,
-                np.nan if rolled is None else 1e3 * rolled.mean_position,
-                np.nan if rolled is None else rolled.mean_torque_command,
-                "" if rolled is None or rolled.failure is None else rolled.failure,
-            )
+_FALLING = "Root mean square of what the equation of motion leaves over, on stretches of the log that the values were not fitted to."
+
+
+def _fall(study: Study, before: tuple[Predictor, Comparison], after: tuple[Predictor, Comparison], tests: Mapping[str, Log]) -> Section:
+    """What the completed model brings: step by step, by channel, over time; and what it leaves."""
+    robot, (first, last) = before[0].robot, (study.steps[index].rollout for index in (0, -1))
+    rolled = first is not None and last is not None
+    simulated = " Below: the model with everything added so far is simulated in the place of the robot; its joints against the log's."
+    channels = zip(before[1].channels, after[1].channels, strict=True)
+    known = [(given, completed) for given, completed in channels if not np.isnan([given.rmse, completed.rmse]).any()]
+    blocks = [
+        FigureBlock("The error, step by step", _FALLING + (simulated if rolled else ""), figures.falling_error(study.steps, _moves(robot)))
+    ]
+    if len(known) > 1:
+        drawn = figures.channel_errors(*map(list, zip(*known, strict=True)))
+        blocks.append(FigureBlock("Every channel, before and after", _RATIOS, drawn))
+    blocks += _measured_torque(study.scenario, before[0], tests)
+    if rolled and len(first.sample_time) and len(last.sample_time):
+        caption = "Simulated less recorded position of the joints that the model as given misses most, over the whole log."
+        blocks.append(
+            FigureBlock("The simulated model, before and after", caption, figures.position_errors(first, last, robot.torque_units))
         )
-    header = ("Added", "Held-out error / noise", "Fitted error / noise", "Simulated joint angles, RMS [mrad]", "Torques, RMS [Nm]", "Fell")
-    return Table(header, tuple(rows))
+    if worst := _worst(after[1]):
+        caption = "Mean error of the completed model in bins of what it may depend on."
+        blocks.append(FigureBlock("What is left, against what it may depend on", caption, figures.error_bins(worst)))
+    left = _failure_tables(after[1], "What the completed model leaves: what still stands out from the noise, in words.")
+    text = "" if left else "What the completed model leaves does not stand out from the noise."
+    return Section(
+        "How the error falls",
+        text,
+        (_step_table(study.steps, robot), *_relative_errors(study), *_simulated_positions(study, robot), *left),
+        tuple(blocks),
+    )
 
 
-def _closing(predictor: Predictor, inputs: Inputs, after: str | None = None) -> list[Section]:
-    """The data and the scenario."""
-    motion, sensors = predictor.motion, predictor.scenario.sensors
-    standing = motion.standing
+def _relative_fall(study: Study) -> list[tuple[str, str]]:
+    """The relative error of all torques together, before and after, as a row of the summary."""
+    first, last = study.steps[0].errors, study.steps[-1].errors
+    falls = [
+        f"on {_log_name(name)} {number(100 * error.relative)} % before, {number(100 * last[name].relative)} % after"
+        for name, error in first.items()
+        if np.isfinite(error.relative)
+    ]
+    return [("Relative torque error", _sentence("; ".join(falls)))] if falls and study.found else []
+
+
+def _log_name(name: str) -> str:
+    return "the log that was fitted" if name == "train" else f"{name} (not fitted)"
+
+
+def _relative_errors(study: Study) -> list[Table]:
+    """Relative errors of the model as given and completed, by joint, on the log that was diagnosed and on others."""
+    first, last = study.steps[0].errors, study.steps[-1].errors
+    if not any(np.isfinite(error.relative) for error in first.values()):
+        return []
+    joints = next(iter(first.values())).relative_by_joint
+    rows = [
+        (words(joint), *(100 * errors[name].relative_by_joint[joint] for name in first for errors in (first, last))) for joint in joints
+    ]
+    if len(rows) > 1:
+        rows.append(("all joints", *(100 * errors[name].relative for name in first for errors in (first, last))))
+    header = ["Joint"]
+    for name in first:
+        header += [f"{_sentence(_log_name(name))[:-1]}: as given [%]", "completed [%]"]
+    return [Table(tuple(header), tuple(rows), "Relative errors |residual| / |measured torque|, 2-norms over each log.")]
+
+
+def _measured_torque(completed: Scenario, given: Predictor, tests: Mapping[str, Log]) -> list[FigureBlock]:
+    """Measured and modelled torque of the worst joints where the model as given errs most, on a log that nothing was fitted to if any."""
+    name, log = next(iter(tests.items()), ("train", given.motion.log))
+    given, after = Predictor(given.scenario, log), Predictor(completed, log)
+    residual, n = given.residual, len(given.robot.joint_names)
+    error = np.where(residual.known, residual.value / np.sqrt(residual.variance), np.nan)[:, :n]
+    power = np.nan_to_num(error**2)
+    worst = np.argsort(-power.sum(axis=0))[:_JOINTS]
+    places = sorted(int(joint) for joint in worst if residual.known[:, joint].any())
+    if not places:
+        return []
+    stretch = _worst_stretch(power[:, places].sum(axis=1))
+    time = residual.time[stretch]
+    part = ", the part in which the model as given errs most" if len(time) < len(residual.time) else ""
+    caption = (
+        f"What the motors gave, and what the model needs for the same motion; {number(float(time[-1] - time[0]), 2)} s of {_log_name(name)}"
+        f"{part}. Right above each panel: |error| / |measured| there (2-norms)."
+    )
+    drawn = figures.torques_over_time(residual, after.residual, places, stretch)
+    return [FigureBlock("Measured torque and the model's, before and after", caption, drawn)]
+
+
+def _worst_stretch(power: np.ndarray) -> slice:
+    """The `_SHOWN` averages in a row with the largest sum."""
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    length = min(_SHOWN, len(power))
+    start = int(np.argmax(total[length:] - total[:-length]))
+    return slice(start, start + length)
+
+
+def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
+    """How the error falls on the way to a diagnosis."""
+    if len(diagnosis.path) < 2:
+        return []
+    steps, taken = [], set()
+    for explanation in diagnosis.path:
+        members = {(candidate.name, candidate.targets) for candidate in explanation.candidates}
+        added = tuple(Finding(*member, np.nan, np.nan, {}, (), chosen=True) for member in sorted(members - taken))
+        shares = (sse.sum() / diagnosis.path[0].held_out_sse.sum() for sse in (explanation.held_out_sse, explanation.sse))
+        steps.append(StudyStep(added, *(diagnosis.held_out_before * float(np.sqrt(share)) for share in shares), rollout=None))
+        taken = members
+    text = "Effects were added one after the other, each the one that leaves least on held-out data."
+    block = FigureBlock("The error as effects are added", _FALLING, figures.falling_error(steps, _moves(robot)))
+    return [Section("How the error falls", text, (_step_table(steps, robot),), (block,))]
+
+
+def _moves(robot: Robot) -> str:
+    """Unit of small motions of its joints."""
+    return ", ".join(dict.fromkeys("mrad" if unit == "Nm" else "mm" for unit in robot.torque_units))
+
+
+def _simulated_positions(study: Study, robot: Robot) -> list[Table]:
+    """How far the simulated model is from the log, as given and completed, by joint."""
+    first, last = study.steps[0].rollout, study.steps[-1].rollout
+    if first is None or last is None or not first.relative_position:
+        return []
+    rows = [
+        (
+            words(joint),
+            "mrad" if unit == "Nm" else "mm",
+            *(1e3 * error.position[joint] for error in (first, last)),
+            *(1e3 * error.mean_absolute_position[joint] for error in (first, last)),
+            *(100 * error.relative_position[joint] for error in (first, last)),
+        )
+        for joint, unit in zip(robot.joint_names, robot.torque_units, strict=True)
+    ]
+    header = ("Joint", "Unit", "RMS, as given", "completed", "Mean |error|, as given", "completed", "Relative [%], as given", "completed")
+    caption = "The model simulated in the place of the robot: errors of its positions; the relative one is |error| / |position|, 2-norms."
+    return [Table(header, tuple(rows), caption)]
+
+
+def _step_table(steps: Sequence[StudyStep], robot: Robot) -> Table:
+    """Errors step by step, and those of the simulated model where it was simulated."""
+    header = ["Added", "Held-out error / noise", "Fitted error / noise"]
+    rows = [[_sentence(_listed(s.added)) if s.added else "The model as given.", s.held_out_rmse, s.train_rmse] for s in steps]
+    if any(step.rollout is not None for step in steps):
+        header += [
+            f"Simulated joints, RMS [{_moves(robot)}]",
+            f"Torques, RMS [{', '.join(dict.fromkeys(robot.torque_units))}]",
+            "Simulation",
+        ]
+        for row, rolled in zip(rows, (step.rollout for step in steps), strict=True):
+            if rolled is None:
+                row += [np.nan, np.nan, "none"]
+            else:
+                row += [1e3 * rolled.mean_position, rolled.mean_torque_command, rolled.failure or "complete"]
+    return Table(tuple(header), tuple(map(tuple, rows)), "Errors as the model grows, over all channels.")
+
+
+def _hygiene(predictor: Predictor, inputs: Inputs) -> Section:
+    """What was measured, and how it was read."""
+    motion, robot, standing = predictor.motion, predictor.robot, predictor.motion.standing
+    time, recording = motion.log.time, predictor.scenario.recording
+    length = f"{number(float(time[-1] - time[0]))} s, {len(time)} samples, {number(1 / motion.period)} Hz"
+    if recording.train_share < 1:
+        length += f"; the first {number(100 * recording.train_share, 2)} % of the log, the rest is to test on"
     rows = [
         ("Log", inputs.log),
-        ("Length", f"{number(float(motion.log.time[-1] - motion.log.time[0]))} s, {len(motion.log.time)} samples"),
+        ("Length", length),
         ("Samples that are missing", f"{number(100 * float(1 - motion.measured.mean()), 2)} %; nothing is said about the gaps"),
-        ("Joint velocities", "measured" if "joint/velocity" in motion.log else "differenced from the angles"),
-        ("Sensor noise that is believed", _noise_text(sensors)),
+        ("Joints", ", ".join(map(words, robot.joint_names))),
+        ("Joint velocities", recording.velocity if "joint/velocity" in motion.log else "differenced from the angles"),
+        ("Low-pass without delay", f"{recording.cutoff:g} Hz" if recording.cutoff > 0 else "none"),
+        ("Sensor noise that is believed", _noise_text(predictor)),
         ("Averages over", f"{number(1e3 * motion.length * motion.period)} ms; {len(motion.time)} of them"),
     ]
-    if predictor.robot.has_floating_base:
-        share = {side: 100 * float(standing[:, k].mean()) for k, side in enumerate(predictor.robot.description.sides)}
+    if robot.has_floating_base:
+        share = {side: 100 * float(standing[:, k].mean()) for k, side in enumerate(robot.description.sides)}
         rows.append(("Share of time that a foot stands", ", ".join(f"{side} {number(value, 2)} %" for side, value in share.items())))
-    scenario = Details("YAML", dump_scenario(predictor.scenario, inputs.name))
-    completed = (Details("YAML with the completed model", after),) if after is not None else ()
-    return [
-        Section("Data", tables=(Table(("", ""), tuple(rows)),)),
-        Section("Scenario", "Sensors, and the model with its effects, as they were believed.", details=(scenario, *completed)),
+    found = tuple((finding.severity, _sentence(finding.text)) for finding in inputs.hygiene.findings)
+    noise = tuple((words(level.channel), level.level, level.believed, level.unit) for level in inputs.hygiene.noise)
+    tables = [
+        Table(("", ""), tuple(rows)),
+        *([Table(("Severity", "What is remarkable"), found)] if found else []),
+        *([Table(("Channel", "White noise of a sample", "Believed", "Unit"), noise)] if noise else []),
     ]
+    text = "What was measured, and how it was read." + ("" if found else " Nothing about it is remarkable.")
+    return Section("Data hygiene", text, tables=tuple(tables))
 
 
-def _noise_text(sensors: SensorsConfig) -> str:
-    imu, feet = sensors.imu, sensors.foot_force
-    return (
-        f"accelerometer {imu.acceleration_noise:g} m/s², gyroscope {imu.angular_velocity_noise:g} rad/s, "
-        f"pads {feet.noise:g} N, joint velocity {joint_velocity_noise(sensors):.2g} rad/s"
-    )
+def _reproduce(command: str, predictor: Predictor, inputs: Inputs, completed: str | None = None) -> Section:
+    """The command that makes this report again, and what it ran on."""
+    log = Path(inputs.log)
+    packages = ", ".join(f"{name} {version(name)}" for name in ("fbse_drake", "drake", "numpy", "scipy"))
+    rows = [("Software", f"Python {python_version()}, {packages}")]
+    if log.is_file():
+        rows.append(("SHA-256 of the log", sha256(log.read_bytes()).hexdigest()))
+    again = [
+        f"fbse {command} {inputs.out}/scenario.yaml {inputs.log}",
+        *(f"--test {test}" for test in inputs.tests),
+        f"--out {inputs.out}_again",
+    ]
+    believed = dump_scenario(predictor.scenario, inputs.name)
+    details = [
+        Details("Command", " ".join(again), folded=False),
+        Details("The scenario as it was believed: sensors, and the model with its effects", believed),
+    ]
+    if completed is not None:
+        details.append(Details("The scenario with the completed model", completed))
+    return Section("Reproduce this", tables=(Table(("", ""), tuple(rows)),), details=tuple(details))
+
+
+def _noise_text(predictor: Predictor) -> str:
+    sensors, robot = predictor.scenario.sensors, predictor.robot
+    imu, rotary = sensors.imu, "Nm" in robot.torque_units
+    parts = [f"joint velocity {joint_velocity_noise(sensors):.2g} {'rad/s' if rotary else 'm/s'}"]
+    if robot.has_floating_base:
+        parts += [f"accelerometer {imu.acceleration_noise:g} m/s²", f"gyroscope {imu.angular_velocity_noise:g} rad/s"]
+        parts += [f"foot forces {sensors.foot_force.noise:g} N"]
+    unit = "Nm" if rotary else "N"
+    parts += [f"torque of {words(joint)} {value:g} {unit}" for joint, value in predictor.scenario.recording.torque_noise.items()]
+    return ", ".join(parts)

@@ -5,10 +5,10 @@ Errors are in multiples of the sensors' noise wherever channels of different uni
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
@@ -18,9 +18,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 
 from fbse_drake.discrepancy.compare import Bin, Channel, Comparison, words
-from fbse_drake.discrepancy.diagnose import EffectStatus, Finding
-from fbse_drake.discrepancy.residual import Residual
-from fbse_drake.discrepancy.study import Study
+from fbse_drake.discrepancy.diagnose import EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.residual import Residual, Row
+from fbse_drake.discrepancy.rollout import RolloutError
+from fbse_drake.discrepancy.study import StudyStep
 from fbse_drake.effects.effect import library
 from fbse_drake.report.figures import ESTIMATE, PLANNED, SIDE_COLORS, TRUTH, WIDTH, add_legend, decorate
 from fbse_drake.report.html import number
@@ -31,8 +32,16 @@ _DARKEST = 30.0
 _RATIO_COLORS = LinearSegmentedColormap.from_list("ratio", ["#f3f5f7", "#fbe3c8", "#f4a562", "#d65f1a", "#8f1313"])
 _RATIO_NORM = LogNorm(1.0, _DARKEST, clip=True)
 _NOISE = "#8a9199"
-# Effects that a tick names.
+# A model before something was added to it.
+_BEFORE = "#d65f1a"
+# Effects that a tick names, panels in a row.
 _MOST_NAMED = 3
+_PANELS = 3
+# Joints whose simulated positions are drawn; samples further apart than this many periods are not joined.
+_MOST_JOINTS = 6
+_GAP = 3.0
+# Intervals are drawn up to this many times the largest value.
+_WIDEST = 4.0
 VERDICT_COLORS = {"present": TRUTH, "confusable": "#e39b16", "absent": ESTIMATE, "not_visible": "#a9b0b7"}
 
 
@@ -126,13 +135,83 @@ def _draw_phases(axes: Axes, channels: Sequence[Channel]) -> None:
     axes.spines[:].set_visible(False)
 
 
+def channel_errors(before: Sequence[Channel], after: Sequence[Channel] = ()) -> Figure:
+    """Error over noise of every channel that is known; with `after`, of the same channels, also what is left of it."""
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(before)), layout="constrained")
+    axes = figure.subplots()
+    ratios = [[_ratio(channel.rmse, channel.noise_floor) for channel in channels] for channels in (before, after or before)]
+    label = "the model as given"
+    _draw_falls(axes, [words(channel.row.name) for channel in before], *ratios, (label, "the completed model" if after else label))
+    axes.set_xlabel("error over the sensors' noise, root mean squares [1]")
+    add_legend(figure)
+    return figure
+
+
+def _draw_falls(
+    axes: Axes,
+    names: Sequence[str],
+    before: Sequence[float],
+    after: Sequence[float],
+    labels: tuple[str, str | Sequence[str]],
+    colors: str | Sequence[str] = ESTIMATE,
+) -> None:
+    """Errors over noise before and after something, a line for each name, the first on top.
+
+    Args:
+        labels, colors: of before and after; those of after may differ from name to name.
+    """
+    decorate(axes)
+    places = range(len(names))
+    labels_after = [labels[1]] * len(names) if isinstance(labels[1], str) else labels[1]
+    colors = [colors] * len(names) if isinstance(colors, str) else colors
+    for place, first, last, label, color in zip(places, before, after, labels_after, colors, strict=True):
+        text = number(last)
+        if first != last:
+            axes.hlines(place, *sorted((first, last)), color=color, linewidth=1.5, alpha=0.4)
+            axes.plot(first, place, "o", color=_BEFORE, markersize=6, label=labels[0])
+            text = f"{number(first)} → {text}"
+        axes.plot(last, place, "o", color=color, markersize=6, label=label)
+        style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": PLANNED}
+        axes.annotate(text, (max(first, last), place), (8, 0), **style)
+    axes.axvline(1.0, color=PLANNED, linestyle="--", linewidth=1.0, label="sensors' noise")
+    axes.set_yticks(places, names, fontsize=9)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xscale("log")
+    smallest, largest = min(0.8, *before, *after), max(1.0, *before, *after)
+    # Room for the numbers.
+    axes.set_xlim(0.9 * smallest, largest * (largest / smallest) ** 0.2)
+    _plain_log(axes.xaxis)
+    axes.grid(visible=False, axis="y")
+
+
+def _plain_log(axis: Axis) -> None:
+    """Ticks at 1, 2, 5 and their decades, in plain numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("")
+
+
+# What an error may depend on, of a revolute and of a prismatic joint, by the unit of its row.
 _LABELS = {
-    "speed": "|velocity| [rad/s]\n(error along the motion)",
-    "velocity": "velocity [rad/s]",
-    "position": "angle [rad]",
-    "load": "torque command [Nm]",
-    "time": "time [s]",
+    "Nm": {
+        "speed": "|velocity| [rad/s]\n(error along the motion)",
+        "velocity": "velocity [rad/s]",
+        "position": "angle [rad]",
+        "load": "torque command [Nm]",
+    },
+    "N": {
+        "speed": "|velocity| [m/s]\n(error along the motion)",
+        "velocity": "velocity [m/s]",
+        "position": "position [m]",
+        "load": "force command [N]",
+    },
 }
+
+
+def _label(variable: str, row: Row) -> str:
+    if variable == "time":
+        return "time [s]"
+    return _LABELS[row.unit][variable] if row.kind == "joint" else f"{variable} [N]"
 
 
 def error_bins(channels: Sequence[Channel]) -> Figure:
@@ -147,7 +226,7 @@ def error_bins(channels: Sequence[Channel]) -> Figure:
         for name, axes in zip(names, panels, strict=False):
             decorate(axes)
             _draw_bins(axes, channel.bins[name])
-            axes.set_xlabel(_LABELS.get(name, f"{name} [N]"), fontsize=9)
+            axes.set_xlabel(_label(name, channel.row), fontsize=9)
         panels[0].set_ylabel(f"{words(channel.row.name).replace(' ', chr(10), 1)}\nerror [{channel.row.unit}]", fontsize=9)
     add_legend(figure)
     return figure
@@ -184,6 +263,81 @@ def errors_over_time(residual: Residual, sides: Sequence[str], channels: Sequenc
     return figure
 
 
+def torques_over_time(before: Residual, after: Residual, joints: Sequence[int], stretch: slice) -> Figure:
+    """Torque of joints as measured and by the model before and after something was added to it; below each the two models' errors.
+
+    Args:
+        before, after: what each model leaves of the same log.
+        joints: their places among the rows.
+        stretch: averages that are shown.
+    """
+    columns = min(2, len(joints))
+    rows = -(-len(joints) // columns)
+    figure = Figure(figsize=(WIDTH, 0.7 + 2.7 * rows), layout="constrained")
+    grid = figure.subplots(2 * rows, columns, sharex=True, squeeze=False, height_ratios=[1.5, 1.0] * rows)
+    for axes in grid[-2:, len(joints) - columns * (rows - 1) :].flat:
+        axes.set_axis_off()
+    time = before.time[stretch]
+    for place, joint in enumerate(joints):
+        torques, errors = grid[2 * (place // columns) : 2 * (place // columns) + 2, place % columns]
+        row, known = before.rows[joint], before.known[stretch, joint]
+        measured, left, rest, noise = (
+            np.where(known, values[stretch, joint], np.nan)
+            for values in (before.signals.torque_command, before.value, after.value, 2 * np.sqrt(before.variance))
+        )
+        for axes in (torques, errors):
+            decorate(axes)
+            axes.margins(x=0)
+        torques.plot(time, measured, color="#15181b", linewidth=1.8, alpha=0.35, label="measured")
+        torques.plot(time, measured - left, color=_BEFORE, linewidth=0.9, label="the model as given")
+        torques.plot(time, measured - rest, color=ESTIMATE, linewidth=0.9, label="the completed model")
+        errors.fill_between(time, -noise, noise, color=_NOISE, alpha=0.45, linewidth=0, label="± 2 standard deviations of the noise")
+        errors.plot(time, left, color=_BEFORE, linewidth=0.9)
+        errors.plot(time, rest, color=ESTIMATE, linewidth=0.9)
+        size = np.linalg.norm(measured[known])
+        shares = [number(100 * float(np.linalg.norm(values[known]) / size), 2) if size > 0 else "n/a" for values in (left, rest)]
+        torques.set_title(words(row.name), loc="left", fontsize=10)
+        torques.set_title(f"relative error {shares[0]} % → {shares[1]} %", loc="right", fontsize=9, color=PLANNED)
+        torques.set_ylabel(f"{'torque' if row.unit == 'Nm' else 'force'} [{row.unit}]", fontsize=9)
+        errors.set_ylabel(f"error [{row.unit}]", fontsize=9)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    figure.align_ylabels()
+    add_legend(figure)
+    return figure
+
+
+def position_errors(before: RolloutError, after: RolloutError, units: Sequence[str]) -> Figure:
+    """Simulated less recorded position over time, before and after something was added to a model, of the worst joints.
+
+    Args:
+        units: of the joints' torques.
+    """
+    worst = sorted(np.argsort([-error for error in before.position.values()])[:_MOST_JOINTS])
+    columns = min(2, len(worst))
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.7 * -(-len(worst) // columns)), layout="constrained")
+    grid = figure.subplots(-(-len(worst) // columns), columns, sharex=True, squeeze=False)
+    for axes in grid.flat[len(worst) :]:
+        axes.set_axis_off()
+    for joint, axes in zip(worst, grid.flat, strict=False):
+        decorate(axes)
+        axes.margins(x=0)
+        for error, color, label in ((before, _BEFORE, "the model as given"), (after, ESTIMATE, "the completed model")):
+            time = error.sample_time
+            # Recordings that were joined, or gaps: nothing is drawn between them.
+            apart = 1 + np.flatnonzero(np.diff(time) > _GAP * np.median(np.diff(time)))
+            values = np.insert(1e3 * error.position_error[:, joint], apart, np.nan)
+            axes.plot(np.insert(time, apart, np.nan), values, color=color, linewidth=0.9, label=label)
+        axes.axhline(0, color=PLANNED, linewidth=0.8)
+        axes.set_title(words(list(before.position)[joint]), loc="left", fontsize=10)
+        axes.set_ylabel(f"error [{'mrad' if units[joint] == 'Nm' else 'mm'}]", fontsize=9)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    figure.align_ylabels()
+    add_legend(figure)
+    return figure
+
+
 def _shade_supports(axes: Axes, residual: Residual, sides: Sequence[str]) -> None:
     single = residual.standing.sum(axis=1) == 1
     for foot, side in enumerate(sides):
@@ -194,35 +348,18 @@ def _shade_supports(axes: Axes, residual: Residual, sides: Sequence[str]) -> Non
             axes.axvspan(first, last, facecolor=color, alpha=0.12, linewidth=0, label=f"{side} leg supports")
 
 
-def ranking(findings: Sequence[Finding]) -> Figure:
-    """Held-out error without and with each effect, in multiples of the noise."""
-    figure = Figure(figsize=(WIDTH, 1.2 + 0.42 * len(findings)), layout="constrained")
+def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
+    """Held-out error without and with each effect, in multiples of the noise.
+
+    Args:
+        names: what to call them; by default the effects and where they are.
+    """
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(findings)), layout="constrained")
     axes = figure.subplots()
-    decorate(axes)
-    for place, finding in enumerate(findings):
-        color = TRUTH if finding.chosen else VERDICT_COLORS["confusable"]
-        label = "with the effect: part of the explanation" if finding.chosen else "with the effect: an alternative"
-        axes.barh(place, finding.held_out_before, height=0.7, color="#dde1e5", label="without the effect")
-        axes.barh(place, finding.held_out_after, height=0.42, color=color, label=label)
-        axes.annotate(
-            f"{number(finding.held_out_before, 3)} → {number(finding.held_out_after, 3)}",
-            (max(finding.held_out_before, finding.held_out_after), place),
-            (5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-            color=PLANNED,
-        )
-    axes.axvline(1.0, color=PLANNED, linestyle="--", linewidth=1.0, label="sensors' noise")
-    axes.set_yticks(range(len(findings)), [finding_name(finding) for finding in findings], fontsize=9)
-    axes.invert_yaxis()
-    axes.set_xscale("log")
-    largest = max(max(finding.held_out_before, finding.held_out_after) for finding in findings)
-    axes.set_xlim(min(0.8, *(finding.held_out_after for finding in findings)), 1.8 * largest)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
-    axes.grid(visible=False, axis="y")
+    errors = [[getattr(finding, name) for finding in findings] for name in ("held_out_before", "held_out_after")]
+    labels = ["with the effect: part of the explanation" if f.chosen else "with the effect: an alternative" for f in findings]
+    colors = [ESTIMATE if finding.chosen else VERDICT_COLORS["confusable"] for finding in findings]
+    _draw_falls(axes, names or [finding_name(finding) for finding in findings], *errors, ("without the effect", labels), colors)
     axes.set_xlabel("held-out error of the channels that the effect moves, in multiples of the sensors' noise [1]")
     add_legend(figure)
     return figure
@@ -236,15 +373,16 @@ def spaced(name: str) -> str:
 
 def finding_name(finding: Finding) -> str:
     """As `Coulomb friction, left knee pitch`."""
-    return f"{spaced(finding.effect)}, {targets_text(finding.targets)}"
+    return f"{spaced(finding.effect)}, {targets_text(finding.targets, finding.effect)}"
 
 
-def targets_text(targets: Sequence[str]) -> str:
-    """Names of targets for reading, as `left and right knee pitch`; of many only how many."""
+def targets_text(targets: Sequence[str], effect: str = "") -> str:
+    """Names of an effect's targets for reading, as `left and right knee pitch`; of many only how many."""
+    things = "bodies" if effect in library() and library()[effect].acts_on == "body" else "joints"
     sides, parts = zip(*(target.partition("_")[::2] for target in targets), strict=True)
     if len(targets) > 1 and len(set(parts)) == 1:
         return f"{' and '.join(sides)} {words(parts[0])}".rstrip()
-    return ", ".join(map(words, targets)) if len(targets) < 4 else f"{len(targets)} joints"
+    return ", ".join(map(words, targets)) if len(targets) < 4 else f"{len(targets)} {things}"
 
 
 def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
@@ -278,54 +416,66 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
     return figure
 
 
-@dataclass(frozen=True)
-class _Interval:
-    targets: str
-    value: float
-    low: float
-    high: float
+def parameters(findings: Sequence[tuple[Finding, str]]) -> Figure:
+    """Fitted values with their 95 % intervals: a panel for each parameter, rows of panels for each effect.
 
+    Intervals that are many times as wide as the values are large are cut.
 
-def parameters(findings: Sequence[Finding]) -> Figure:
-    """Fitted values with their 95 % intervals, a panel for each parameter of each effect."""
-    panels: dict[tuple[str, str, str], list[_Interval]] = {}
-    for finding in findings:
-        for name, estimate in finding.parameters.items():
-            interval = _Interval(targets_text(finding.targets), estimate.value, *estimate.interval)
-            panels.setdefault((finding.effect, name, estimate.unit), []).append(interval)
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    sizes = list(map(len, panels.values()))
-    heights = [1.0 + 0.28 * max(sizes[start : start + columns]) for start in range(0, len(sizes), columns)]
-    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
-    grid = figure.subplots(rows, columns, height_ratios=heights, squeeze=False)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_axis_off()
-    for axes, ((effect, name, unit), intervals) in zip(grid.flat, panels.items(), strict=False):
-        decorate(axes)
-        places = np.arange(len(intervals))
-        value, low, high = (np.array([getattr(interval, key) for interval in intervals]) for key in ("value", "low", "high"))
-        axes.hlines(places, low, high, color=ESTIMATE, linewidth=3, alpha=0.5, label="95 % interval")
-        axes.plot(value, places, "o", color=ESTIMATE, markersize=5, label="value")
-        axes.axvline(0, color=PLANNED, linewidth=0.8)
-        axes.locator_params(axis="x", nbins=5)
-        axes.set_yticks(places, [interval.targets for interval in intervals], fontsize=9)
-        axes.set_ylim(len(intervals) - 0.5, -0.5)
-        axes.set_title(spaced(effect), loc="left", fontsize=10)
-        axes.set_xlabel(f"{words(name)} [{unit}]")
+    Args:
+        findings: with what each is called among those of its effect.
+    """
+    rows: list[tuple[str, list[str]]] = []
+    by_name: dict[str, list[tuple[Finding, str]]] = {}
+    for finding, place in findings:
+        by_name.setdefault(finding.effect, []).append((finding, place))
+    for effect, found in by_name.items():
+        names = list(found[0][0].parameters)
+        rows += [(effect, names[start : start + _PANELS]) for start in range(0, len(names), _PANELS)]
+    heights = [0.85 + 0.23 * len(by_name[effect]) for effect, _ in rows]
+    figure = Figure(figsize=(WIDTH, 0.4 + sum(heights)), layout="constrained")
+    columns = max(len(names) for _, names in rows)
+    grid = figure.subplots(len(rows), columns, height_ratios=heights, sharey="row", squeeze=False)
+    for (effect, names), panels in zip(rows, grid, strict=True):
+        found, places = zip(*by_name[effect], strict=True)
+        for axes in panels[len(names) :]:
+            axes.set_axis_off()
+        for name, axes in zip(names, panels, strict=False):
+            _draw_estimates(axes, [finding.parameters[name] for finding in found])
+            axes.set_xlabel(f"{words(name)} [{found[0].parameters[name].unit}]", fontsize=9)
+        panels[0].set_yticks(range(len(found)), places, fontsize=9)
+        panels[0].set_ylim(len(found) - 0.4, -0.6)
+        panels[0].set_title(spaced(effect), loc="left", fontsize=10)
     add_legend(figure)
     return figure
 
 
-def falling_error(study: Study) -> Figure:
-    """Error of the residual step by step, and that of the simulated model where it was simulated."""
-    rolled = [step.rollout for step in study.steps if step.rollout is not None]
+def _draw_estimates(axes: Axes, estimates: Sequence[Estimate]) -> None:
+    decorate(axes)
+    places = np.arange(len(estimates))
+    value, (low, high) = np.array([e.value for e in estimates]), np.array([e.interval for e in estimates]).T
+    limit = _WIDEST * np.abs(value).max() or np.abs([low, high]).max()
+    axes.hlines(places, low.clip(-limit, limit), high.clip(-limit, limit), color=ESTIMATE, linewidth=3, alpha=0.5, label="95 % interval")
+    axes.plot(value, places, "o", color=ESTIMATE, markersize=5, label="value")
+    for cut, edge, marker in ((low < -limit, -limit, "<"), (high > limit, limit, ">")):
+        if cut.any():
+            axes.plot(np.full(cut.sum(), edge), places[cut], marker, color=ESTIMATE, markersize=6, alpha=0.7, label="interval goes on")
+    axes.axvline(0, color=PLANNED, linewidth=0.8)
+    axes.locator_params(axis="x", nbins=5)
+
+
+def falling_error(steps: Sequence[StudyStep], unit: str) -> Figure:
+    """Error of the residual step by step, and that of the simulated model where it was simulated.
+
+    Args:
+        unit: of a thousandth of the joints' positions.
+    """
+    rolled = any(step.rollout is not None for step in steps)
     figure = Figure(figsize=(WIDTH, 6.4 if rolled else 4.2), layout="constrained")
     panels = figure.subplots(2 if rolled else 1, 1, sharex=True, squeeze=False)[:, 0]
-    places = np.arange(len(study.steps))
-    labels = ["as given", *("+ " + "\n+ ".join(_added(step.added)) for step in study.steps[1:])]
+    places = np.arange(len(steps))
+    labels = ["as given", *("+ " + "\n+ ".join(_added(step.added)) for step in steps[1:])]
     axes = panels[0]
-    held_out, train = ([getattr(step, name) for step in study.steps] for name in ("held_out_rmse", "train_rmse"))
+    held_out, train = ([getattr(step, name) for step in steps] for name in ("held_out_rmse", "train_rmse"))
     decorate(axes)
     axes.plot(places, held_out, "o-", color=TRUTH, linewidth=2, label="held-out data")
     axes.plot(places, train, "o--", color=ESTIMATE, linewidth=1.2, markersize=4, label="data that it was fitted to")
@@ -333,19 +483,17 @@ def falling_error(study: Study) -> Figure:
         axes.annotate(number(value, 3), (place, value), (0, 8), textcoords="offset points", ha="center", fontsize=9)
     axes.axhline(1.0, color=PLANNED, linestyle="--", linewidth=1.0, label="sensors' noise")
     axes.set_yscale("log")
-    axes.set_ylim(min(0.8, *held_out), 1.6 * max(held_out))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("")
+    axes.set_ylim(0.8 * min(1.0, *held_out), 1.6 * max(held_out))
+    _plain_log(axes.yaxis)
     axes.set_ylabel("error of the residual\nover noise [1]")
     if rolled:
         decorate(panels[1])
-        values = [np.nan if step.rollout is None else 1e3 * step.rollout.mean_position for step in study.steps]
-        panels[1].plot(places, values, "o-", color="#7a4fa3", linewidth=2, label="simulated model, joint angles")
+        values = [np.nan if step.rollout is None else 1e3 * step.rollout.mean_position for step in steps]
+        panels[1].plot(places, values, "o-", color="#7a4fa3", linewidth=2, label="simulated model, joint positions")
         for place, value in zip(places, values, strict=True):
             panels[1].annotate(number(value, 3), (place, value), (0, 8), textcoords="offset points", ha="center", fontsize=9)
         panels[1].set_ylim(0, 1.25 * max(1e-6, np.nanmax(values)))
-        panels[1].set_ylabel("error of simulated\njoint angles, RMS [mrad]")
+        panels[1].set_ylabel(f"error of simulated\njoints, RMS [{unit}]")
     panels[-1].set_xticks(places, labels, fontsize=8)
     panels[-1].set_xlim(-0.5, len(places) - 0.5)
     figure.align_ylabels()
@@ -355,7 +503,7 @@ def falling_error(study: Study) -> Figure:
 
 def _added(findings: Sequence[Finding]) -> list[str]:
     """Effects and where they are, wrapped to fit below a tick; of many the first ones."""
-    named = [f"{spaced(effect)}\n({textwrap.fill(targets_text(targets), 22)})" for effect, targets in by_effect(findings).items()]
+    named = [f"{spaced(effect)}\n({textwrap.fill(targets_text(targets, effect), 22)})" for effect, targets in by_effect(findings).items()]
     return named if len(named) <= _MOST_NAMED else [*named[: _MOST_NAMED - 1], f"{len(named) - _MOST_NAMED + 1} others"]
 
 

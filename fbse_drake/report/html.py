@@ -20,10 +20,14 @@ _DPI = 130
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts and numbers under a header; numbers are shown by `number`."""
+    """Rows of texts and numbers under a header; numbers are shown by `number`. Without a header the first column names the rows."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str | float, ...], ...]
+    # What it shows, one or two sentences.
+    caption: str = ""
+    # Folded away behind its caption, after the figures.
+    folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -37,15 +41,16 @@ class FigureBlock:
 
 @dataclass(frozen=True)
 class Details:
-    """Long preformatted text, folded away behind its title."""
+    """Preformatted text, folded away behind its title."""
 
     title: str
     text: str
+    folded: bool = True
 
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of a report; shows its text, tables, figures and details in this order."""
+    """A titled part of a report; shows its text, tables, figures, folded tables and details in this order."""
 
     title: str
     text: str = ""

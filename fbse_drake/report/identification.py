@@ -1,0 +1,74 @@
+"""The report of identified inertial parameters."""
+
+from pathlib import Path
+
+from fbse_drake.discrepancy.identify import Identification, identifiability_text
+from fbse_drake.discrepancy.inertial import PARAMETERS, BaseParameter
+from fbse_drake.effects.inertia import InertialParameters
+from fbse_drake.report.discrepancy import parameters_text
+from fbse_drake.report.discrepancy_figures import spaced, targets_text
+from fbse_drake.report.html import Details, Report, Section, Table, number, write_report
+from fbse_drake.scenario import dump_scenario
+
+BASE_HEADER = ("combination", "unit", "model", "identified", "95 % interval", "known to")
+ERROR_HEADER = ("log", "error of the model", "identified")
+_BASE_TEXT = (
+    "What this log tells apart. `known to` is the standard deviation as a share of what a body of this size has, if what is left over were "
+    "white noise; intervals respect that it is not."
+)
+_BODIES_TEXT = (
+    "One of the many sets of values that have these combinations: the one nearest to the model that some distribution of mass has. "
+    "First moments and rotational inertia are about the origin of the body's frame. Where `known to` is near 100 % the value is that of "
+    "the model."
+)
+
+
+def base_row(base: BaseParameter) -> tuple[str, ...]:
+    """A combination under `BASE_HEADER`."""
+    low, high = base.interval
+    share = f"{100 * base.uncertainty:.2g} %"
+    return (base.text, base.unit, number(base.model), number(base.value), f"{number(low)} to {number(high)}", share)
+
+
+def error_rows(result: Identification) -> list[tuple[str, ...]]:
+    """Relative errors of all joints together under `ERROR_HEADER`, then of each joint."""
+    rows = []
+    for name, after in result.after.items():
+        before = result.before[name]
+        rows.append((name, f"{100 * before.relative:.2f} %", f"{100 * after.relative:.2f} %"))
+        for joint, share in after.relative_by_joint.items():
+            rows.append((f"{name}: {joint}", f"{100 * before.relative_by_joint[joint]:.2f} %", f"{100 * share:.2f} %"))
+    return rows
+
+
+def identification_outcome(result: Identification) -> str:
+    """The result in one sentence."""
+    before, after = (errors["train"].relative for errors in (result.before, result.after))
+    return f"The relative torque error falls from {100 * before:.1f} % to {100 * after:.1f} % with identified inertia and plain friction."
+
+
+def write_identification_report(path: str | Path, result: Identification, name: str) -> None:
+    """Writes what was identified as one HTML file.
+
+    Args:
+        name: of the scenario.
+    """
+    inertia = result.inertia
+    bodies = []
+    for k, body in enumerate(inertia.bodies):
+        for j, parameter in enumerate(PARAMETERS):
+            model, value, width = inertia.model[k, j], inertia.model[k, j] + inertia.change[k, j], inertia.half_width[k, j]
+            between, share = f"{number(value - width)} to {number(value + width)}", f"{100 * inertia.uncertainty[k, j]:.2g} %"
+            unit = InertialParameters.parameters[parameter].unit
+            bodies.append((f"{body} {parameter}", unit, number(model), number(value), between, share))
+    plain = [f for f in result.findings if f.effect != InertialParameters.__name__]
+    friction = Table(("effect", "in", "values"), tuple((spaced(f.effect), targets_text(f.targets), parameters_text(f)) for f in plain))
+    sections = (
+        Section("What can be known", identifiability_text(inertia)),
+        Section("Combinations", _BASE_TEXT, (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),)),
+        Section("Friction", tables=(friction,)),
+        Section("Errors", "|residual| / |torque|, 2-norms.", (Table(ERROR_HEADER, tuple(error_rows(result))),)),
+        Section("Bodies", _BODIES_TEXT, (Table(("parameter", *BASE_HEADER[1:]), tuple(bodies)),)),
+        Section("Scenario", details=(Details("With all this in its model", dump_scenario(result.scenario, name)),)),
+    )
+    write_report(path, Report(f"{name}: inertial parameters", True, identification_outcome(result), sections))

@@ -1,0 +1,190 @@
+"""Reports and recordings of runs in a real browser, headless Chromium: they need nothing outside themselves, and show all they hold."""
+
+import io
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
+from test_any_plant import CRANE, crane
+from test_discrepancy_report import FRICTION, INPUTS, NOTHING, made_diagnosis
+
+from fbse_drake import Log, load_scenario, simulate
+from fbse_drake.discrepancy.compare import compare
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.rollout import RolloutError
+from fbse_drake.discrepancy.study import Study, StudyStep, model_error, study
+from fbse_drake.effects.actuation import TorqueBias
+from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.report import discrepancy as reports
+from fbse_drake.report.html import Report, Section, Table, write_report
+from fbse_drake.report.metrics import run_metrics
+from fbse_drake.report.run import write_run_report
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install playwright)")
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+# Containers run as root and without a graphics card.
+_OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"]
+# The order of a lab report.
+SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN = (
+    "Summary",
+    "Where the model fails",
+    "Why it fails",
+    "What else was looked for",
+    "How the error falls",
+    "Data hygiene",
+    "Reproduce this",
+)
+
+
+@dataclass
+class Visit:
+    """What a browser says of a page."""
+
+    # Everything that was asked for beyond the page itself and what it holds.
+    requests: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    headings: list[str] = field(default_factory=list)
+    # Natural and shown widths of all pictures [px].
+    pictures: list[tuple[int, int]] = field(default_factory=list)
+    # By how much the page is wider than the window [px].
+    overflow: int = 0
+    # Of the window, (height, width, 3).
+    screenshot: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+
+_LOOK = """() => {
+  document.querySelectorAll("details").forEach(details => { details.open = true; });
+  const page = document.documentElement;
+  return {
+    headings: [...document.querySelectorAll("h2")].map(heading => heading.textContent),
+    pictures: [...document.querySelectorAll("img, svg")].map(
+      picture => [picture.naturalWidth ?? picture.clientWidth, picture.clientWidth]),
+    overflow: page.scrollWidth - page.clientWidth,
+  };
+}"""
+
+
+@pytest.fixture(scope="module")
+def visit() -> Iterator[Callable[..., Visit]]:
+    """Opens a file without a network: visit(path, width=1280)."""
+    executable = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if executable is None:
+        pytest.skip(f"no browser is installed (looked for {', '.join(_BROWSERS)})")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=executable, args=_OPTIONS)
+
+        def opened(path: Path, width: int = 1280) -> Visit:
+            result = Visit()
+            context = browser.new_context(viewport={"width": width, "height": 800}, offline=True)
+            page, own = context.new_page(), path.as_uri()
+            inside = (own, "data:", "blob:")
+            page.on("request", lambda request: result.requests.extend([request.url] * (not request.url.startswith(inside))))
+            page.on("websocket", lambda socket: result.requests.append(socket.url))
+            page.on("console", lambda message: result.errors.extend([message.text] * (message.type == "error")))
+            page.on("pageerror", lambda error: result.errors.append(str(error)))
+            page.goto(own, wait_until="networkidle")
+            for name, value in page.evaluate(_LOOK).items():
+                setattr(result, name, value)
+            result.screenshot = matplotlib.image.imread(io.BytesIO(page.screenshot()), format="png")[..., :3]
+            context.close()
+            return result
+
+        yield opened
+        browser.close()
+
+
+def check(visit: Callable[..., Visit], path: Path, headings: list[str], pictures: int) -> None:
+    """The file is whole by itself, at the width of a screen and of half a one."""
+    for width in (1280, 800):
+        seen = visit(path, width)
+        assert seen.requests == []
+        assert seen.errors == []
+        assert seen.headings == headings
+        assert len(seen.pictures) == pictures
+        assert all(natural > 0 and 300 < shown <= width for natural, shown in seen.pictures)
+        assert seen.overflow <= 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("reports")
+
+
+def test_study_of_a_walk_is_a_lab_report(visit: Callable[..., Visit], run: Callable[..., Log], folder: Path):
+    predictor = Predictor(load_scenario("paper_walk"), run("paper_walk", "duration=3"))
+    whole = (predictor, compare(predictor))
+    rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
+    errors = {"train": model_error(predictor)}
+    steps = (StudyStep((), 4.2, 4.2, rolled, errors), StudyStep((FRICTION,), 1.01, 1.0, rolled, errors))
+    found = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", predictor.scenario)
+    reports.write_study_report(folder / "study.html", found, whole, whole, INPUTS)
+    check(visit, folder / "study.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 10)
+
+
+def test_reports_of_a_machine_without_legs_are_lab_reports(visit: Callable[..., Visit], folder: Path):
+    """A revolute and a prismatic joint: no feet, no phases."""
+    (folder / "crane.urdf").write_text(CRANE)
+    scenario = crane(folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5}))
+    log = simulate(scenario).log
+    found = study(scenario, log, [CoulombFriction, ViscousFriction, TorqueBias], rollouts=False, tests={"another log": log})
+    before, after = Predictor(scenario, log), Predictor(found.scenario, log)
+    comparison = compare(before)
+    reports.write_compare_report(folder / "compare.html", comparison, before, INPUTS)
+    check(visit, folder / "compare.html", [SUMMARY, WHERE, HYGIENE, AGAIN], 3)
+    assert "In 2 of 2 joints." in (folder / "compare.html").read_text(encoding="utf-8")
+    reports.write_diagnosis_report(folder / "diagnosis.html", found.diagnoses[0], comparison, before, INPUTS)
+    check(visit, folder / "diagnosis.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 7)
+    reports.write_study_report(folder / "study.html", found, (before, comparison), (after, compare(after)), INPUTS, {"another log": log})
+    check(visit, folder / "study.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 9)
+    text = (folder / "study.html").read_text(encoding="utf-8")
+    assert "Another log (not fitted): as given [%]" in text
+    said = text[: text.index("<h2>Reproduce this")]
+    assert not re.findall(r"\b(?:foot|feet|soles?|accelerometer|support)\b", said)
+
+
+def test_report_of_a_run(visit: Callable[..., Visit], run: Callable[..., Log], folder: Path):
+    log = run("paper_walk", "duration=3")
+    write_run_report(folder / "run.html", log, run_metrics(log, 1.0), name="a_walk")
+    check(visit, folder / "run.html", [SUMMARY, "Motion", "Joints", "Foot forces", "Friction", "Sensors", "Scenario"], 10)
+
+
+def test_recording_of_a_run_shows_the_robot(visit: Callable[..., Visit], folder: Path):
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    simulate(load_scenario("squat", overrides=["duration=0.1"]), meshcat=meshcat)
+    meshcat.SetCameraPose([2.2, -2.2, 1.3], [0.2, 0.0, 0.5])
+    (folder / "meshcat.html").write_text(meshcat.StaticHtml())
+    seen = visit(folder / "meshcat.html")
+    assert seen.requests == []
+    assert seen.errors == []
+    assert seen.overflow <= 0
+    red, green, blue = np.moveaxis(seen.screenshot, 2, 0)
+    # Its right leg is orange, its left one blue; the stage is grey.
+    assert (red - blue > 0.3).sum() > 1000
+    assert (blue - red > 0.3).sum() > 1000
+    assert ((np.abs(red - blue) < 0.1) & (np.abs(red - green) < 0.1)).mean() > 0.5
+
+
+def test_what_is_wrong_with_a_page_is_seen(visit: Callable[..., Visit], tmp_path: Path):
+    (tmp_path / "bad.html").write_text(
+        "<h2>a</h2><img src='http://localhost:1/picture.png'><img src='data:image/png;base64,broken'>"
+        "<script>new WebSocket('ws://localhost:1'); throw new Error('thrown')</script><div style='width: 2000px'>wide</div>"
+    )
+    seen = visit(tmp_path / "bad.html")
+    assert {"http://localhost:1/picture.png", "ws://localhost:1/"} <= set(seen.requests)
+    assert any("thrown" in error for error in seen.errors)
+    assert [natural for natural, _ in seen.pictures] == [0, 0]
+    assert seen.overflow > 700
+
+
+def test_a_wide_table_scrolls_by_itself(visit: Callable[..., Visit], tmp_path: Path):
+    header = tuple(f"a long name of column {k}" for k in range(30))
+    table = Table(header, (tuple(float(k) for k in range(30)),), "Wide.")
+    write_report(tmp_path / "report.html", Report("wide", True, "done", (Section("s", tables=(table,)),)))
+    assert visit(tmp_path / "report.html", 800).overflow <= 0
