@@ -45,6 +45,7 @@ _FRICTION = frozenset(
         "ViscousFriction",
         "StribeckFriction",
         "DirectionalFriction",
+        "DirectionalViscousFriction",
         "LoadDependentFriction",
         "QuadraticDrag",
         "ThermalDrift",

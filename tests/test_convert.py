@@ -671,4 +671,7 @@ def test_real_duty_cycles_have_a_sign():
     assert np.abs(voltage).max() < 7.6
     assert np.mean(np.sign(voltage[driven]) == np.sign(error[driven])) > 0.95
     assert {segment["kp"] for segment in log.meta["segments"]} == {100, 200, 400, 800}
-    np.testing.assert_allclose(log["joint/torque_command"][:, 0], 0.32321 / 4.76365 * voltage, rtol=1e-3)
+    # At standstill, of a motor with kt = 0.3036 Nm/A and R = 2.445 ohm, at 7.4 V.
+    records = json.loads(sorted(Path(DATA).glob("bam_xl330/raw/*.json"))[0].read_text())["entries"]
+    duty = np.array([(entry["load"] + 2**15) % 2**16 - 2**15 for entry in records]) / 885
+    np.testing.assert_allclose(log["joint/torque_command"][: len(duty), 0], 0.3036 / 2.445 * 7.4 * duty, rtol=1e-3)

@@ -191,7 +191,8 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
             forces = values[:, 3:] if name.endswith("wrench") else values
             result.append(_level(motion, name, forces, "N", sensors.foot_force.noise))
         else:
-            result.append(_level(motion, name, values, motion.log.unit(name), believed[name]))
+            units = evidence.units.get(name, {"": motion.log.unit(name)})
+            result.append(_level(motion, name, values, " or ".join(dict.fromkeys(units.values())), believed[name]))
     return result
 
 

@@ -115,7 +115,7 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
         constant = float(constants[np.unravel_index(causal.argmin(), causal.shape)[0]])
         text = (
             f"the vertical force follows what the masses need through a low-pass of first order of {1e3 * constant:.2g} ms "
-            f"({1 / (2 * np.pi * constant):.2g} Hz), not through a mere delay; the base's rows miss force wherever it changes"
+            f"({1 / (2 * np.pi * constant):.2g} Hz), not through a mere delay; the base's rows may miss force where it changes"
         )
         yield remark("low_pass", "warning", "foot/<side>", constant, "s", text)
     elif smooth.min() < (1 - _WORTHWHILE) * smooth[:, _LARGEST_OFFSET].min():
