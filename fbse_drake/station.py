@@ -115,11 +115,13 @@ class Station(Diagram):
         ]
         if distorting:
             sensor_effects = builder.AddNamedSystem("sensor_effects", SensorEffects(distorting, robot, scenario.control.period))
-            split = builder.AddNamedSystem("distorted", Demultiplexer([port.size() for port in available.values()]))
-            builder.Connect(sensor_effects.get_output_port(), split.get_input_port())
-            for i, (name, port) in enumerate(available.items()):
+            for name, port in available.items():
                 builder.Connect(port, sensor_effects.GetInputPort(name.removeprefix("measured_")))
-                available[name] = split.get_output_port(i)
+            # A robot without feet has no forces there to split off.
+            sizes = {name: port.size() for name, port in available.items() if port.size() > 0}
+            split = builder.AddNamedSystem("distorted", Demultiplexer(list(sizes.values())))
+            builder.Connect(sensor_effects.get_output_port(), split.get_input_port())
+            available |= {name: split.get_output_port(i) for i, name in enumerate(sizes)}
 
         # Reference and controller.
         source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))

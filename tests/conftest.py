@@ -9,6 +9,13 @@ from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.scenario import SensorsConfig
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A file's tests share its runs, so they stay on one worker; notebooks share nothing."""
+    for item in items:
+        if item.path.stem != "test_notebooks":
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
 @pytest.fixture(scope="session")
 def run() -> Callable[..., Log]:
     """Simulates a shipped scenario, cached: run("squat", "duration=2", noise=False)."""

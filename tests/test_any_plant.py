@@ -12,12 +12,14 @@ from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.compare import compare
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.discrepancy.study import model_error, train_and_rest
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
-from fbse_drake.walking.reference import JointSines
+from fbse_drake.walking.reference import JointSines, Recorded
 
 TROLLEY, LOAD, LENGTH, G = 6.0, 2.0, 0.5, 9.81
 # A trolley on a rail along x, a rope (a rod here) that swings about y, and a spoon below it that the description does not name. The shapes
@@ -135,6 +137,12 @@ def test_hidden_friction_is_found_in_a_machine_without_legs(rubbing: tuple[Scena
     assert found["ViscousFriction"].parameters["viscous"].value == pytest.approx(1.5, rel=0.02)
 
 
+def test_a_crooked_sensor_of_a_machine_without_feet_is_simulated(folder: Path):
+    scenario = dataclasses.replace(crane(folder, crooked=EncoderOffset({"swing": 0.05})), duration=0.5)
+    log = simulate(scenario).log
+    np.testing.assert_allclose(log["joint/position"][:, 0] - log["truth/joint/position"][:, 0], 0.05, atol=1e-9)
+
+
 def test_nothing_is_found_where_nothing_is_hidden(folder: Path):
     scenario = crane(folder)
     assert diagnose(Predictor(scenario, simulate(scenario).log)).verdict == "nothing_missing"
@@ -178,6 +186,26 @@ def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: 
     late = Predictor(wrong, log).motion.residual.value[middle]
     assert np.abs(error).max() < 2e-3 * np.abs(torque).max()
     assert np.abs(late).max() > 5 * np.abs(error).max()
+
+
+def test_a_position_servo_tells_its_torque_by_its_gains(rubbing: tuple[Scenario, Log]):
+    """A recording of positions alone: the torque follows from what was asked for and the known gains of the loop."""
+    scenario, log = rubbing
+    asked = dataclasses.replace(scenario, reference=Recorded())
+    without = Log({name: values for name, values in log.items() if name != "joint/torque_command"}, log.meta)
+    names = make_robot(scenario.robot.description)[0].description
+    torque = with_command(asked, without, names)["joint/torque_command"]
+    np.testing.assert_allclose(torque, log["joint/torque_command"], atol=1e-9)
+    assert with_command(asked, log, names) is log
+    limited = dataclasses.replace(asked, control=dataclasses.replace(asked.control, torque_limit={"all": 5.0}))
+    assert np.abs(with_command(limited, without, names)["joint/torque_command"]).max() == 5.0
+    off = Log({**without.channels, "joint/enabled": np.zeros_like(torque)}, log.meta)
+    assert not with_command(asked, off, names)["joint/torque_command"].any()
+    blind = Log({name: values for name, values in without.items() if name != "joint/velocity"}, log.meta)
+    with pytest.raises(InputError, match="control: kd: the log has no channel joint/velocity"):
+        with_command(asked, blind, names)
+    with pytest.raises(InputError, match="gain kp: expected a number that is kept with the log's stretches"):
+        with_command(dataclasses.replace(asked, reference=Recorded(gain="kp")), without, names)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from fbse_drake.discrepancy.residual import (
     residual_rows,
     rms,
 )
+from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.effects.contact import ContactEffect, FootCreep, GroundCompliance, PadContact, pad_contact, spring_force
 from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.inertia import InertiaEffect
@@ -53,6 +54,7 @@ class Predictor:
             self.robot = build_robot(scenario.believed)
         names = self.robot.description
         self._known = [effect.resolve(names, key=f"model.effects.{key}") for key, effect in scenario.believed.effects.items()]
+        log = with_command(scenario, log, names)
         self.motion = RecordedMotion(self.robot, scenario.sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):

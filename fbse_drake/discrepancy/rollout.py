@@ -1,6 +1,6 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, LogV
 from pydrake.trajectories import PiecewisePolynomial
 
 from fbse_drake.control.position_loop import PositionLoop, PositionLoopConfig
+from fbse_drake.discrepancy.servo import scaled_gains, stretches
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.sensor import SensorEffect, SensorEffects, SensorSignals
 from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
@@ -108,9 +109,9 @@ def _rollout_error(log: Log, rows: np.ndarray, simulated: Mapping[str, np.ndarra
 
 def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None) -> RolloutError:
     rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
-    for stretch, constants in _stretches(log):
+    for stretch, constants in stretches(log):
         with located("control: "):
-            control = _scaled(scenario.control, recorded, constants)
+            control = scaled_gains(scenario.control, recorded, constants)
         done, failure = _simulate_stretch(scenario, control, log.part(stretch))
         count = len(next(iter(done.values())))
         rows[stretch.start : stretch.start + count] = True
@@ -123,26 +124,6 @@ def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress
             break
     names = [name for name in _COMPARED if name in log]
     return _rollout_error(log, rows, {name: np.concatenate([c[name] for c in channels]) for name in names}, simulated_time, failure)
-
-
-def _stretches(log: Log) -> Iterator[tuple[slice, Mapping[str, Any]]]:
-    """The log's stretches that follow each other without a break, with their constants."""
-    whole = {"start": float(log.time[0]), "end": float(log.time[-1])}
-    for segment in log.meta.get("segments", [whole]):
-        start, stop = np.searchsorted(log.time, [segment["start"] - 1e-9, segment["end"] + 1e-9])
-        if stop - start > _STARTING_SAMPLES:
-            yield slice(int(start), int(stop)), segment
-
-
-def _scaled(control: PositionLoopConfig, recorded: Recorded, constants: Mapping[str, Any]) -> PositionLoopConfig:
-    if not recorded.gain:
-        return control
-    factor = constants.get(recorded.gain)
-    if not isinstance(factor, int | float):
-        numbers = [name for name, value in constants.items() if isinstance(value, int | float)]
-        raise InputError(f"gain {recorded.gain}: expected a number that is kept with the log's stretches (there are: {', '.join(numbers)})")
-    gains = {key: {joint: factor * value for joint, value in getattr(control, key).items()} for key in ("kp", "kd")}
-    return replace(control, **gains)
 
 
 def _simulate_stretch(scenario: Scenario, control: PositionLoopConfig, log: Log) -> tuple[dict[str, np.ndarray], str | None]:

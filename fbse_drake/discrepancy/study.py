@@ -19,6 +19,8 @@ from fbse_drake.walking.reference import Recorded
 
 # Share by which a later round must lower the held-out error: the first one finds what there is, the others mend what is not linear.
 _LEAST_GAIN = 0.01
+# Below this multiple of the sensors' noise a later round adds nothing: what it finds there is noise, or noise that was believed too large.
+_NOISE_FLOOR = 1.0
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
 
@@ -134,6 +136,8 @@ def study(
         if not steps:
             steps.append(measured_step((), diagnosis.held_out_before, diagnosis.held_out_before))
         worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
+        if len(diagnoses) > 1:
+            worthwhile &= diagnosis.held_out_before > _NOISE_FLOOR
         if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis.chosen)
@@ -144,7 +148,7 @@ def study(
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
     last = diagnoses[-1]
-    if last.chosen and len(diagnoses) == _MOST_ROUNDS:
+    if last.chosen and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > _NOISE_FLOOR:
         return f"{len(diagnoses)} rounds were made and each found something: the library does not fit this robot well"
     if last.verdict == "unknown_effect":
         rows = ", ".join(words(structure.row) for structure in last.unexplained)
