@@ -169,7 +169,7 @@ def test_closure_with_contact(run: Run, name: str):
     assert joint_error[solved].max() < 1e-6
 
 
-@pytest.mark.parametrize("seed", (0, 3, 6, 9))
+@pytest.mark.parametrize("seed", [0, 3, 6, 9])
 @pytest.mark.parametrize(("name", "largest_error"), [("paper_walk", 2e-3), ("hrp2_friction_walk", 3.5e-3)])
 def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
     log = run(name, f"seed={seed}")
