@@ -19,8 +19,8 @@ from fbse_drake.walking.reference import Recorded
 
 # Share by which a later round must lower the held-out error: the first one finds what there is, the others mend what is not linear.
 _LEAST_GAIN = 0.01
-# Below this multiple of the sensors' noise a later round adds nothing: what it finds there is noise, or noise that was believed too large.
-_NOISE_FLOOR = 1.0
+# The same where no more than the sensors' noise was left: what is found there is mostly noise, unless more noise is believed than there is.
+_LEAST_GAIN_IN_NOISE = 0.1
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
 
@@ -135,9 +135,8 @@ def study(
         diagnoses.append(diagnosis)
         if not steps:
             steps.append(measured_step((), diagnosis.held_out_before, diagnosis.held_out_before))
-        worthwhile = diagnosis.held_out_after < (1.0 if len(diagnoses) == 1 else 1.0 - _LEAST_GAIN) * diagnosis.held_out_before
-        if len(diagnoses) > 1:
-            worthwhile &= diagnosis.held_out_before > _NOISE_FLOOR
+        least_gain = _LEAST_GAIN if diagnosis.held_out_before > 1.0 else _LEAST_GAIN_IN_NOISE
+        worthwhile = diagnosis.held_out_after < (1.0 - least_gain * (len(diagnoses) > 1)) * diagnosis.held_out_before
         if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis.chosen)
@@ -148,7 +147,7 @@ def study(
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
     last = diagnoses[-1]
-    if last.chosen and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > _NOISE_FLOOR:
+    if last.chosen and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > 1.0:
         return f"{len(diagnoses)} rounds were made and each found something: the library does not fit this robot well"
     if last.verdict == "unknown_effect":
         rows = ", ".join(words(structure.row) for structure in last.unexplained)
