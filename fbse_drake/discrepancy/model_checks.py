@@ -13,7 +13,7 @@ from fbse_drake.discrepancy.residual import Instants, RecordedMotion, rms
 from fbse_drake.discrepancy.sanity import rate_by_legs
 
 # Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation from which on a delay can be told.
-_LARGEST_OFFSET, _SMALLEST_OFFSET, _CORRELATED = 20, 0.75, 0.7
+_LARGEST_OFFSET, _SMALLEST_OFFSET, _CORRELATED = 20, 1.5, 0.7
 # What a delay or a low-pass must take off the mismatch of two channels to be named, as a share of its sum of squares.
 _WORTHWHILE = 0.1
 # Root mean square rate of a joint that moves well [rad/s or m/s].
