@@ -27,7 +27,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.foot_pads import FootPads, measured_pad_forces
 from fbse_drake.log import Log
-from fbse_drake.robot.plant import Robot, grasp_map
+from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
 
@@ -222,7 +222,6 @@ class EquationOfMotion:
         self.robot, plant = robot, robot.plant
         self._context = plant.CreateDefaultContext()
         self.pads = FootPads(robot)
-        self._grasp = [grasp_map(robot.pad_positions(side)) for side in robot.description.sides]
         self.weight = plant.CalcTotalMass(self._context) * float(np.linalg.norm(plant.gravity_field().gravity_vector()))
         self.gravity = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
         n = len(robot.joint_names)
@@ -252,11 +251,11 @@ class EquationOfMotion:
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
         parts = self.pads.split(pad_force)
-        return [part.reshape(len(part), -1) @ G.T for part, G in zip(parts, self._grasp, strict=True)]
+        return [part.reshape(len(part), -1) @ G.T for part, G in zip(parts, self.robot.grasp_maps, strict=True)]
 
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
-        result = np.zeros((len(pad_force), len(self._grasp)), dtype=bool)
+        result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)
         for foot, force in enumerate(self.pads.split(pad_force)):
             normal = force[:, :, 2]
             result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (normal.min(axis=1) > _STANDING_PAD * self.weight)
@@ -462,8 +461,12 @@ class RecordedMotion:
 
     def averages(self, predicted: np.ndarray) -> np.ndarray:
         """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
-        stretches = _stretches(self.measured[:-1] & self.measured[1:])
-        return block_means(_low_passed(predicted, self.recording.recorded_cutoff, self.period, stretches), self.length)
+        return block_means(_low_passed(predicted, self.recording.recorded_cutoff, self.period, self._measured_steps), self.length)
+
+    @cached_property
+    def _measured_steps(self) -> list[slice]:
+        """Runs of steps without a gap."""
+        return _stretches(self.measured[:-1] & self.measured[1:])
 
     @cached_property
     def blocks(self) -> Instants:
