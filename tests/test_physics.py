@@ -169,6 +169,13 @@ def test_closure_with_contact(run: Run, name: str):
     assert joint_error[solved].max() < 1e-6
 
 
+@pytest.mark.parametrize(("name", "share"), [("squat", 1.0), ("sway", 1.0), ("paper_walk", 0.9), ("hrp2_friction_walk", 0.9)])
+def test_closure_with_exactly_solved_contact(run: Run, name: str, share: float):
+    """Drake's `sap` contact is linear as long as pads keep standing or sliding; then its solver's last step is exact."""
+    joint_error, _ = closure(run(name, "duration=3", "plant.discrete_contact_approximation=sap", noise=False), name)
+    assert np.mean(joint_error.max(axis=1) < 1e-6) >= share
+
+
 @pytest.mark.parametrize("seed", [0, 3, 6, 9])
 @pytest.mark.parametrize(("name", "largest_error"), [("paper_walk", 2e-3), ("hrp2_friction_walk", 3.5e-3)])
 def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
