@@ -11,7 +11,7 @@ log does not show stays there. A body is physical just if 1 + Z is positive semi
 constraint.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,7 +22,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from fbse_drake.discrepancy.regression import Fit, Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual import EquationOfMotion, Instants, RecordedMotion, residual_rows
 from fbse_drake.effects.effect import Effect
-from fbse_drake.effects.inertia import InertialParameters, inertial_parameters, pseudo_inertia
+from fbse_drake.effects.inertia import InertiaEffect, InertialParameters, inertia_changes, inertial_parameters, pseudo_inertia
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 
@@ -72,6 +72,20 @@ def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> n
     V = np.einsum("mij,mj->mi", J, states[:, plant.num_positions() :])
     A = np.einsum("mij,mj->mi", J, accelerations) + bias
     return np.swapaxes(J, 1, 2)[:, equation.row_velocities] @ body_wrench(V[:, :3], A[:, :3], A[:, 3:] - g)
+
+
+def inertia_addition(equation: EquationOfMotion, at: Instants, effect: InertiaEffect, regressor: Callable[[str], np.ndarray]) -> np.ndarray:
+    """What a robot whose inertia an effect changes has more than the model in the joint and base rows, shape (M, rows).
+
+    Args:
+        regressor: `inertial_regressor` of a body at these instants.
+    """
+    rotor_inertia, point_masses = inertia_changes({"effect": effect}, equation.robot)
+    result = np.zeros((len(at.joint_acceleration), len(equation.row_velocities)))
+    result[:, : len(rotor_inertia)] = rotor_inertia * at.joint_acceleration
+    for point in point_masses:
+        result += regressor(point.body) @ inertial_parameters(point.inertia)
+    return result
 
 
 def body_wrench(w: np.ndarray, alpha: np.ndarray, a: np.ndarray) -> np.ndarray:

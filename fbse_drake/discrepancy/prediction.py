@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import savgol_filter
 
+from fbse_drake.discrepancy.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.regression import Signature
 from fbse_drake.discrepancy.residual import (
-    EquationOfMotion,
     Instants,
     RecordedMotion,
     Residual,
@@ -61,6 +61,7 @@ class Predictor:
                 memory = known.effect.memory_over_time(self.motion.signals, known, self.robot, self.motion.period)
                 self.motion.signals = self._undone(known, memory)
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
+        self._regressors: dict[tuple[str, bool], np.ndarray] = {}
 
     @property
     def rows(self) -> int:
@@ -258,20 +259,24 @@ class Predictor:
 
     def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
         """What that noise adds to the signature of an inertia effect: regressors are measured too."""
-        noisy = self._smoothed(self._noisier_blocks)
-        dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
-        without = self.motion.equation.residual(noisy, kinematic=False)
-        columns = np.zeros((len(without), self.rows, len(effect.parameters)))
+        columns = np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
         for k, name in enumerate(effect.parameters):
             unit = _probe(effect, name)
-            other = self._equation_with(effect.from_values([target], {name: [unit]})).residual(noisy, kinematic=False)
-            columns[:, :dynamic, k] = (without - other) / unit
+            columns[:, :, k] = self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True) / unit
         return replace(clean, values=columns[:, clean.rows] - clean.values)
 
-    def _equation_with(self, effect: Effect) -> EquationOfMotion:
-        """The equation of motion of a model with a further effect."""
-        believed = self.scenario.believed
-        return EquationOfMotion(build_robot(replace(believed, effects={**believed.effects, "_probe": effect})))
+    def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
+        """What an inertia effect adds to the residual, (B, R)."""
+        blocks = self._smoothed(self._noisier_blocks) if noisier else self._smooth_blocks
+
+        def regressor(body: str) -> np.ndarray:
+            key = (body, noisier)
+            if key not in self._regressors:
+                self._regressors[key] = inertial_regressor(self.motion.equation, blocks, body)
+            return self._regressors[key]
+
+        added = inertia_addition(self.motion.equation, blocks, effect, regressor)
+        return np.pad(added, ((0, 0), (0, self.rows - added.shape[1])))
 
     def signature_near(
         self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray, elsewhere: Signature
@@ -302,12 +307,7 @@ class Predictor:
         values = {name: [value] for name, value in (*zip(names, linear, strict=True), *zip(fixed, nonlinear, strict=True))}
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
-            # By changing the model: what the robot has more than the model stays in the residual with the other sign.
-            dynamic = self.rows - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
-            result = np.zeros_like(self._residual_at_blocks)
-            other = self._equation_with(changed).residual(self._smooth_blocks, kinematic=False)
-            result[:, :dynamic] = self._residual_at_blocks[:, :dynamic] - other
-            return result
+            return self._inertia_addition(changed)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self._undone(resolved, self._memory(effect, resolved))

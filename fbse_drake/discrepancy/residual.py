@@ -13,6 +13,7 @@ average of order one, so that each row's covariance is tridiagonal.
 """
 
 import fnmatch
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -39,6 +40,8 @@ _STANDING_PAD = 0.01
 # Soles settle for this long at the start of a log [s].
 _SETTLING = 0.1
 _AXES = ("x", "y", "z")
+# Results that the equation of motion keeps of each of its functions.
+_REMEMBERED = 3
 
 
 @dataclass(frozen=True)
@@ -215,6 +218,22 @@ def averaged(instants: Instants, length: int) -> Instants:
     return Instants(**{name: block_means(values, length) for name, values in vars(instants).items()})
 
 
+class _Remembered:
+    """A function of arrays that remembers its last results."""
+
+    def __init__(self, function: Callable[..., np.ndarray]):
+        self._function = function
+        self._results: dict[tuple[bytes, ...], np.ndarray] = {}
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        key = tuple(array.tobytes() for array in arrays)
+        result = self._results.pop(key) if key in self._results else self._function(*arrays)
+        self._results[key] = result
+        if len(self._results) > _REMEMBERED:
+            del self._results[next(iter(self._results))]
+        return result
+
+
 class EquationOfMotion:
     """The residual's rows for one model; see the module."""
 
@@ -235,6 +254,11 @@ class EquationOfMotion:
             self._order = robot.velocity_index
         self._upright = robot.base_pose_positions(RigidTransform())
         self._joints = slice(len(self._order) - n, None)
+        self._soles = [robot.sole(side) for side in robot.description.sides] if robot.has_floating_base else []
+        # An effect that is tried changes some signals; what depends on the others is not computed again.
+        self._inverse_dynamics = _Remembered(self._calc_inverse_dynamics)
+        self._jacobians = _Remembered(self._calc_jacobians)
+        self._bias_accelerations = _Remembered(self._calc_bias_accelerations)
 
     def sole_rotations(self, at: Instants) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each."""
@@ -267,41 +291,58 @@ class EquationOfMotion:
         Args:
             kinematic: are the kinematic rows wanted? Else they are left out.
         """
-        robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
-        M, v = len(at.joint_position), len(order)
         states, accelerations = self.plant_motion(at)
-        rates = states[:, plant.num_positions() + order]
-        forces = MultibodyForces(plant)
-        floating = robot.has_floating_base
-        wrenches = self.wrenches(at.pad_force) if floating else []
-        soles = [robot.sole(side) for side in robot.description.sides] if floating else []
-        extra = len(residual_rows(robot)) - v if kinematic else 0
-        result = np.empty((M, v + extra))
-        world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
-        for k in range(M):
-            plant.SetPositionsAndVelocities(context, states[k])
-            if not floating:
-                plant.CalcForceElementsContribution(context, forces)
-            generalized = plant.CalcInverseDynamics(context, accelerations[k], forces)[order]
-            place, relative = v, []
-            for sole, wrench in zip(soles, wrenches, strict=True):
-                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[:, order]
-                generalized = generalized - wrench[k] @ J
-                if extra:
-                    bias = plant.CalcBiasSpatialAcceleration(context, wrt, sole, origin, world, sole).translational()
-                    velocity = J @ rates[k]
-                    result[k, place : place + 3] = velocity[:3]
-                    result[k, place + 3 : place + 6] = J[3:] @ accelerations[k, order] + bias
-                    result[k, place + 5] -= self.gravity
+        generalized = self._inverse_dynamics(states, accelerations)
+        rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
+        if self.robot.has_floating_base:
+            J = self._jacobians(states[:, : self.robot.plant.num_positions()])
+            for foot, wrench in enumerate(self.wrenches(at.pad_force)):
+                generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
+            if kinematic:
+                velocity = np.einsum("fmij,mj->fmi", J, rates)
+                specific_force = np.einsum("fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]) + self._bias_accelerations(states)
+                specific_force[:, :, 2] -= self.gravity
+                kinematic_rows = [rows[foot] for foot in range(len(J)) for rows in (velocity[..., :3], specific_force)]
+                if len(J) == 2:
                     # The base's columns of J hold R_FB.
-                    relative.append(J[3:, 3:6].T @ velocity[3:])
-                    place += 6
-            if extra and len(soles) == 2:
-                result[k, place:] = relative[0] - relative[1]
-            result[k, :v] = -generalized
-        result[:, self._joints.start : v] += at.torque_command
+                    left, right = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
+                    kinematic_rows.append(left - right)
         # Joints first.
-        return np.concatenate([result[:, self._joints.start : v], result[:, : self._joints.start], result[:, v:]], axis=1)
+        joints = at.torque_command - generalized[:, self._joints]
+        return np.concatenate([joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1)
+
+    def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
+        """Generalized forces without those of the feet, (M, v), in our order."""
+        plant, context, forces = self.robot.plant, self._context, MultibodyForces(self.robot.plant)
+        result = np.empty((len(states), len(self._order)))
+        for k, (state, acceleration) in enumerate(zip(states, accelerations, strict=True)):
+            plant.SetPositionsAndVelocities(context, state)
+            if not self.robot.has_floating_base:
+                plant.CalcForceElementsContribution(context, forces)
+            result[k] = plant.CalcInverseDynamics(context, acceleration, forces)[self._order]
+        return result
+
+    def _calc_jacobians(self, positions: np.ndarray) -> np.ndarray:
+        """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
+        plant, context, soles = self.robot.plant, self._context, self._soles
+        result = np.empty((len(soles), len(positions), 6, len(self._order)))
+        for k, position in enumerate(positions):
+            plant.SetPositions(context, position)
+            for foot, sole in enumerate(soles):
+                J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, sole, np.zeros(3), plant.world_frame(), sole)
+                result[foot, k] = J[:, self._order]
+        return result
+
+    def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
+        """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
+        plant, context, soles, world = self.robot.plant, self._context, self._soles, self.robot.plant.world_frame()
+        result = np.empty((len(soles), len(states), 3))
+        for k, state in enumerate(states):
+            plant.SetPositionsAndVelocities(context, state)
+            for foot, sole in enumerate(soles):
+                bias = plant.CalcBiasSpatialAcceleration(context, JacobianWrtVariable.kV, sole, np.zeros(3), world, sole)
+                result[foot, k] = bias.translational()
+        return result
 
     @property
     def row_velocities(self) -> np.ndarray:

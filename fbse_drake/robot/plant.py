@@ -57,6 +57,11 @@ class PointMass:
     # p_BoP_B, shape (3,) [m].
     position: np.ndarray
 
+    @property
+    def inertia(self) -> SpatialInertia:
+        """About Bo, in B; no body has that of a negative mass."""
+        return SpatialInertia(self.mass, self.position, UnitInertia.PointMass(self.position), skip_validity_check=True)
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -376,7 +381,7 @@ def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_mass
         if not plant.HasBodyNamed(point.body, instance):
             raise InputError(f"{point.body}: the model has no body of this name")
         body = plant.GetBodyByName(point.body, instance)
-        added = SpatialInertia(point.mass, point.position, UnitInertia.PointMass(point.position), skip_validity_check=True)
+        added = point.inertia
         # A sum in place, but not in the body's own inertia.
         inertia = inertias.setdefault(point.body, copy(body.default_spatial_inertia()))
         if inertia.get_mass() + point.mass <= 0:
