@@ -86,11 +86,17 @@ def test_delay_shifts_the_command(steps: float):
     np.testing.assert_allclose(law(TorqueDelay(delay={"all": steps * H}), M), M.command - late, atol=1e-9)
 
 
-def test_past_commands_at_once_are_those_of_the_steps(monkeypatch: pytest.MonkeyPatch):
-    sets = np.array([[[0.0, 2e-3], [7.3e-3, 2.9e-2]]])
-    at_once = basis_over_time(TorqueDelay, M, sets)
-    monkeypatch.setattr(TorqueDelay, "memory_over_time", JointTorqueEffect.memory_over_time)
-    np.testing.assert_array_equal(at_once, basis_over_time(TorqueDelay, M, sets))
+@pytest.mark.parametrize(
+    ("effect", "sets"),
+    [
+        (TorqueDelay, [[[0.0, 2e-3], [7.3e-3, 2.9e-2]]]),
+        (Backlash, [[[1e-3, 2e-3], [0.0, 2e-2]], [[0.1, 0.3], [0.02, 1.0]]]),
+    ],
+)
+def test_memory_at_once_is_that_of_the_steps(monkeypatch: pytest.MonkeyPatch, effect: type[JointTorqueEffect], sets: list):
+    at_once = basis_over_time(effect, M, np.array(sets))
+    monkeypatch.setattr(effect, "memory_over_time", JointTorqueEffect.memory_over_time)
+    np.testing.assert_array_equal(at_once, basis_over_time(effect, M, np.array(sets)))
 
 
 @pytest.mark.parametrize("time_constant", [2e-4, 5e-3, 5e-2])

@@ -1,10 +1,11 @@
 """Torques of gears and cables: springs, ripple, hysteresis, backlash."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 
 from fbse_drake.effects.effect import Parameter, in_library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, affine_recursion
@@ -137,16 +138,48 @@ class Backlash(JointTorqueEffect):
         offset, velocity, _ = _cross(motion, nonlinear)
         return np.stack([offset, velocity])
 
+    @staticmethod
+    def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        first = Backlash.start(replace(motion, command=motion.command[:1]), nonlinear)
+        # Time first, all else in one axis.
+        command, *values = np.broadcast_arrays(motion.command, *nonlinear)
+        steps = [np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1) for array in (command, *values)]
+        ends = _crossings(first[0].ravel(), first[1].ravel(), *steps, motion.time_step)[:2, :-1]
+        ends = np.moveaxis(ends.reshape(2, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
+        return np.concatenate([first, ends], axis=-2)
 
-def _cross(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offset [rad] and velocity [rad/s] of a rotor against its link at the end of the step, and for which share of the step it was free.
 
-    The memory is offset and velocity at the start; the offset is within half the gap to either side.
+def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+    """Result of `_crossings` for one step, (3, ...); the memory is offset and velocity at its start."""
+    arrays = np.broadcast_arrays(*motion.memory, motion.command, *nonlinear)
+    offset, velocity, *step = (np.ascontiguousarray(array).reshape(1, -1) for array in arrays)
+    return _crossings(offset[0], velocity[0], *step, motion.time_step).reshape(3, *arrays[0].shape)
+
+
+@njit(cache=True)
+def _crossings(
+    offset: np.ndarray, velocity: np.ndarray, command: np.ndarray, gap: np.ndarray, inertia: np.ndarray, time_step: float
+) -> np.ndarray:
+    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step, and for which share of the step they were
+    free, (3, N, C).
+
+    Args:
+        offset, velocity: at the start, (C,); the offset is within half the gap to either side.
+        command, gap, inertia: of each step, (N, C).
     """
-    (offset, velocity), (gap, inertia) = motion.memory, nonlinear
-    velocity = velocity + motion.time_step * motion.command / inertia
-    travel = motion.time_step * velocity
-    room = 0.5 * gap - np.sign(travel) * offset
-    arrives = np.abs(travel) >= room
-    share = np.divide(room, np.abs(travel), out=np.ones_like(travel), where=arrives & (travel != 0))
-    return np.where(arrives, 0.5 * gap * np.sign(travel), offset + travel), np.where(arrives, 0.0, velocity), share
+    result = np.empty((3, *command.shape))
+    for j in range(command.shape[1]):
+        x, v = offset[j], velocity[j]
+        for k in range(command.shape[0]):
+            v += time_step * command[k, j] / inertia[k, j]
+            travel, side = time_step * v, 0.5 * gap[k, j]
+            room = side - np.sign(travel) * x
+            share = 1.0
+            if abs(travel) >= room:
+                if travel != 0:
+                    share = room / abs(travel)
+                x, v = side * np.sign(travel), 0.0
+            else:
+                x += travel
+            result[0, k, j], result[1, k, j], result[2, k, j] = x, v, share
+    return result
