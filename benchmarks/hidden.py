@@ -280,7 +280,11 @@ def _strength(hidden: dict[str, Any], target: str) -> float:
     if not parameter.linear:
         return hidden["parameters"][name][target]
     parameters = library()[hidden["effect"]].parameters
-    return float(np.linalg.norm([hidden["parameters"][n][target] for n, p in parameters.items() if p.linear and p.unit == parameter.unit]))
+    return float(
+        np.linalg.norm(
+            [hidden["parameters"].get(n, {}).get(target, 0.0) for n, p in parameters.items() if p.linear and p.unit == parameter.unit]
+        )
+    )
 
 
 def _limit(stated: dict[str, dict[str, float]], hidden: dict[str, Any], target: str) -> float:
