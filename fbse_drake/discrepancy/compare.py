@@ -295,7 +295,7 @@ class _RowErrors:
         found = [where for phase in best.phases for where in self._outstanding(best, phase, threshold, smallest)]
         if not found and self._rmse > max(_EXCESS * self._noise_floor, smallest):
             found = [self._scatter()]
-        return [Failure(self.row, where, _text(self.row, where)) for where in found]
+        return [Failure(self.row, where, _text(self.row, where, has_phases=bool(self.phases))) for where in found]
 
     def _scatter(self) -> Bin:
         """The root mean square of the whole row."""
@@ -391,13 +391,14 @@ def _digits(value: float) -> str:
     return f"{float(f'{value:.1e}'):g}"
 
 
-def _text(row: Row, where: Bin) -> str:
+def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
     size, unit = _digits(abs(where.error)), _UNITS.get(row.unit, row.unit)
     # As force, z in base/force_z.
     kind, _, axis = row.name.split("/")[-1].rpartition("_")
     more = where.error > 0
     if where.variable == "scatter":
-        what = f"an error of {size} {unit} (root mean square) that follows neither phase nor any of the variables"
+        nothing = "neither phase nor any" if has_phases else "none"
+        what = f"an error of {size} {unit} (root mean square) that follows {nothing} of the variables"
     elif row.kind == "joint":
         along = " along the motion" if where.variable == "speed" else ""
         what = f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too {'low' if more else 'high'}{along}"
