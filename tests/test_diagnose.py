@@ -182,6 +182,16 @@ def test_two_effects_at_once_are_both_found() -> None:
     }
 
 
+def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
+    """One offset alone explains less than a turned IMU with a moved mass; both together explain all."""
+    log = log_with("!EncoderOffset {offset: {hip_roll: 0.007}}")
+    candidates = [library()[name] for name in ("EncoderOffset", "ImuMisalignment", "BodyCentreOfMass", "TorqueBias")]
+    diagnosis = diagnose(Predictor(scenario(), log), candidates)
+    assert diagnosis.verdict == "effect_found"
+    assert sorted((f.effect, *f.targets) for f in diagnosis.chosen) == [("EncoderOffset", f"{side}_hip_roll") for side in ("left", "right")]
+    assert all(f.parameters["offset"].value == pytest.approx(0.007, rel=0.02) for f in diagnosis.chosen)
+
+
 def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
     hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
     result = study(scenario(), log_with(hidden), effects())

@@ -249,7 +249,7 @@ def _rivals(search: Search, final: Explanation) -> dict[int, list[Explanation]]:
     result = {}
     for k, member in enumerate(final.candidates):
         rest = search.explain([c for c in final.candidates if c is not member])
-        additions = search.best_additions(rest, member.signature.rows)
+        additions = [e for e in search.best_additions(rest, member.signature.rows) if len(e.candidates) == len(final.candidates)]
         result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
     return result
 

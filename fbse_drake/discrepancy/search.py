@@ -96,13 +96,16 @@ class Explanation:
     # Of held-out data, with the charge for every parameter; smaller is better.
     deviance: float
 
+    def start(self, candidate: Candidate) -> int:
+        """Place of a candidate's first parameter."""
+        return sum(c.signature.values.shape[2] for c in itertools.takewhile(lambda c: c is not candidate, self.candidates))
+
     def values(self, candidate: Candidate) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds.
 
         A nonlinear parameter that was not searched for has its plausible range as interval.
         """
-        start = sum(c.signature.values.shape[2] for c in itertools.takewhile(lambda c: c is not candidate, self.candidates))
-        names = candidate.linear_names
+        start, names = self.start(candidate), candidate.linear_names
         fitted = names + (candidate.nonlinear_names if issubclass(candidate.effect, JointTorqueEffect) else [])
         offsets = np.concatenate([np.zeros(len(names)), candidate.nonlinear])[: len(fitted)]
         part = slice(start, start + len(fitted))
@@ -272,17 +275,34 @@ class Search:
     def best_additions(self, base: Explanation, rows: np.ndarray | None = None) -> list[Explanation]:
         """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
 
+        Sensors of both legs may be wrong together, and one alone look like something else: `_pairs` are tried too.
+
         Args:
             rows: only candidates that change one of these; by default all.
         """
-        found = []
-        for candidate in self._promising(base, rows):
-            if self._loses_scale([*base.candidates, candidate]):
+        promising, found = self._promising(base, rows), []
+        for added in [*([candidate] for candidate in promising), *self._pairs(promising)]:
+            everything = [*base.candidates, *added]
+            if self._loses_scale(everything):
                 continue
-            wider = self.explain([*base.candidates, candidate])
-            if self.is_significant(base, wider, candidate):
+            wider = self.explain(everything)
+            without = (base if len(added) == 1 else self.explain([c for c in everything if c is not member]) for member in added)
+            if all(self.is_significant(rest, wider, member) for rest, member in zip(without, added, strict=True)):
                 found.append(wider)
         return sorted(found, key=lambda e: e.deviance)
+
+    def _pairs(self, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+        """Candidates that are no joint torque effects, each with its like on the other legs; with values of their own."""
+        description = self.predictor.robot.description
+        alike = [*dict.fromkeys(map(description.counterparts, self._joints)), tuple(description.sides)]
+        found = {(c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)}
+        result = []
+        for effect in dict.fromkeys(c.effect for c in candidates):
+            for targets in alike:
+                members = [found.get((effect, (target,))) for target in targets]
+                if len(members) > 1 and None not in members:
+                    result.append(members)
+        return result
 
     def _loses_scale(self, candidates: Sequence[Candidate]) -> bool:
         """Could everything be nothing? Without torques only the masses and the gains of the feet say how large forces are: if all of them
@@ -297,7 +317,7 @@ class Search:
         return _SYSTEMATIC * float(self.white.doubt[rows].sum()) if self._per_step else 0.0
 
     def is_significant(self, base: Explanation, wider: Explanation, added: Candidate) -> bool:
-        """Does the last candidate bring more than chance, with values that can be?"""
+        """Does a candidate bring more than chance to an explanation without it, with values that can be?"""
         drop = base.deviance - wider.deviance
         if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows) + added.spurious:
             return False
@@ -305,7 +325,7 @@ class Search:
         taken, gained = (float(np.maximum(a[rows] - b[rows], 0.0).sum()) for a, b in ((self.white.sse, base.sse), (base.sse, wider.sse)))
         if self._per_step and gained < _MISFIT * taken:
             return False
-        start = sum(c.signature.values.shape[2] for c in wider.candidates[:-1])
+        start = wider.start(added)
         names = added.linear_names if added.has_linear else added.nonlinear_names
         offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
         values, deviations = wider.fit.parameters[start:][: len(names)] + offsets, wider.fit.deviation[start:][: len(names)]
