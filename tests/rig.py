@@ -15,6 +15,7 @@ from fbse_drake.estimators.estimator import EstimatorConfig, EstimatorDiagram, m
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
+from fbse_drake.estimators.support import MeasuredSupport
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.walking.reference import make_reference
 
@@ -61,14 +62,15 @@ class Base:
     @staticmethod
     def of(description: str = "biped") -> "Base":
         robot, _ = make_robot(description)
-        monitor = SensorMonitor(SensorMonitorConfig(), robot, CLOCK)
+        monitor = SensorMonitor(SensorMonitorConfig(), MeasuredSupport(), robot, CLOCK)
         return Base(robot, monitor, FloatingBaseModel(robot, monitor.fields.slices, CLOCK))
 
     def measurements(self, **values: np.ndarray | float) -> np.ndarray:
         """Trusted readings of a robot that stands on level ground, but for the values given."""
         pads = sum(len(leg.pads) for leg in self.robot.description.legs.values())
         standing = np.tile([0.0, 0.0, 87.0 * 9.81 / pads], pads)
-        return pack(self.monitor, **{"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, **values})
+        resting = {"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, "support": np.ones(2)}
+        return pack(self.monitor, **{**resting, **values})
 
     def model_of(self, **values: np.ndarray | float) -> dict[str, np.ndarray]:
         """Fields of the model for such readings."""

@@ -31,14 +31,14 @@ class Attitude(Rig):
         estimator = AttitudeEstimator(AttitudeConfig(**config), base.robot, base.monitor.fields.slices, base.model.fields.slices, CLOCK)
         super().__init__(estimator)
         self._base = base
-        self.fix(support=np.zeros(2), model=self.feet(np.eye(3)))
+        self.fix(model=self.feet(np.eye(3)))
 
     def feet(self, R_BF: np.ndarray) -> np.ndarray:
         """Model input with both soles turned like this in the base."""
         return self._base.model.fields.pack(foot_rotation=np.tile(np.ravel(R_BF), 2))
 
-    def read(self, specific_force: np.ndarray, rate: np.ndarray, **inputs: np.ndarray) -> dict[str, np.ndarray]:
-        readings = self._base.measurements(specific_force=specific_force, angular_velocity=rate)
+    def read(self, specific_force: np.ndarray, rate: np.ndarray, *, stands: bool = False, **inputs: np.ndarray) -> dict[str, np.ndarray]:
+        readings = self._base.measurements(specific_force=specific_force, angular_velocity=rate, support=np.full(2, float(stands)))
         return self.tick(measurements=readings, **inputs)
 
 
@@ -132,7 +132,7 @@ def test_tilted_at_rest(config: dict[str, float], roll: float, pitch: float):
     R_WB = Rotation.from_euler("ZYX", [0, pitch, roll])
     attitude = Attitude(**config)
     # Standing feet that are level, as the legs tell it.
-    standing = {"support": np.ones(2), "model": attitude.feet(R_WB.inv().as_matrix())}
+    standing = {"stands": True, "model": attitude.feet(R_WB.inv().as_matrix())}
     for _ in range(100):
         posterior = attitude.read(R_WB.inv().apply([0, 0, GRAVITY]), np.zeros(3), **standing)
         np.testing.assert_allclose(matrix(posterior), R_WB.as_matrix(), atol=1e-9)
@@ -148,7 +148,7 @@ def test_it_does_not_matter_how_the_imu_sits(tmp_path: Path):
         for k in range(400):
             R_WB = Rotation.from_euler("ZYX", [0.3 * k * TICK, 0.02, -0.01])
             f, w = R_WB.inv().apply([0, 0, GRAVITY]), R_WB.inv().apply([0, 0, 0.3])
-            standing = {"support": np.ones(2), "model": plain.feet(R_WB.inv().as_matrix())}
+            standing = {"stands": True, "model": plain.feet(R_WB.inv().as_matrix())}
             expected = plain.read(f, w, **standing)
             posterior = turned.read(R_BI.inv().apply(f), R_BI.inv().apply(w), **standing)
             np.testing.assert_allclose(matrix(posterior), matrix(expected), atol=1e-9)
@@ -230,7 +230,7 @@ def test_level_feet_hold_the_tilt_against_acceleration():
     f = np.array([0.3, 0.0, GRAVITY])
     with_feet, without = Attitude(standing_time=0.0), Attitude(**IMU_ONLY)
     for _ in range(1500):
-        held, fooled = (attitude.read(f, np.zeros(3), support=np.ones(2)) for attitude in (with_feet, without))
+        held, fooled = (attitude.read(f, np.zeros(3), stands=True) for attitude in (with_feet, without))
     tilt = [Rotation.from_matrix(matrix(posterior)).as_rotvec()[1] for posterior in (held, fooled)]
     assert tilt[1] == pytest.approx(-0.3 / GRAVITY, rel=0.05)
     assert abs(tilt[0]) < 0.3 * abs(tilt[1])

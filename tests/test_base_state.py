@@ -16,7 +16,9 @@ from fbse_drake.estimate import estimate
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.base_state import AdaptiveLipm, AdaptiveLipmEstimator, BaseStateEstimator, ContactAided, ContactAidedEstimator
 from fbse_drake.estimators.estimator import Fbse
-from fbse_drake.estimators.support import MeasuredSupport, SupportDetector
+from fbse_drake.estimators.recursive import Status
+from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
+from fbse_drake.estimators.support import MeasuredSupport
 
 GRAVITY = 9.81
 WEIGHT = 87.0 * GRAVITY
@@ -33,7 +35,7 @@ class BaseState(Rig):
         self._attitude = AttitudeEstimator(AttitudeConfig(), BASE.robot, parts, BASE.model.fields.slices, CLOCK)
         super().__init__(kind(config, BASE.robot, parts, self._attitude.fields.slices, BASE.model.fields.slices, CLOCK, (0.0, 0.0)))
         self.turned()
-        self.fix(support=np.ones(2), model=BASE.model.fields.pack(**LEVEL), measurements=BASE.measurements())
+        self.fix(model=BASE.model.fields.pack(**LEVEL), measurements=BASE.measurements())
 
     def turned(self, rotation: Rotation | None = None, rate: np.ndarray | None = None) -> None:
         """Attitude R_WB and angular velocity in base axes."""
@@ -155,13 +157,10 @@ def test_lever_arm_of_the_centre_of_mass():
 
 def test_lever_arm_of_the_base():
     """Who spins about the base's origin, with no foot on the ground, goes nowhere."""
-    estimator = BaseState(ContactAidedEstimator, ContactAided())
-    estimator.fix(support=np.zeros(2))
-    posterior = spin(estimator, np.zeros(3), 600, pad_force=np.zeros(24))
+    lifted = {"pad_force": np.zeros(24), "support": np.zeros(2)}
+    posterior = spin(BaseState(ContactAidedEstimator, ContactAided()), np.zeros(3), 600, **lifted)
     np.testing.assert_allclose(posterior["base_velocity"], 0, atol=1e-9)
-    estimator = BaseState(ContactAidedEstimator, ContactAided())
-    estimator.fix(support=np.zeros(2))
-    posterior = spin(estimator, np.array([0.0, 0.3, 0.0]), 600, pad_force=np.zeros(24))
+    posterior = spin(BaseState(ContactAidedEstimator, ContactAided()), np.array([0.0, 0.3, 0.0]), 600, **lifted)
     # The base circles at 0.3 m with 1.8 rad/s.
     assert np.linalg.norm(posterior["base_velocity"]) > 0.1
 
@@ -215,10 +214,11 @@ def test_feet_are_anchored_where_they_land(run: Run):
 def test_untrusted_sensors_move_nothing():
     """Without IMU and legs the velocity stays, and the position goes on with it."""
     estimator = BaseState(ContactAidedEstimator, ContactAided())
-    push = BASE.measurements(specific_force=[1.0, 0, GRAVITY], pad_force=np.zeros(24))
-    blind = BASE.measurements(trust=[0, 1, 0, 0], specific_force=[50.0, 0, GRAVITY], pad_force=np.zeros(24))
+    lifted = {"pad_force": np.zeros(24), "support": np.zeros(2)}
+    push = BASE.measurements(specific_force=[1.0, 0, GRAVITY], **lifted)
+    blind = BASE.measurements(trust=[0, 1, 0, 0], specific_force=[50.0, 0, GRAVITY], **lifted)
     for _ in range(101):
-        pushed = estimator.tick(measurements=push, support=np.zeros(2))
+        pushed = estimator.tick(measurements=push)
     for _ in range(100):
         posterior = estimator.tick(measurements=blind)
     assert pushed["base_velocity"][0] == pytest.approx(0.1, rel=1e-6)
@@ -229,16 +229,19 @@ def test_untrusted_sensors_move_nothing():
 
 
 class Support(Rig):
-    """A SupportDetector under a left foot with a load; the right one carries the rest."""
+    """A SensorMonitor over a left foot with a load; the right one carries the rest, or as little as is said."""
 
     def __init__(self, **config: float):
-        system: System = SupportDetector(MeasuredSupport(**config), BASE.robot, BASE.monitor.fields.slices, CLOCK)
+        system: System = SensorMonitor(SensorMonitorConfig(), MeasuredSupport(**config), BASE.robot, CLOCK)
         super().__init__(system)
 
-    def left(self, share: float, trust: float = 0.0) -> bool:
-        load = np.repeat([share, 1 - share], 4) * WEIGHT / 4
-        readings = BASE.measurements(pad_force=np.column_stack([np.zeros((8, 2)), load]), trust=[0, 0, trust, 0])
-        left, right = self.tick(measurements=readings)["support"]
+    def left(self, share: float, right: float | None = None) -> bool:
+        load = np.repeat([share, 1 - share if right is None else right], 4) * WEIGHT / 4
+        pads, imu = np.column_stack([np.zeros((8, 2)), load]), [0, 0, GRAVITY, 0, 0, 0]
+        posterior = self.tick(sensors=np.concatenate([BENT, np.zeros(12), imu, pads.ravel()]))
+        # A foot is lost if both together show too little.
+        assert posterior["trust"][2] == (0 if right is None else Status.LOST)
+        left, right = posterior["support"]
         assert right == 1
         return bool(left)
 
@@ -272,7 +275,7 @@ def test_support_waits_for_the_debounce():
 def test_untrusted_foot_stays_what_it_was():
     detector = Support()
     assert detector.left(0.5)
-    assert all(detector.left(0.0, trust=3.0) for _ in range(100))
+    assert all(detector.left(0.0, right=0.5) for _ in range(100))
     assert not all(detector.left(0.0) for _ in range(20))
 
 

@@ -79,7 +79,6 @@ class Friction(Rig):
         kind = ModelAidedEstimator if isinstance(config, ModelAided) else RecursiveLeastSquaresEstimator
         self._link = LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, PARTS, MODEL, ACCELERATION.fields.slices, CLOCK)
         super().__init__(kind(config, BASE.robot, PARTS, self._link.fields.slices, CLOCK))
-        self.fix(support=np.ones(2))
 
     def see(
         self,
@@ -88,11 +87,11 @@ class Friction(Rig):
         torque: float = 0.01,
         impulse: float = 1e-8,
         valid: float = 1,
-        **inputs: np.ndarray,
+        support: tuple[float, float] = (1, 1),
     ):
         noise = {"torque_variance": np.full(12, torque), "impulse_variance": np.full(12, impulse), "valid": np.full(12, valid)}
         link = pack(self._link, residual=residual, **noise)
-        return self.tick(measurements=BASE.measurements(joint_velocity=velocity), link_torque=link, **inputs)
+        return self.tick(measurements=BASE.measurements(joint_velocity=velocity, support=support), link_torque=link)
 
 
 def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_in_swing():
@@ -108,7 +107,7 @@ def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_i
     parameters = posterior["parameters"].reshape(12, 2)
     np.testing.assert_allclose(parameters, truth, atol=0.08)
     # Now the right leg swings, and what is measured there is nonsense.
-    posterior = estimator.see(velocity, np.full(12, 77.0), support=np.array([1.0, 0.0]))
+    posterior = estimator.see(velocity, np.full(12, 77.0), support=(1, 0))
     np.testing.assert_allclose(posterior["friction"][:6], 77.0)
     np.testing.assert_allclose(posterior["friction"][6:], (phi * parameters).sum(axis=1)[6:], rtol=1e-9)
     np.testing.assert_array_equal(posterior["parameters"].reshape(12, 2)[6:], parameters[6:])

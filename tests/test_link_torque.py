@@ -110,15 +110,13 @@ def residual_with(attitude: Rotation, support: list[float], method: str = "fused
     for rig in (chain, torque):
         rig.tick(
             **{"measurements": BASE.measurements(), "model_at_step_start": np.zeros(BASE.model.fields.size)},
-            **({"attitude": pack(ATTITUDE, rotation=np.eye(3)), "support": np.ones(2)} if rig is chain else {}),
+            **({"attitude": pack(ATTITUDE, rotation=np.eye(3))} if rig is chain else {}),
             **({"joint_acceleration": pack(accelerations()), "torque_command": np.full(12, 3.0)} if rig is torque else {}),
         )
     moving = {"joint_velocity": generator.normal(size=12), "angular_velocity": generator.normal(size=3)}
     model = BASE.model.fields.pack(**BASE.model_of(**moving))
-    readings = BASE.measurements(**{name: value + 0.01 for name, value in moving.items()})
-    known = chain.tick(
-        measurements=readings, model_at_step_start=model, attitude=pack(ATTITUDE, rotation=attitude.as_matrix()), support=np.array(support)
-    )
+    readings = BASE.measurements(**{name: value + 0.01 for name, value in moving.items()}, support=support)
+    known = chain.tick(measurements=readings, model_at_step_start=model, attitude=pack(ATTITUDE, rotation=attitude.as_matrix()))
     accelerated = chain.system.fields.pack(**known)
     return torque.tick(measurements=readings, model_at_step_start=model, joint_acceleration=accelerated)["residual"]
 
@@ -141,7 +139,7 @@ def test_joint_accelerations_keep_standing_feet_where_they_are(method: str):
     config = JointAccelerationConfig(method=method, foot_angular_acceleration=1e-6, foot_acceleration=1e-6)
     rig = Rig(accelerations(config))
     attitude = pack(ATTITUDE, rotation=np.eye(3))
-    rig.tick(measurements=BASE.measurements(), model_at_step_start=np.zeros(BASE.model.fields.size), attitude=attitude, support=np.ones(2))
+    rig.tick(measurements=BASE.measurements(), model_at_step_start=np.zeros(BASE.model.fields.size), attitude=attitude)
     x = rig.tick(measurements=BASE.measurements(**moving), model_at_step_start=BASE.model.fields.pack(**terms))
     names = ("base_angular_acceleration", "base_specific_force", "joint_acceleration")
     a = np.concatenate([x[name] for name in names]) - np.concatenate([np.zeros(3), [0, 0, GRAVITY], np.zeros(12)])

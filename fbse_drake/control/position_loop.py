@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from fbse_drake.errors import InputError, require_positive
@@ -40,6 +41,28 @@ def position_loop(error: np.ndarray, error_rate: np.ndarray, kp: np.ndarray, kd:
     return kp * error + kd * error_rate
 
 
+_law = njit(cache=True)(position_loop)
+
+
+@njit(cache=True)
+def _command(
+    command: np.ndarray,
+    desired: np.ndarray,
+    estimated: np.ndarray,
+    feedforward: np.ndarray,
+    friction: np.ndarray,
+    enabled: np.ndarray,
+    kp: np.ndarray,
+    kd: np.ndarray,
+    limit: np.ndarray,
+) -> None:
+    """Fills the command of a `PositionLoop` from its inputs."""
+    n = len(command)
+    for i in range(n):
+        torque = _law(desired[i] - estimated[i], desired[n + i] - estimated[n + i], kp[i], kd[i]) + feedforward[i] + friction[i]
+        command[i] = np.minimum(np.maximum(torque, -limit[i]), limit[i]) * enabled[i]
+
+
 class PositionLoop(LeafSystem):
     """Position loop with feed-forward and friction compensation, held between its ticks.
 
@@ -72,15 +95,18 @@ class PositionLoop(LeafSystem):
         """
         super().__init__()
         n = len(names.joint_names)
-        self._n, self._period = n, config.period
+        self._period = config.period
         self._kp = names.per_joint(config.kp, key="control.kp")
         self._kd = names.per_joint(config.kd, key="control.kd")
         self._limit = names.per_joint(config.torque_limit, key="control.torque_limit")
         self._estimated_state = self.DeclareVectorInputPort("estimated_state", 2 * n)
         self._desired_state = self.DeclareVectorInputPort("desired_state", 2 * n)
-        self._feedforward = self.DeclareVectorInputPort("feedforward_torque", n)
-        self._friction = self.DeclareVectorInputPort("friction_estimate", n)
-        self._enabled = self.DeclareVectorInputPort("enabled", n)
+        # Inputs that may be left unconnected, and what they then count as.
+        self._optional = [
+            (self.DeclareVectorInputPort("feedforward_torque", n), np.zeros(n)),
+            (self.DeclareVectorInputPort("friction_estimate", n), np.zeros(n)),
+            (self.DeclareVectorInputPort("enabled", n), np.ones(n)),
+        ]
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
@@ -92,13 +118,9 @@ class PositionLoop(LeafSystem):
         if self._holds and not is_tick(context.get_time(), self._period):
             output.SetFromVector(context.get_discrete_state(self._held).value())
             return
-        error = self._desired_state.Eval(context) - self._estimated_state.Eval(context)
-        torque = position_loop(error[: self._n], error[self._n :], self._kp, self._kd)
-        for port in (self._feedforward, self._friction):
-            if port.HasValue(context):
-                torque = torque + port.Eval(context)
-        torque = np.minimum(np.maximum(torque, -self._limit), self._limit)
-        output.SetFromVector(torque * self._enabled.Eval(context) if self._enabled.HasValue(context) else torque)
+        desired, estimated = self._desired_state.Eval(context), self._estimated_state.Eval(context)
+        optional = [port.Eval(context) if port.HasValue(context) else unconnected for port, unconnected in self._optional]
+        _command(output.get_mutable_value(), desired, estimated, *optional, self._kp, self._kd, self._limit)
 
     def _hold(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._held).set_value(self.torque_command.Eval(context))

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State, ValueProducer
 
@@ -14,11 +15,10 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 _LAST_STEP = 3e-4
 _MAX_ITERATIONS = 60
 # Rows of the state before those of the effects' memories, see `JointTorqueEffects`.
-_ROWS = 7
+_POSITION, _VELOCITY, _COMMAND, _TORQUE, _FREE, _END, _GAIN, _ROWS = range(8)
 
 
-@dataclass(frozen=True)
-class ImplicitStep:
+class ImplicitStep(NamedTuple):
     """Solution of `solve_implicit_step`, arrays of shape (n,)."""
 
     # Velocity at the end of the step [rad/s] and the torque loss of that velocity [Nm].
@@ -45,21 +45,56 @@ def solve_implicit_step(
         torque_and_slope: u(v) [Nm] and its derivative [Nm s/rad], each (n,), for v (n,).
         free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
     """
-    v, low, high, last_step = guess, -np.inf, np.inf, np.inf
+    work = np.empty((6, len(guess)))
+    v = work[0]
+    v[:], work[3], work[4:] = guess, -math.inf, math.inf
     for _ in range(_MAX_ITERATIONS):
         torque, slope = torque_and_slope(v)
-        gain = 1.0 / (1.0 + mobility * slope)
-        excess = v + mobility * torque - free_velocity
-        step = excess * gain
-        if step @ step < _LAST_STEP**2:
+        if _newton_step(work, torque, slope, free_velocity, mobility):
             break
-        above = excess > 0
-        high, low = np.where(above, v, high), np.where(above, low, v)
-        newton, middle = v - step, (low + high) / 2
-        astray = (newton < low) | (newton > high) | (np.abs(step) > 0.5 * np.abs(last_step))
-        v = np.where(astray & np.isfinite(middle), middle, newton)
-        last_step = step
-    return ImplicitStep(v - step, torque - slope * step, gain)
+    else:
+        # Where the slope is too negative there may be no end: the last step counts twice.
+        v -= work[5]
+    return ImplicitStep(v, work[1], work[2])
+
+
+@njit(cache=True)
+def _newton_step(work: np.ndarray, torque: np.ndarray, slope: np.ndarray, free_velocity: np.ndarray, mobility: np.ndarray) -> bool:
+    """One iteration of `solve_implicit_step` in place; says whether it was the last.
+
+    Args:
+        work: rows of (n,): the three of `ImplicitStep`, lower and upper end of the bracket, last step.
+    """
+    v, end_torque, gain, low, high, last_step = work[0], work[1], work[2], work[3], work[4], work[5]
+    gain[:] = 1.0 / (1.0 + mobility * slope)
+    excess = v + mobility * torque - free_velocity
+    step = excess * gain
+    end_torque[:] = torque - slope * step
+    newton = v - step
+    if (step * step).sum() < _LAST_STEP**2:
+        v[:] = newton
+        return True
+    for i in range(len(v)):
+        if excess[i] > 0:
+            high[i] = v[i]
+        else:
+            low[i] = v[i]
+        middle = (low[i] + high[i]) / 2
+        astray = newton[i] < low[i] or newton[i] > high[i] or abs(step[i]) > 0.5 * abs(last_step[i])
+        v[i] = middle if astray and math.isfinite(middle) else newton[i]
+        last_step[i] = step[i]
+    return False
+
+
+@njit(cache=True)
+def _begin_step(state: np.ndarray, last: np.ndarray, joint_state: np.ndarray, command: np.ndarray, mobility: np.ndarray) -> None:
+    """Fills rows of the next state: what is known when a step begins, and a guess of the velocity at its end."""
+    n = len(command)
+    for i in range(n):
+        v = joint_state[n + i]
+        free_velocity = v + (v - last[_VELOCITY, i]) + mobility[i] * last[_TORQUE, i]
+        state[_POSITION, i], state[_VELOCITY, i], state[_COMMAND, i], state[_FREE, i] = joint_state[i], v, command[i], free_velocity
+        state[_END, i] = last[_END, i] + last[_GAIN, i] * (free_velocity - last[_FREE, i])
 
 
 class JointTorqueEffects(LeafSystem):
@@ -103,7 +138,7 @@ class JointTorqueEffects(LeafSystem):
         """
         super().__init__()
         n = len(inertia)
-        self._n, self._time_step, self._mobility = n, time_step, time_step / inertia
+        self._n, self._time_step, self._mobility, self._nothing = n, time_step, time_step / inertia, np.zeros(n)
         self._effects, rows = [], _ROWS
         for effect in effects:
             start = rows
@@ -125,23 +160,23 @@ class JointTorqueEffects(LeafSystem):
         """The next state."""
         n, mobility, time, time_step = self._n, self._mobility, context.get_time(), self._time_step
         joint_state, command = self._joint_state.Eval(context), self._torque_command.Eval(context)
-        position, v = joint_state[:n], joint_state[n:]
         last = context.get_discrete_state(self._state).value().reshape(-1, n)
-        last_position, last_v, last_command, last_torque, last_free, last_end, last_gain = last[:_ROWS]
         state = np.empty_like(last)
-        first = math.isnan(last_v[0])
-        load = command if first else last_command - last_torque
+        _begin_step(state, last, joint_state, command, mobility)
+        position, v = state[_POSITION], state[_VELOCITY]
+        first = math.isnan(last[_VELOCITY, 0])
+        load = command if first else last[_COMMAND] - last[_TORQUE]
         for effect, rows in self._remembering:
             if first:
                 now = JointMotion(v, position, command, time, time_step)
                 state[rows] = effect.effect.start(now, effect.nonlinear)
             else:
-                velocity = last_end + np.clip(2.0 * last_gain, 0.0, 1.0) * (v - last_end)
-                step = JointMotion(velocity, last_position, last_command, time - time_step, time_step, last[rows])
+                velocity = last[_END] + np.clip(2.0 * last[_GAIN], 0.0, 1.0) * (v - last[_END])
+                step = JointMotion(velocity, last[_POSITION], last[_COMMAND], time - time_step, time_step, last[rows])
                 state[rows] = effect.effect.advance(step, effect.nonlinear)
 
         def torque_and_slope(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            torque = slope = np.zeros(n)
+            torque = slope = self._nothing
             for effect, rows in self._effects:
                 more = effect.torque_and_slope(JointMotion(velocity, position, command, time, time_step, state[rows], load))
                 torque, slope = torque + more[0], slope + more[1]
@@ -149,16 +184,12 @@ class JointTorqueEffects(LeafSystem):
 
         if first:
             # As if the joint had been moving on like this.
-            free_velocity, guess = v + mobility * torque_and_slope(v)[0], v
-        else:
-            free_velocity = v + (v - last_v) + mobility * last_torque
-            guess = last_end + last_gain * (free_velocity - last_free)
-        solution = solve_implicit_step(torque_and_slope, free_velocity, mobility, guess)
-        state[:_ROWS] = position, v, command, solution.torque, free_velocity, solution.velocity, solution.gain
+            state[_FREE], state[_END] = v + mobility * torque_and_slope(v)[0], v
+        state[_END], state[_TORQUE], state[_GAIN] = solve_implicit_step(torque_and_slope, state[_FREE], mobility, state[_END])
         output.set_value(state)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step.Eval(context)[3])
+        output.SetFromVector(self._step.Eval(context)[_TORQUE])
 
     def _remember(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._state).set_value(self._step.Eval(context).ravel())

@@ -366,12 +366,11 @@ class AttitudeEstimator(RecursiveEstimator):
         name: AttitudeEstimator
         input_ports:
         - measurements
-        - support
         - model
         output_ports:
         - posterior
 
-    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`, and a support estimate (feet,). Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. Fields of the posterior:
 
         orientation            (4,)  quaternion [w, x, y, z] of the base in the world (eq. 6); its sign never jumps
         rotation               (9,)  R_WB, row by row
@@ -408,15 +407,16 @@ class AttitudeEstimator(RecursiveEstimator):
             *starts(model, "foot_rotation"),
             *starts(self.fields.slices, "age", "imu_orientation"),
         )
+        self._support = measurements["support"]
         R_BI = ImuMount(robot).R_BI
         self._R_BI = tuple(R_BI.ravel().tolist())
         self._q_IB = tuple(RotationMatrix(R_BI.T).ToQuaternion().wxyz().tolist())
         self._config = tuple(float(value) for value in astuple(config))
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
-        self._support = self.DeclareVectorInputPort("support", len(robot.description.sides))
         self._model = self.DeclareVectorInputPort("model", max(part.stop for part in model.values()))
-        self._declare_posterior("measurements", "support", "model")
+        self._declare_posterior("measurements", "model")
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured, support, model = self._measurements.Eval(context), self._support.Eval(context), self._model.Eval(context)
+        measured, model = self._measurements.Eval(context), self._model.Eval(context)
+        support = measured[self._support]
         _estimate_attitude(posterior, last, elapsed, measured, support, model, self._places, self._R_BI, self._q_IB, self._config)

@@ -208,12 +208,11 @@ class BaseStateEstimator(RecursiveEstimator):
         input_ports:
         - measurements
         - attitude
-        - support
         - model
         output_ports:
         - posterior
 
-    Inputs: posteriors of `SensorMonitor`, `AttitudeEstimator`, a support estimate (feet,) and `FloatingBaseModel`. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor`, `AttitudeEstimator` and `FloatingBaseModel`. Fields of the posterior:
 
         base_position, base_velocity   (3,)  of the base's origin in the world (eqs. 32, 33) [m, m/s]
         com_position, com_velocity     (3,)  [m, m/s]
@@ -263,9 +262,9 @@ class BaseStateEstimator(RecursiveEstimator):
         )
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
-        self.DeclareVectorInputPort("support", feet)
-        names = ("measurements", "attitude", "model", "support")
-        self._measurements, self._attitude, self._model, self._support = (self.GetInputPort(name) for name in names)
+        names = ("measurements", "attitude", "model")
+        self._measurements, self._attitude, self._model = (self.GetInputPort(name) for name in names)
+        self._support = measurements["support"]
         self._declare_posterior(*names)
 
 
@@ -278,7 +277,6 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
         input_ports:
         - measurements
         - attitude
-        - support
         - model
         output_ports:
         - posterior
@@ -316,8 +314,8 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
         self._rotation, self._angular_velocity, self._com = attitude["rotation"], attitude["angular_velocity"], model["com"]
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
-        model, support = self._model.Eval(context), self._support.Eval(context)
+        measured, attitude, model = self._measurements.Eval(context), self._attitude.Eval(context), self._model.Eval(context)
+        support = measured[self._support]
         first, fields, config = math.isnan(elapsed), self.fields, self._config
         R_WB = attitude[self._rotation].reshape(3, 3)
         legs = _follow_legs(
@@ -531,7 +529,6 @@ class ContactAidedEstimator(BaseStateEstimator):
         input_ports:
         - measurements
         - attitude
-        - support
         - model
         output_ports:
         - posterior
@@ -563,14 +560,15 @@ class ContactAidedEstimator(BaseStateEstimator):
         self._config = tuple(float(value) for value in astuple(config))
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+        measured = self._measurements.Eval(context)
         _estimate_base_state(
             posterior,
             last,
             elapsed,
-            self._measurements.Eval(context),
+            measured,
             self._attitude.Eval(context),
             self._model.Eval(context),
-            self._support.Eval(context),
+            measured[self._support],
             self._pads.position,
             self._pads.foot,
             self._leg_places,

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import Demultiplexer
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
@@ -38,7 +38,7 @@ from fbse_drake.estimators.reference_methods import (
     TrueFrictionSource,
 )
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
-from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, SupportDetector
+from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal
 from fbse_drake.walking.plan import TaskPlan
@@ -68,7 +68,7 @@ EstimatorConfig = NoEstimator | Fbse | TrueFriction | TorqueSensor | Disturbance
 # Fields of the estimators' posteriors that a log keeps: system, field, channel.
 _CHANNELS = [
     ("sensor_monitor", "trust", "estimate/sensors/status"),
-    ("support", "support", "estimate/support"),
+    ("sensor_monitor", "support", "estimate/support"),
     ("attitude", "status", "estimate/attitude/status"),
     ("attitude", "orientation", "estimate/base/orientation"),
     ("attitude", "angular_velocity_bias", "estimate/imu/angular_velocity_bias"),
@@ -137,7 +137,7 @@ class EstimatorDiagram(Diagram):
             friction = self._add("friction", TorqueSensorEstimator(config, n, clock))
             self._feed(friction, "measured_torque", "torque_command")
         elif isinstance(config, FixedFriction):
-            self._add_monitor(SensorMonitorConfig(), robot, clock)
+            self._add_monitor(SensorMonitorConfig(), MeasuredSupport(), robot, clock)
             friction = self._add("friction", FixedFrictionModel(config, robot, self._parts("sensor_monitor"), clock))
             self._join(friction, measurements="sensor_monitor")
         elif isinstance(config, DisturbanceObserver):
@@ -158,7 +158,6 @@ class EstimatorDiagram(Diagram):
             JointAccelerationEstimator(config.joint_acceleration, robot, measurements, attitude, model, clock),
         )
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
-        self._connect_support(acceleration)
         self._connect_model_at_start(acceleration)
         link_torque = self._add(
             "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._parts("joint_acceleration"), clock)
@@ -169,7 +168,6 @@ class EstimatorDiagram(Diagram):
         kind = ModelAidedEstimator if isinstance(config.friction, ModelAided) else RecursiveLeastSquaresEstimator
         friction = self._add("friction", kind(config.friction, robot, measurements, self._parts("link_torque"), clock))
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
-        self._connect_support(friction)
         return friction
 
     def _add_momentum_observer(self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
@@ -182,10 +180,10 @@ class EstimatorDiagram(Diagram):
         return friction
 
     def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
-        """Sensor monitor, attitude, support, model and base state."""
+        """Sensor monitor with support, model, attitude and base state."""
         if not robot.has_floating_base or not robot.description.legs:
             raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
-        self._add_monitor(config.sensor_monitor, robot, clock)
+        self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._parts("sensor_monitor")
         model = self._add("model", FloatingBaseModel(robot, measurements, clock))
         self._join(model, measurements="sensor_monitor")
@@ -194,16 +192,10 @@ class EstimatorDiagram(Diagram):
             if plan is None:
                 raise InputError("estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)")
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
-            source = held_signal(support, float(plan.time[1] - plan.time[0]))
-            self._support = self._builder.AddNamedSystem("support", source).get_output_port()
-            self.channels["estimate/support"] = (len(sides),)
-        else:
-            detector = self._add("support", SupportDetector(config.support, robot, measurements, clock))
-            self._join(detector, measurements="sensor_monitor")
-            self._support = self._field_port("support", "support")
+            source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
+            self._builder.Connect(source.get_output_port(), self._systems["sensor_monitor"].GetInputPort("planned_support"))
         attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._parts("model"), clock))
         self._join(attitude, measurements="sensor_monitor", model="model")
-        self._connect_support(attitude)
         middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
         shared = (robot, measurements, self._parts("attitude"), self._parts("model"), clock, (float(middle[0]), float(middle[1])))
         base_state: BaseStateEstimator
@@ -213,11 +205,15 @@ class EstimatorDiagram(Diagram):
             base_state = ContactAidedEstimator(config.base_state, *shared)
         self._add("base_state", base_state)
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
-        self._connect_support(base_state)
 
-    def _add_monitor(self, config: SensorMonitorConfig, robot: Robot, clock: Clock) -> None:
-        monitor = self._add("sensor_monitor", SensorMonitor(config, robot, clock))
-        self._feed(monitor, "measured_joint_state", "measured_imu", "measured_pad_force")
+    def _add_monitor(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock) -> None:
+        monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
+        pad_force = monitor.fields.sizes["pad_force"]
+        sizes = {"measured_joint_state": 2 * len(robot.joint_names), "measured_imu": 6, "measured_pad_force": pad_force}
+        sensors = self._builder.AddNamedSystem("sensors", Multiplexer(list(sizes.values())))
+        self._builder.Connect(sensors.get_output_port(), monitor.GetInputPort("sensors"))
+        for i, port in enumerate(sizes):
+            self._builder.ExportInput(sensors.get_input_port(i), port)
 
     def _add(self, name: str, system: RecursiveEstimator) -> RecursiveEstimator:
         self._systems[name] = self._builder.AddNamedSystem(name, system)
@@ -233,9 +229,6 @@ class EstimatorDiagram(Diagram):
 
     def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
         self._builder.Connect(self._systems["model"].GetOutputPort("at_step_start"), system.GetInputPort("model_at_step_start"))
-
-    def _connect_support(self, system: System) -> None:
-        self._builder.Connect(self._support, system.GetInputPort("support"))
 
     def _feed(self, system: RecursiveEstimator, *ports: str) -> None:
         """Makes inputs of the diagram of a system's input ports."""
@@ -254,8 +247,6 @@ class EstimatorDiagram(Diagram):
 
     def _export(self, n: int) -> None:
         self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
-        if "estimate/support" in self.channels:
-            self._builder.ExportOutput(self._support, "estimate/support")
         for system, name, channel in _CHANNELS:
             if system in self._systems and name in self._systems[system].fields.sizes:
                 size = self._systems[system].fields.sizes[name]

@@ -49,8 +49,8 @@ def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: 
 @njit(cache=True)
 def _plant_state(
     state: np.ndarray, measured: np.ndarray, q_index: np.ndarray, v_index: np.ndarray, places: tuple[int, ...], R_BI: Rotation
-) -> None:
-    """Puts joint angles and velocities and the base's angular velocity into a plant's state, in place.
+) -> bool:
+    """Puts joint angles and velocities and the base's angular velocity into a plant's state, in place; says whether all are finite.
 
     Args:
         state: [positions, velocities] of the plant.
@@ -64,6 +64,7 @@ def _plant_state(
         state[v_index[i]] = w[i]
     for i in range(len(q_index)):
         state[q_index[i]], state[v_index[6 + i]] = measured[joint_position + i], measured[joint_velocity + i]
+    return np.isfinite(state).all()
 
 
 @njit(cache=True)
@@ -187,10 +188,9 @@ class FloatingBaseModel(RecursiveEstimator):
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
         plant, now, state, order = self._plant, self._plant_context, self._state, self._order
         measured = self._measurements.Eval(context)
-        if not math.isfinite(measured.dot(measured)):
+        if not _plant_state(state, measured, self._q_index, self._v_index, self._measured_places, self._R_BI):
             posterior.fill(math.nan)  # Drake would refuse it.
             return
-        _plant_state(state, measured, self._q_index, self._v_index, self._measured_places, self._R_BI)
         plant.SetPositionsAndVelocities(now, state)
         world, wrt = self._world, JacobianWrtVariable.kV
         feet = tuple(

@@ -5,6 +5,7 @@
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -86,7 +87,7 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 
 @dataclass(frozen=True)
 class FrictionRegressor:
-    """A joint torque effect as a regressor: basis (parameters, n) of a velocity (n,)."""
+    """A joint torque effect as a regressor: its basis torques, (n,) for each parameter, at a velocity (n,)."""
 
     effect: type[JointTorqueEffect]
     # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
@@ -103,9 +104,9 @@ class FrictionRegressor:
     def parameters(self) -> int:
         return self.initial.shape[1]
 
-    def __call__(self, velocity: np.ndarray) -> np.ndarray:
+    def __call__(self, velocity: np.ndarray) -> Sequence[np.ndarray]:
         basis, _ = self.effect.basis(JointMotion(velocity), self.nonlinear)
-        return np.array(basis)
+        return basis
 
 
 def recursive_least_squares(
@@ -136,13 +137,11 @@ class FrictionEstimator(RecursiveEstimator):
         input_ports:
         - measurements
         - link_torque
-        - support
         output_ports:
         - posterior
 
-    Inputs: posteriors of `SensorMonitor` and `LinkTorqueEstimator`, and a support estimate (feet,). Fields of the posterior: `friction`
-    (n,) [Nm], the estimate for the tick that ends now; `parameters` (n, m) and `covariance` (n, m, m) of the model; `innovation` and
-    `innovation_variance` (n,).
+    Inputs: posteriors of `SensorMonitor` and `LinkTorqueEstimator`. Fields of the posterior: `friction` (n,) [Nm], the estimate for the
+    tick that ends now; `parameters` (n, m) and `covariance` (n, m, m) of the model; `innovation` and `innovation_variance` (n,).
     """
 
     def __init__(
@@ -174,9 +173,8 @@ class FrictionEstimator(RecursiveEstimator):
         self._leg = leg_of_joint(robot)
         for name, parts in (("measurements", measurements), ("link_torque", link_torque)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
-        self.DeclareVectorInputPort("support", len(robot.description.sides))
-        names = ("measurements", "link_torque", "support")
-        self._measurements, self._link, self._support = (self.GetInputPort(name) for name in names)
+        names = ("measurements", "link_torque")
+        self._measurements, self._link = (self.GetInputPort(name) for name in names)
         self._declare_posterior(*names)
 
 
@@ -189,7 +187,6 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         input_ports:
         - measurements
         - link_torque
-        - support
         output_ports:
         - posterior
 
@@ -204,7 +201,8 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         self._config = config
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured, link_torque, support = self._measurements.Eval(context), self._link.Eval(context), self._support.Eval(context)
+        measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
+        support = measured[self._measured["support"]]
         config, fields, n, m = self._config, self.fields, self._n, self._m
         posterior[:] = last
         posterior[STATUS] = max(measured[self._measured["trust"]].tolist())
@@ -216,7 +214,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if age == math.inf or (config.reset_period and age >= config.reset_period * (1 - 1e-9)):
             P[:], age = config.covariance * np.eye(m), 0.0
         posterior[fields["age"]] = age
-        phi = self._regressor(measured[self._measured["joint_velocity"]]).T
+        phi = np.array(self._regressor(measured[self._measured["joint_velocity"]])).T
         valid = link_torque[self._link_torque["valid"]] > 0
         if config.swing == "model":
             valid &= support[self._leg] > 0
@@ -242,22 +240,22 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 @njit(cache=True)
 def smooth_velocity(
-    last: np.ndarray, measured: np.ndarray, elapsed: float, n: int, places: tuple[int, int, int], time_constant: float
-) -> np.ndarray:
-    """Low-pass of first order over joint velocities, shape (n,) [rad/s].
+    velocity: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, places: tuple[int, int, int], time_constant: float
+) -> None:
+    """Low-pass of first order over joint velocities.
 
     Args:
+        velocity: to be filled, shape (n,) [rad/s].
         last, measured: posteriors of `ModelAidedEstimator` a tick ago and of `SensorMonitor`.
         places: of what is read, see the first line.
         time_constant: of the low-pass [s], 0 does not smooth.
     """
     joint_velocity, smoothed, measured_last = places
-    keep, velocity = math.exp(-elapsed / time_constant) if time_constant > 0 else 0.0, np.empty(n)
-    for joint in range(n):
+    keep = math.exp(-elapsed / time_constant) if time_constant > 0 else 0.0
+    for joint in range(len(velocity)):
         # The joint's velocity over the tick is the mean of those at its ends.
         mean = 0.5 * (measured[joint_velocity + joint] + last[measured_last + joint])
         velocity[joint] = keep * last[smoothed + joint] + (1 - keep) * mean
-    return velocity
 
 
 @njit(cache=True)
@@ -268,29 +266,25 @@ def _estimate_friction(
     measured: np.ndarray,
     link_torque: np.ndarray,
     support: np.ndarray,
-    velocity: np.ndarray,
-    phi: np.ndarray,
+    phi: tuple[np.ndarray, ...],
     joint_leg: np.ndarray,
     places: tuple[int, ...],
     measures_swing: bool,
     walks: tuple[float, float],
 ) -> None:
-    """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint; fills the posterior.
+    """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint; fills the posterior but for its `velocity`.
 
     Args:
-        velocity: that the model sees, shape (n,) [rad/s].
-        phi: the model's regressors, shape (m, n).
+        phi: the model's regressors, m of shape (n,).
         joint_leg: which leg each joint belongs to, shape (n,).
         places: of what is read and written, see the first lines.
         measures_swing: whether the measurement counts while the leg swings.
         walks: random walks of disturbance and parameters, see `ModelAided`.
     """
     trust, joint_velocity, residual, torque_variance, impulse_variance, valid_at = places[:6]
-    friction, parameters, variances, covariance, innovations, innovation_variances, disturbance, impulse_at, smoothed, measured_at = places[
-        6:
-    ]
+    friction, parameters, variances, covariance, innovations, innovation_variances, disturbance, impulse_at, measured_at = places[6:]
     disturbance_walk, parameter_walk = walks
-    m, n = phi.shape
+    m, n = len(phi), len(joint_leg)
     size = m + 2
     regressor, x = np.ones(m + 1), np.empty(m + 1)
     posterior[STATUS] = measured[trust : trust + 2 + len(support)].max()
@@ -298,7 +292,7 @@ def _estimate_friction(
         valid = link_torque[valid_at + joint] > 0 and (measures_swing or support[joint_leg[joint]] > 0)
         # Parameters and disturbance, whose regressor is one.
         for k in range(m):
-            regressor[k], x[k] = phi[k, joint], last[parameters + joint * m + k]
+            regressor[k], x[k] = phi[k][joint], last[parameters + joint * m + k]
         x[m] = last[disturbance + joint]
         start = covariance + joint * size * size
         posterior[start : start + size * size] = last[start : start + size * size]
@@ -348,7 +342,7 @@ def _estimate_friction(
         posterior[friction + joint] = total
         posterior[disturbance + joint], posterior[impulse_at + joint] = x[m], impulse
         posterior[innovations + joint], posterior[innovation_variances + joint] = innovation if valid else 0.0, S
-        posterior[smoothed + joint], posterior[measured_at + joint] = velocity[joint], measured[joint_velocity + joint]
+        posterior[measured_at + joint] = measured[joint_velocity + joint]
 
 
 class ModelAidedEstimator(FrictionEstimator):
@@ -360,7 +354,6 @@ class ModelAidedEstimator(FrictionEstimator):
         input_ports:
         - measurements
         - link_torque
-        - support
         output_ports:
         - posterior
 
@@ -376,7 +369,9 @@ class ModelAidedEstimator(FrictionEstimator):
         self._config, self._measures_swing = config, config.swing == "measurement"
         self._velocity_places = (*starts(measurements, "joint_velocity"), *starts(self.fields.slices, "velocity", "last_velocity"))
         self._smoothing, self._walks = float(config.velocity_smoothing), (float(config.disturbance_walk), float(config.parameter_walk))
-        written = ("friction", "parameters", "parameter_variance", "covariance", "innovation", "innovation_variance", *further)
+        self._velocity = self.fields["velocity"]
+        model, innovation = ("parameters", "parameter_variance", "covariance"), ("innovation", "innovation_variance")
+        written = ("friction", *model, *innovation, "disturbance", "impulse", "last_velocity")
         self._places = (
             *starts(measurements, "trust", "joint_velocity"),
             *starts(link_torque, "residual", "torque_variance", "impulse_variance", "valid"),
@@ -384,11 +379,13 @@ class ModelAidedEstimator(FrictionEstimator):
         )
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured, link_torque, support = self._measurements.Eval(context), self._link.Eval(context), self._support.Eval(context)
+        measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
+        support = measured[self._measured["support"]]
         if math.isnan(elapsed):
             self._start(posterior, measured)
             return
-        velocity = smooth_velocity(last, measured, elapsed, self._n, self._velocity_places, self._smoothing)
+        velocity = posterior[self._velocity]
+        smooth_velocity(velocity, last, measured, elapsed, self._velocity_places, self._smoothing)
         _estimate_friction(
             posterior,
             last,
@@ -396,7 +393,6 @@ class ModelAidedEstimator(FrictionEstimator):
             measured,
             link_torque,
             support,
-            velocity,
             self._regressor(velocity),
             self._leg,
             self._places,

@@ -235,13 +235,12 @@ class JointAccelerationEstimator(RecursiveEstimator):
         input_ports:
         - measurements
         - attitude
-        - support
         - model_at_step_start
         output_ports:
         - posterior
 
-    Inputs: posteriors of `SensorMonitor` and `AttitudeEstimator`, a support estimate (feet,), and the terms of `FloatingBaseModel` where
-    the tick began. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `AttitudeEstimator`, and the terms of `FloatingBaseModel` where the tick began. Fields of the
+    posterior:
 
         base_angular_acceleration, base_specific_force   (3,)  in base axes [rad/s^2, m/s^2]
         joint_acceleration    (n,)  [rad/s^2]
@@ -297,14 +296,14 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._legs = [np.array([robot.joint_names.index(name) for name in joints]) for joints in legs]
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model_at_step_start", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
-        self.DeclareVectorInputPort("support", feet)
-        names = ("measurements", "attitude", "model_at_step_start", "support")
-        self._measurements, self._attitude, self._model, self._support = (self.GetInputPort(name) for name in names)
+        names = ("measurements", "attitude", "model_at_step_start")
+        self._measurements, self._attitude, self._model = (self.GetInputPort(name) for name in names)
+        self._support = measurements["support"]
         self._declare_posterior(*names)
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
-        model, support = self._model.Eval(context), self._support.Eval(context)
+        measured, attitude, model = self._measurements.Eval(context), self._attitude.Eval(context), self._model.Eval(context)
+        support = measured[self._support]
         if last.item(STATUS):
             elapsed = math.nan  # Velocities are differentiated: both ends of the tick must be trusted.
         if self._method != "fused":

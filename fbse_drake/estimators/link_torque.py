@@ -12,6 +12,8 @@ from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches, leg_of_join
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.robot.plant import Robot, grasp_map
 
+_NOT_FINITE = float(Status.NOT_FINITE)
+
 
 @dataclass(frozen=True)
 class LinkTorqueConfig:
@@ -53,6 +55,9 @@ def _estimate_link_torque(
         places: of what is read, see the first line.
         noise: standard deviations of accelerometer, gyro and joint velocities, see `LinkTorqueConfig`.
     """
+    if not np.isfinite(torque_command).all():
+        posterior[STATUS], posterior[STATUS + 1 :] = _NOT_FINITE, 0.0
+        return
     trust, pad_force, mass_matrix, bias, foot_jacobian, acceleration_at, known, sensitivity_at = places
     acceleration_noise, angular_velocity_noise, joint_velocity_noise = noise
     n, feet = len(torque_command), len(smallest_load)
@@ -149,21 +154,17 @@ class LinkTorqueEstimator(RecursiveEstimator):
         names = ("measurements", "model_at_step_start", "joint_acceleration")
         self._measurements, self._model, self._acceleration = (self.GetInputPort(name) for name in names)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self._last_command = self.DeclareDiscreteState(n)
+        self.DeclareDiscreteState(n)  # the last command
         self._declare_posterior(*names)
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
-        command = context.get_discrete_state(1).value()
-        if not math.isfinite(command.dot(command)):
-            posterior[STATUS], posterior[STATUS + 1 :] = Status.NOT_FINITE, 0.0
-            return
         _estimate_link_torque(
             posterior,
             elapsed,
             self._measurements.Eval(context),
             self._model.Eval(context),
             self._acceleration.Eval(context),
-            command,
+            context.get_discrete_state(1).value(),
             self._pads.position,
             self._pads.foot,
             self._wrench_variance,
@@ -175,4 +176,4 @@ class LinkTorqueEstimator(RecursiveEstimator):
 
     def _remember(self, context: Context, state: State) -> None:
         super()._remember(context, state)
-        state.get_mutable_discrete_state().set_value(self._last_command, self._torque_command.Eval(context))
+        state.get_mutable_discrete_state().set_value(1, self._torque_command.Eval(context))

@@ -133,4 +133,4 @@ class RecursiveEstimator(LeafSystem):
             posterior[0] = math.nan  # Nothing to start from yet.
 
     def _remember(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state().set_value(self._last, self._posterior.Eval(context))
+        state.get_mutable_discrete_state().set_value(0, self._posterior.Eval(context))

@@ -1,4 +1,4 @@
-"""Watches the raw sensors, so that the estimators behind it never see what is not a number, and know whom to trust."""
+"""Watches the raw sensors, so that the estimators behind it never see what is not a number, and know whom to trust and which feet stand."""
 
 import math
 from dataclasses import astuple, dataclass
@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, detect_support
 from fbse_drake.robot.plant import Robot
 
 _OK, _NOT_FINITE, _STUCK, _LOST = float(Status.OK), float(Status.NOT_FINITE), float(Status.STUCK), float(Status.LOST)
@@ -51,30 +52,32 @@ def _watch_sensors(
     posterior: np.ndarray,
     last: np.ndarray,
     elapsed: float,
-    joint_state: np.ndarray,
-    imu: np.ndarray,
-    pad_force: np.ndarray,
+    sensors: np.ndarray,
+    joints: int,
     channel_sensor: np.ndarray,
     pad_foot: np.ndarray,
-    sensors: int,
+    feet: int,
     weighed_mass: float,
     config: tuple[float, float, float],
+    support_thresholds: tuple[float, float, float],
 ) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
+        sensors: their readings, see `SensorMonitor`.
         channel_sensor: which sensor each channel belongs to, shape (channels,).
         weighed_mass: that the feet carry [kg]; 0 where they need not.
         config: the values of `SensorMonitorConfig`.
+        support_thresholds: see `detect_support`.
     """
     stuck_after, smallest_load_share, lost_after = config
     first, channels = math.isnan(elapsed), len(channel_sensor)
-    n = len(joint_state) // 2
-    start = STATUS + 1 + sensors
-    trust, reading, unchanged = posterior[STATUS + 1 : start], posterior[start : start + channels], posterior[start + channels : -1]
-    last_reading, last_unchanged = last[start : start + channels], last[start + channels : -1]
+    n, start = joints, STATUS + 3 + feet
+    light_at = start + 2 * channels
+    trust, reading, unchanged = posterior[STATUS + 1 : start], posterior[start : start + channels], posterior[start + channels : light_at]
+    last_reading, last_unchanged = last[start : start + channels], last[start + channels : light_at]
     trust[:] = _OK
-    reading[: 2 * n], reading[2 * n : 2 * n + 6], reading[2 * n + 6 :] = joint_state, imu, pad_force
+    reading[:] = sensors
     for i in range(channels):
         if not math.isfinite(reading[i]):
             reading[i], trust[channel_sensor[i]] = last_reading[i], _NOT_FINITE
@@ -84,52 +87,62 @@ def _watch_sensors(
         # Joint angles may repeat themselves; without load a sensor without noise may rest at zero.
         if unchanged[i] > stuck_after and i >= n and reading[i] != 0 and trust[channel_sensor[i]] == _OK:
             trust[channel_sensor[i]] = _STUCK
-    light = 0.0
+    light, load = 0.0, vertical_loads(reading[2 * n + 6 :], pad_foot, feet)
     if weighed_mass > 0 and not first:
         # What the feet must carry together: mass times specific force, or gravity where the IMU says nothing.
         fx, fy, fz = reading[2 * n], reading[2 * n + 1], reading[2 * n + 2]
         weight = weighed_mass * max(5.0, math.sqrt(fx * fx + fy * fy + fz * fz))
-        load = vertical_loads(reading[2 * n + 6 :], pad_foot, sensors - 2)
         if load.sum() < smallest_load_share * weight:
-            light = last[-1] + elapsed
+            light = last[light_at] + elapsed
         if light > lost_after:
-            for foot in range(sensors - 2):
+            for foot in range(feet):
                 if trust[2 + foot] == _OK and load[foot] < 0.02 * weight:
                     trust[2 + foot] = _LOST
-    posterior[-1] = light
+    posterior[light_at] = light
     posterior[STATUS] = trust.max()
+    support, waiting = light_at + 1, light_at + 1 + feet
+    detect_support(
+        posterior[support:waiting], posterior[waiting:], last[support:waiting], last[waiting:], elapsed, load, trust[2:], support_thresholds
+    )
 
 
 class SensorMonitor(RecursiveEstimator):
-    """Passes the sensors' readings on, the last good one where there is none now, with a status for each sensor.
+    """Passes the sensors' readings on, the last good one where there is none now, with a status for each sensor; says which feet stand.
 
     .. pydrake_system::
 
         name: SensorMonitor
         input_ports:
-        - measured_joint_state
-        - measured_imu
-        - measured_pad_force
+        - sensors
+        - planned_support
         output_ports:
         - posterior
 
-    Fields of the posterior: see `measurement_fields`, and `unchanged`, the time [s] for which each channel has repeated itself.
+    `sensors` holds what is read, side by side in the order of `measurement_fields`, without `trust`. `planned_support` (feet,) is there
+    for `PlannedSupport` only; a foot stands where it is positive. Fields of the posterior: see `measurement_fields`; `unchanged`, the
+    time [s] for which each channel has repeated itself; `light`, for how long [s] the feet have shown too little; `support` (feet,), 1
+    for a foot that stands, else 0; `waiting` (feet,), see `detect_support`.
     """
 
-    def __init__(self, config: SensorMonitorConfig, robot: Robot, clock: Clock):
+    def __init__(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock):
         readings = measurement_fields(robot)
         channels = sum(readings.values()) - readings["trust"]
-        super().__init__({"status": 1, **readings, "unchanged": channels, "light": 1}, clock)
         n, legs = len(robot.joint_names), robot.description.legs
-        self._joint_state = self.DeclareVectorInputPort("measured_joint_state", 2 * n)
-        self._imu = self.DeclareVectorInputPort("measured_imu", 6)
-        self._pads = self.DeclareVectorInputPort("measured_pad_force", readings["pad_force"])
-        self._declare_posterior("measured_joint_state", "measured_imu", "measured_pad_force")
+        feet = len(legs)
+        super().__init__({"status": 1, **readings, "unchanged": channels, "light": 1, "support": feet, "waiting": feet}, clock)
+        self._joints, self._feet = n, feet
+        self._sensors = self.DeclareVectorInputPort("sensors", channels)
+        self._planned = self.DeclareVectorInputPort("planned_support", feet) if isinstance(support, PlannedSupport) else None
+        self._declare_posterior(*(self.get_input_port(i).get_name() for i in range(self.num_input_ports())))
         self._pad_foot = FootPads(robot).foot
         self._channel_sensor = np.concatenate([np.zeros(2 * n, dtype=int), np.ones(6, dtype=int), np.repeat(2 + self._pad_foot, 3)])
-        self._sensors = readings["trust"]
         checks_load = bool(legs) and robot.has_floating_base
-        self._weighed_mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext()) if checks_load else 0.0
+        mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+        self._weighed_mass = mass if checks_load else 0.0
+        measured = support if isinstance(support, MeasuredSupport) else MeasuredSupport()
+        weight = 9.81 * mass
+        self._thresholds = (measured.on * weight, measured.off * weight, float(measured.debounce))
+        self._support = self.fields["support"]
         self._config = tuple(float(value) for value in astuple(config))
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
@@ -137,12 +150,14 @@ class SensorMonitor(RecursiveEstimator):
             posterior,
             last,
             elapsed,
-            self._joint_state.Eval(context),
-            self._imu.Eval(context),
-            self._pads.Eval(context),
+            self._sensors.Eval(context),
+            self._joints,
             self._channel_sensor,
             self._pad_foot,
-            self._sensors,
+            self._feet,
             self._weighed_mass,
             self._config,
+            self._thresholds,
         )
+        if self._planned is not None:
+            posterior[self._support] = self._planned.Eval(context) > 0

@@ -5,12 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_not_negative
-from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
-from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
-from fbse_drake.robot.plant import Robot
 
 
 @dataclass(frozen=True)
@@ -38,62 +34,34 @@ SupportConfig = PlannedSupport | MeasuredSupport
 
 
 @njit(cache=True)
-def _detect_support(
-    posterior: np.ndarray,
-    last: np.ndarray,
+def detect_support(
+    support: np.ndarray,
+    waiting: np.ndarray,
+    last_support: np.ndarray,
+    last_waiting: np.ndarray,
     elapsed: float,
-    measured: np.ndarray,
-    pad_foot: np.ndarray,
-    places: tuple[int, int],
+    load: np.ndarray,
+    trust: np.ndarray,
     thresholds: tuple[float, float, float],
 ) -> None:
-    """One tick of `SupportDetector`; fills the posterior.
+    """One tick of `MeasuredSupport`; all arrays have shape (feet,). A foot whose sensors are not trusted stays what it was.
 
     Args:
-        places: of what is read, see the first line.
+        support: filled with 1 for a foot that stands, else 0.
+        waiting: filled with how long each load has been beyond its threshold [s].
+        last_support, last_waiting: the same of the last tick.
+        elapsed: time since then [s], NaN at the first tick.
+        load: vertical force on each foot [N].
+        trust: status of each foot's sensors, 0 for trusted ones.
         thresholds: loads that begin and end a stance [N], and the debounce [s].
     """
-    trust, pad_force = places
     on, off, debounce = thresholds
-    feet = (len(posterior) - STATUS - 1) // 2
-    load = vertical_loads(measured[pad_force:], pad_foot, feet)
-    posterior[STATUS] = measured[trust + 2 : trust + 2 + feet].max()
-    for foot in range(feet):
-        support, waiting = STATUS + 1 + foot, STATUS + 1 + feet + foot
+    for foot in range(len(support)):
         if math.isnan(elapsed):
-            posterior[support], posterior[waiting] = 1.0 if load[foot] > on else 0.0, 0.0
+            support[foot], waiting[foot] = 1.0 if load[foot] > on else 0.0, 0.0
             continue
-        posterior[support] = last[support]
-        beyond = load[foot] < off if last[support] > 0 else load[foot] > on
-        posterior[waiting] = last[waiting] + elapsed if beyond and measured[trust + 2 + foot] == 0 else 0.0
-        if posterior[waiting] > debounce:
-            posterior[support], posterior[waiting] = 1.0 - last[support], 0.0
-
-
-class SupportDetector(RecursiveEstimator):
-    """Which feet stand, from their vertical load.
-
-    .. pydrake_system::
-
-        name: SupportDetector
-        input_ports:
-        - measurements
-        output_ports:
-        - posterior
-
-    `measurements` is the posterior of a `SensorMonitor`. Fields: `support` (feet,), 1 for a foot that stands, else 0; `waiting` (feet,),
-    for how long [s] each load has been beyond its threshold. A foot whose sensors are not trusted stays what it was.
-    """
-
-    def __init__(self, config: MeasuredSupport, robot: Robot, measurements: dict[str, slice], clock: Clock):
-        feet = len(robot.description.sides)
-        super().__init__({"status": 1, "support": feet, "waiting": feet}, clock)
-        weight = 9.81 * robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-        self._thresholds = (config.on * weight, config.off * weight, float(config.debounce))
-        self._pad_foot, self._places = FootPads(robot).foot, starts(measurements, "trust", "pad_force")
-        self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
-        self._declare_posterior("measurements")
-
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured = self._measurements.Eval(context)
-        _detect_support(posterior, last, elapsed, measured, self._pad_foot, self._places, self._thresholds)
+        support[foot] = last_support[foot]
+        beyond = load[foot] < off if last_support[foot] > 0 else load[foot] > on
+        waiting[foot] = last_waiting[foot] + elapsed if beyond and trust[foot] == 0 else 0.0
+        if waiting[foot] > debounce:
+            support[foot], waiting[foot] = 1.0 - last_support[foot], 0.0

@@ -81,7 +81,7 @@ class PadForces(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         reactions = self._reaction_forces.Eval(context)
         # A joint's reaction acts on the pad, against the ground's force.
-        output.SetFromVector(-np.array([reactions[joint].translational() for joint in self._joints]).ravel())
+        output.SetFromVector(-np.concatenate([reactions[joint].translational() for joint in self._joints]))
 
 
 class FootForceSensors(Diagram):
