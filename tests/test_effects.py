@@ -85,6 +85,22 @@ def test_implicit_step_solves_its_equation(effect: JointTorqueEffect):
         assert torque[0] * exact >= 0
 
 
+@pytest.mark.parametrize("start", [-0.5, 0.0, 0.03, 2.0])
+def test_friction_that_falls_too_steeply_for_the_step_is_solved_all_the_same(start: float):
+    """Stribeck friction whose slope times the mobility is below -1: the left side rises, falls and rises again."""
+    law = resolved(StribeckFriction(gamma1={"all": 4.2}, gamma2={"all": 131.0}, gamma3={"all": 6.5}, gamma4={"all": 5.0}), 1)
+    mobility = np.full(1, 0.25)
+    velocities = np.linspace(0.0, 0.3, 3000)
+    slopes = law.torque_and_slope(JointMotion(velocities[:, None]))[1]
+    assert 1 + mobility[0] * slopes.min() < -2
+    for free in np.linspace(-3.0, 3.0, 61):
+        solution = solve_implicit_step(lambda v: law.torque_and_slope(JointMotion(v)), np.full(1, free), mobility, np.full(1, start))
+        torque, slope = law.torque_and_slope(JointMotion(solution.velocity))
+        # To the first order that the last step of Newton's method leaves.
+        assert abs(solution.velocity + mobility * torque - free) < 1e-3 * (1 + mobility * abs(slope))
+        assert solution.torque == pytest.approx(torque, abs=0.05)
+
+
 class Flywheel:
     """A wheel on a revolute joint with an effect, a commanded torque, and nothing else."""
 

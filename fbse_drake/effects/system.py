@@ -14,6 +14,8 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 # Newton's method stops at a step of this size [rad/s]; its last step is still taken. A plant step changes velocities by far more.
 _LAST_STEP = 3e-4
 _MAX_ITERATIONS = 60
+# The left side's derivative is taken to be at least this.
+_LEAST_GROWTH = 0.05
 # Rows of the state before those of the effects' memories, see `JointTorqueEffects`.
 _POSITION, _VELOCITY, _COMMAND, _TORQUE, _FREE, _END, _GAIN, _ROWS = range(8)
 
@@ -37,9 +39,9 @@ def solve_implicit_step(
     """Solves v + mobility * u(v) = free_velocity, for each joint by itself.
 
     This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
-    `mobility` the step over the joint's inertia. The left side must grow with v, which friction does unless its negative
-    (Stribeck) slope times the mobility exceeds 1. Newton's method; where it leaves the bracket seen so far or its steps do not halve,
-    bisection.
+    `mobility` the step over the joint's inertia. The left side grows with v, unless a negative (Stribeck) slope times the mobility exceeds
+    1; then there may be several solutions, and it is one of them. Newton's method; where it leaves the bracket seen so far or its steps do
+    not halve, bisection.
 
     Args:
         torque_and_slope: u(v) [Nm] and its derivative [Nm s/rad], each (n,), for v (n,).
@@ -52,9 +54,6 @@ def solve_implicit_step(
         torque, slope = torque_and_slope(v)
         if _newton_step(work, torque, slope, free_velocity, mobility):
             break
-    else:
-        # Where the slope is too negative there may be no end: the last step counts twice.
-        v -= work[5]
     return ImplicitStep(v, work[1], work[2])
 
 
@@ -66,7 +65,8 @@ def _newton_step(work: np.ndarray, torque: np.ndarray, slope: np.ndarray, free_v
         work: rows of (n,): the three of `ImplicitStep`, lower and upper end of the bracket, last step.
     """
     v, end_torque, gain, low, high, last_step = work[0], work[1], work[2], work[3], work[4], work[5]
-    gain[:] = 1.0 / (1.0 + mobility * slope)
+    # Where the left side falls, Newton's step would lead away from the solution.
+    gain[:] = 1.0 / np.maximum(1.0 + mobility * slope, _LEAST_GROWTH)
     excess = v + mobility * torque - free_velocity
     step = excess * gain
     end_torque[:] = torque - slope * step
