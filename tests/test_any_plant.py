@@ -8,14 +8,16 @@ import pytest
 import yaml
 
 from fbse_drake import InputError, Log, Scenario, simulate
+from fbse_drake.control.compensation import FeedforwardCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.compare import compare
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.discrepancy.study import model_error, train_and_rest
-from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
+from fbse_drake.estimators.reference_methods import FixedFriction
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
@@ -141,6 +143,19 @@ def test_a_crooked_sensor_of_a_machine_without_feet_is_simulated(folder: Path):
     scenario = dataclasses.replace(crane(folder, crooked=EncoderOffset({"swing": 0.05})), duration=0.5)
     log = simulate(scenario).log
     np.testing.assert_allclose(log["joint/position"][:, 0] - log["truth/joint/position"][:, 0], 0.05, atol=1e-9)
+
+
+def test_friction_that_is_known_is_fed_forward_in_a_machine_without_feet(folder: Path):
+    law = CoulombViscousFriction(coulomb={"slide": 7.0, "swing": 0.0}, viscous={"slide": 5.0, "swing": 1.5}, transition={"all": 0.01})
+    scenario = dataclasses.replace(crane(folder, friction=law), duration=3.0, estimator=FixedFriction(law))
+    fed = dataclasses.replace(scenario, compensation=FeedforwardCompensation())
+    alone, compensated = (simulate(one).log for one in (scenario, fed))
+    moving = np.abs(alone["joint/velocity"][:-1]).min(axis=1) > 0.05
+    np.testing.assert_allclose(
+        alone["estimate/joint/friction_torque"][1:][moving], alone["truth/joint/friction_torque"][:-1][moving], rtol=0.05
+    )
+    left = [np.sqrt(np.mean((log["reference/joint/position"] - log["truth/joint/position"]) ** 2)) for log in (alone, compensated)]
+    assert left[1] < 0.3 * left[0]
 
 
 def test_nothing_is_found_where_nothing_is_hidden(folder: Path):

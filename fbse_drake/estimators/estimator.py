@@ -237,19 +237,19 @@ class EstimatorDiagram(Diagram):
 
     def _field_port(self, system: str, name: str) -> OutputPort:
         """The output port of one field of a posterior."""
+        # A machine without feet has no field for them.
+        sizes = {field: size for field, size in self._systems[system].fields.sizes.items() if size > 0}
         if system not in self._split:
-            fields = self._systems[system].fields
-            split = self._builder.AddNamedSystem(f"{system}_fields", Demultiplexer(list(fields.sizes.values())))
+            split = self._builder.AddNamedSystem(f"{system}_fields", Demultiplexer(list(sizes.values())))
             self._builder.Connect(self._systems[system].GetOutputPort("posterior"), split.get_input_port())
             self._split[system] = split
-        split = self._split[system]
-        return split.get_output_port(list(self._systems[system].fields.sizes).index(name))
+        return self._split[system].get_output_port(list(sizes).index(name))
 
     def _export(self, n: int) -> None:
         self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
         for system, name, channel in _CHANNELS:
-            if system in self._systems and name in self._systems[system].fields.sizes:
-                size = self._systems[system].fields.sizes[name]
+            size = self._systems[system].fields.sizes.get(name, 0) if system in self._systems else 0
+            if size > 0:
                 self._builder.ExportOutput(self._field_port(system, name), channel)
                 per_joint = name in ("parameters", "parameter_variance")
                 self.channels[channel] = (n, size // n) if per_joint else () if name == "status" else (size,)
