@@ -220,7 +220,8 @@ class ThermalDrift(JointTorqueEffect):
     experiment: ClassVar[str] = "Repeat one motion from a cold start for longer than the warm-up takes."
     parameters: ClassVar[dict[str, Parameter]] = {
         "change": Parameter("Nm", linear=True, plausible=(-20.0, 20.0), bounds=(-np.inf, np.inf)),
-        "warm_up": Parameter("s", linear=False, plausible=(1.0, 1000.0), bounds=(1e-9, np.inf), grid=5),
+        # Much faster, and it would be Coulomb friction by another name.
+        "warm_up": Parameter("s", linear=False, plausible=(3.0, 1000.0), bounds=(1e-9, np.inf), grid=5),
         "transition": _TRANSITION,
     }
 
