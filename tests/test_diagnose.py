@@ -192,6 +192,12 @@ def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
     assert all(f.parameters["offset"].value == pytest.approx(0.007, rel=0.02) for f in diagnosis.chosen)
 
 
+def test_no_body_loses_more_than_it_weighs() -> None:
+    predictor, mass = Predictor(scenario(), log_with("")), library()["BodyMass"]
+    foot = predictor.robot.body("left_foot").default_mass()
+    assert [predictor.is_possible(mass, "left_foot", np.array([share * foot])) for share in (-1.1, -0.9, 5.0)] == [False, True, True]
+
+
 def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
     hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
     result = study(scenario(), log_with(hidden), effects())

@@ -25,7 +25,7 @@ from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedJointTorque, basis_over_time
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
-from fbse_drake.errors import located
+from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.sensors.foot_force import force_noise
@@ -264,6 +264,18 @@ class Predictor:
             unit = _probe(effect, name)
             columns[:, :, k] = self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True) / unit
         return replace(clean, values=columns[:, clean.rows] - clean.values)
+
+    def is_possible(self, effect: type[Effect], target: str, linear: np.ndarray) -> bool:
+        """Can a robot have an effect with these values? Not every inertia is that of a body."""
+        if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
+            return True
+        change = effect.from_values([target], {name: [value] for name, value in zip(effect.parameters, linear, strict=True)})
+        believed = self.scenario.believed
+        try:
+            build_robot(replace(believed, effects={**believed.effects, "_change": change}))
+        except InputError:
+            return False
+        return True
 
     def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
         """What an inertia effect adds to the residual, (B, R)."""

@@ -275,7 +275,7 @@ class Search:
     def best_additions(self, base: Explanation, rows: np.ndarray | None = None) -> list[Explanation]:
         """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
 
-        Sensors of both legs may be wrong together, and one alone look like something else: `_pairs` are tried too.
+        Joints of both legs may be wrong together, and one alone look like something else: `_pairs` are tried too.
 
         Args:
             rows: only candidates that change one of these; by default all.
@@ -292,9 +292,8 @@ class Search:
         return sorted(found, key=lambda e: e.deviance)
 
     def _pairs(self, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-        """Candidates that are no joint torque effects, each with its like on the other legs; with values of their own."""
-        description = self.predictor.robot.description
-        alike = [*dict.fromkeys(map(description.counterparts, self._joints)), tuple(description.sides)]
+        """Candidates in joints that are no joint torque effects, each with its like on the other legs; with values of their own."""
+        alike = dict.fromkeys(map(self.predictor.robot.description.counterparts, self._joints))
         found = {(c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)}
         result = []
         for effect in dict.fromkeys(c.effect for c in candidates):
@@ -335,7 +334,7 @@ class Search:
             widest = _IMPLAUSIBLE * max(abs(bound) for bound in plausible)
             if value < low or value > high + 3 * deviation or abs(value) > widest + 3 * deviation:
                 return False
-        return True
+        return self.predictor.is_possible(added.effect, added.targets[0], values)
 
     def _promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over."""
