@@ -11,6 +11,7 @@ from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
 from fbse_drake.discrepancy.experiment import planned_log
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.rollout import rollout
 from fbse_drake.discrepancy.search import Search
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.effect import Effect, library
@@ -190,6 +191,15 @@ def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
     assert diagnosis.verdict == "effect_found"
     assert sorted((f.effect, *f.targets) for f in diagnosis.chosen) == [("EncoderOffset", f"{side}_hip_roll") for side in ("left", "right")]
     assert all(f.parameters["offset"].value == pytest.approx(0.007, rel=0.02) for f in diagnosis.chosen)
+
+
+def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
+    """Planned anew with the mass that was found, it would walk otherwise than the robot did."""
+    clean, log = scenario(), log_with("!BodyMass {mass: {trunk: 2.0}}")
+    heavier = replace(clean, model=replace(clean.model, effects={**clean.model.effects, "found": library()["BodyMass"]({"trunk": 2.0})}))
+    before, after = (rollout(model, log, planned_with=clean.believed) for model in (clean, heavier))
+    assert after.mean_position < 0.1 * before.mean_position
+    assert after.mean_torque_command < 0.1 * before.mean_torque_command
 
 
 def test_no_body_loses_more_than_it_weighs() -> None:

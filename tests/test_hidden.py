@@ -100,6 +100,14 @@ def test_every_effect_is_drawn_with_values_that_it_accepts(name: str, walk: Scen
         assert acts.tolist() == np.isin(names.joint_names, hidden.targets).tolist()
 
 
+def test_a_rough_spot_has_a_width_in_a_joint_that_stands_still(walk: Scenario):
+    names, _ = load_description("biped")
+    drawn = [draw(walk, seed, what="RoughSpot").effects[0] for seed in range(40)]
+    assert any("left_hip_yaw" in hidden.targets for hidden in drawn)
+    for hidden in drawn:
+        hidden.make().resolve(names)
+
+
 @pytest.mark.parametrize("name", ["CoulombFriction", "GroundSlope", "Backlash"])
 def test_sizes_are_thirds_and_shrinking_scales_them(name: str, walk: Scenario):
     sizes = [draw(walk, 3, what=name, size=size).effects[0] for size in SIZES]

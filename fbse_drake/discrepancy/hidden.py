@@ -148,7 +148,8 @@ _RECIPES = {
         lambda draw, size: {
             "coulomb": size,
             "angle": float(np.quantile(draw.position, draw.uniform(0.2, 0.8))),
-            "width": 0.15 * float(np.ptp(draw.position)),
+            # A joint that stands still in the plan trembles.
+            "width": max(1e-3, 0.15 * float(np.ptp(draw.position))),
         },
     ),
 }

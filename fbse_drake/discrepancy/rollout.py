@@ -19,7 +19,7 @@ from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
-from fbse_drake.scenario import Scenario, build_robot
+from fbse_drake.scenario import RobotConfig, Scenario, build_robot
 from fbse_drake.simulate import simulate
 from fbse_drake.walking.reference import Recorded
 
@@ -58,12 +58,18 @@ class RolloutError:
         return float(np.sqrt(np.mean(np.square(list(self.torque_command.values())))))
 
 
-def rollout(scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None) -> RolloutError | None:
+def rollout(
+    scenario: Scenario, log: Log, *, planned_with: RobotConfig | None = None, progress: Callable[[float], None] | None = None
+) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
     Reference and controller are the scenario's; sensor noise is drawn anew. A `!Recorded` reference is that of the log: the model starts
     where each stretch of the log starts, and its position loop gets what the robot's got. Played open loop, a recorded torque would say
     little: its errors add up, and what is not stable in itself falls.
+
+    Args:
+        planned_with: the model that reference and feed-forward were planned with when the log was made, which did not know what has been
+            added since; by default the scenario's.
 
     Returns:
         None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
@@ -74,7 +80,10 @@ def rollout(scenario: Scenario, log: Log, *, progress: Callable[[float], None] |
     if isinstance(scenario.reference, Recorded):
         return _recorded_rollout(scenario, scenario.reference, log, progress) if "reference/joint/position" in log else None
     duration = min(scenario.duration, float(log.time[-1]))
-    believed = replace(scenario, robot=scenario.believed, estimator=NoEstimator(), seed=scenario.seed + 1, duration=duration)
+    planned_with = planned_with or scenario.believed
+    believed = replace(
+        scenario, robot=scenario.believed, model=planned_with, estimator=NoEstimator(), seed=scenario.seed + 1, duration=duration
+    )
     result = simulate(believed, progress=progress)
     simulated = result.log
     rows = np.searchsorted(simulated.time, log.time - 1e-9)

@@ -121,14 +121,14 @@ def study(
         rolled, test_rolled = None, {}
         if rollouts:
             say("simulating the model against the log")
-            rolled = rollout(scenario, log)
+            rolled = rollout(scenario, log, planned_with=planned_with)
             if isinstance(scenario.reference, Recorded):
                 candidates = ((name, rollout(scenario, other)) for name, other in (tests or {}).items())
                 test_rolled = {name: error for name, error in candidates if error is not None}
         return StudyStep(tuple(added), held_out_rmse, train_rmse, rolled, errors, test_rolled)
 
     effects = None if effects is None else list(effects)
-    predictor = Predictor(scenario, log)
+    predictor, planned_with = Predictor(scenario, log), scenario.believed
     while len(diagnoses) < _MOST_ROUNDS:
         say(f"round {len(diagnoses) + 1}")
         diagnosis = diagnose(predictor, effects, progress=progress)
