@@ -34,7 +34,7 @@ bench: $(INSTALLED)
 fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.fbse
 
-# How well missing physics is found: some 400 logs, hours on two cores; goes on where it was stopped. By hand: --quick, --only NAME.
+# How well missing physics is found: some 430 logs, an hour and a half on two cores; goes on where it was stopped. By hand: --quick, --only NAME.
 hidden: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.hidden
 
