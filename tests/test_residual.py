@@ -85,6 +85,13 @@ def test_gaps_are_left_out_and_touch_nothing_else(walk: tuple[Scenario, Log]) ->
     np.testing.assert_allclose(torn.value[others, :18], whole.value[others, :18], atol=1e-9)
 
 
+def test_a_long_log_is_computed_piece_by_piece(walk: tuple[Scenario, Log], monkeypatch: pytest.MonkeyPatch) -> None:
+    motion = Predictor(*walk).motion
+    whole = motion.equation.residual(motion.steps)
+    monkeypatch.setattr("fbse_drake.discrepancy.residual._MOST_INSTANTS", 700)
+    np.testing.assert_array_equal(motion.equation.residual(motion.steps), whole)
+
+
 def test_whitening_makes_differenced_noise_white() -> None:
     rng = np.random.default_rng(1)
     blocks, white, differenced = 4000, 0.3, 2.0

@@ -40,8 +40,9 @@ _STANDING_PAD = 0.01
 # Soles settle for this long at the start of a log [s].
 _SETTLING = 0.1
 _AXES = ("x", "y", "z")
-# Results that the equation of motion keeps of each of its functions.
+# Results that the equation of motion keeps of each of its functions, and instants that are computed at once: Jacobians take room.
 _REMEMBERED = 3
+_MOST_INSTANTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -291,6 +292,10 @@ class EquationOfMotion:
         Args:
             kinematic: are the kinematic rows wanted? Else they are left out.
         """
+        if len(at.joint_position) > _MOST_INSTANTS:
+            parts = [slice(start, start + _MOST_INSTANTS) for start in range(0, len(at.joint_position), _MOST_INSTANTS)]
+            pieces = [Instants(**{name: values[part] for name, values in vars(at).items()}) for part in parts]
+            return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
         generalized = self._inverse_dynamics(states, accelerations)
         rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
