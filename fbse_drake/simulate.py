@@ -1,8 +1,11 @@
 """Runs a scenario and records it."""
 
 import math
+import signal
+import threading
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +65,34 @@ def simulate(
     Raises:
         InputError: see `build_station`.
     """
+    with _postponed_interruption() as interrupted:
+        return _simulate(scenario, name, meshcat, progress, interrupted)
+
+
+@contextmanager
+def _postponed_interruption() -> Iterator[threading.Event]:
+    """Tells of a Ctrl-C instead of raising it, for the run looks at it often enough: inside a callback of a compiler it would be lost.
+    A second one is raised. In other threads than the main one, which get none, nothing changes."""
+    interrupted = threading.Event()
+
+    def interrupt(number: int, frame: object) -> None:
+        if interrupted.is_set():
+            signal.default_int_handler(number, frame)
+        interrupted.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _simulate(
+    scenario: Scenario, name: str, meshcat: Meshcat | None, progress: Callable[[float], None] | None, interrupted: threading.Event
+) -> SimulationResult:
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
     # One sink for all signals: every sink has an event of its own, which costs more than its data.
@@ -91,6 +122,8 @@ def simulate(
                 break
             if progress is not None:
                 progress(context.get_time())
+            if interrupted.is_set():
+                raise KeyboardInterrupt
     except KeyboardInterrupt:
         failure = "interrupted"
     except RuntimeError as error:

@@ -107,10 +107,7 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, capsys: pyte
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
-    # An interruption while a kernel is being compiled can be lost: here they are, and are kept.
-    assert main(["simulate", "squat", "--set", "duration=0.05", "--out", str(tmp_path / "short"), "--quiet"]) == DONE
     command = [sys.executable, "-m", "fbse_drake", "simulate", "squat", "--set", "duration=20", "--set", "plant.time_step=1e-4"]
     process = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, env={**os.environ})
     # An interruption while modules are being loaded can be lost in one of them; the folder is made when all are there.
