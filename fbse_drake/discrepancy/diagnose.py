@@ -130,9 +130,10 @@ def diagnose(
     before = search.white.sse
     path = select(search, say)
     final, inertia = search.consistent(path[-1])
-    path[-1] = final
     say("looking at what is left")
-    unexplained = leftover_structure(search, final)
+    path[-1], remaining, left = search.added(final)
+    final = path[-1]
+    unexplained = leftover_structure(predictor.motion, remaining, left)
     say("finding what would have been seen")
     rivals = _rivals(search, final)
     experiments = Experiments(predictor.scenario, suspected_bodies(predictor))
@@ -173,6 +174,8 @@ def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[
         if chosen.deviance > base.deviance - MARGIN:
             break
         path.append(search.polished(search.doubting(chosen)))
+    if search.inertia is None:
+        path[-1] = _pruned(search, path[-1])
     return path
 
 

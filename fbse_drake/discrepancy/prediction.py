@@ -49,7 +49,7 @@ class Predictor:
         Raises:
             InputError: a log that does not fit the model.
         """
-        self.scenario = scenario
+        self.scenario, self.log = scenario, log
         with located("model: "):
             self.robot = build_robot(scenario.believed)
         names = self.robot.description

@@ -21,6 +21,7 @@ from itertools import pairwise
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake.effects.sensor import SensorSignals
@@ -37,8 +38,9 @@ _ORDER, _PADDING = 4, 100
 # A sole stands still while it carries more than this share of the weight, and each of its pads this one.
 _STANDING = 0.15
 _STANDING_PAD = 0.01
-# Soles settle for this long at the start of a log [s].
-_SETTLING = 0.1
+# Soles settle for this long at the start of a log [s]. A foot that has just touched down, or is about to lift, may still roll over an edge:
+# its sole is not at rest in this time [s].
+_SETTLING, _ROLLING = 0.1, 0.03
 _AXES = ("x", "y", "z")
 # Results that the equation of motion keeps of each of its functions, and instants that are computed at once: Jacobians take room.
 _REMEMBERED = 3
@@ -542,9 +544,11 @@ class RecordedMotion:
         known[:, : len(least)] &= block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
         kinematic = np.array([row.kind == "kinematic" for row in rows])
         known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
+        around = 2 * round(_ROLLING / (self.length * self.period)) + 1
+        at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
         for foot, side in enumerate(self.robot.description.sides):
-            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= self.standing[:, foot, None]
-        known[:, [row.name.startswith("soles/") for row in rows]] &= self.standing.all(axis=1)[:, None]
+            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= at_rest[:, foot, None]
+        known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
         return known
 
     @cached_property

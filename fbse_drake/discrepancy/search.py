@@ -23,7 +23,7 @@ from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.inertia import BodyMass, InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
-from fbse_drake.effects.sensor import FootForceGain
+from fbse_drake.effects.sensor import FootForceGain, SensorEffect
 from fbse_drake.errors import InputError
 
 # Probability of any false alarm on a log that hides nothing.
@@ -119,6 +119,16 @@ class Explanation:
                 found[name], between[name] = float(value), candidate.parameters[name].plausible
         return found, between
 
+    @property
+    def effects(self) -> list[Effect]:
+        """The candidates' effects with the values that were found."""
+        found = []
+        for candidate in self.candidates:
+            values, _ = self.values(candidate)
+            same = {name: [value] * len(candidate.targets) for name, value in values.items()}
+            found.append(candidate.effect.from_values(candidate.targets, same))
+        return found
+
 
 class Search:
     """The effects that could explain one residual, and the fits of them."""
@@ -134,6 +144,7 @@ class Search:
         # In a log per step it is not known at which velocity within the step a law holds: what such a law leaves is weak evidence.
         self._per_step = predictor.scenario.recording.rows == "per_step"
         self._joints = predictor.robot.joint_names
+        self._travel = np.ptp(predictor.motion.signals.joint_position, axis=0)
         self._unit = dict(zip(self._joints, predictor.robot.torque_units, strict=True))
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
         self._bodies = [body for body in bodies if body not in untrusted]
@@ -159,11 +170,7 @@ class Search:
 
     def doubting(self, explanation: Explanation) -> Explanation:
         """Weighs the residual anew: friction laws that an explanation takes off make it noisier. Returns the explanation, fitted anew."""
-        resolved = []
-        for candidate in explanation.candidates:
-            values, _ = explanation.values(candidate)
-            same = {name: [value] * len(candidate.targets) for name, value in values.items()}
-            resolved.append(candidate.effect.from_values(candidate.targets, same).resolve(self.predictor.robot.description))
+        resolved = [effect.resolve(self.predictor.robot.description) for effect in explanation.effects]
         self._weigh(self.predictor.doubted(self.predictor.residual, resolved))
         return self.explain([replace(c, signature=self.white.whiten_signature(c.raw)) for c in explanation.candidates])
 
@@ -317,22 +324,28 @@ class Search:
 
     def is_significant(self, base: Explanation, wider: Explanation, added: Candidate) -> bool:
         """Does a candidate bring more than chance to an explanation without it, with values that can be?"""
-        drop = base.deviance - wider.deviance
-        if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(added.signature.rows) + added.spurious:
-            return False
         rows = added.signature.rows
+        if issubclass(added.effect, JointTorqueEffect) and not np.any(added.effect.shows_within(self._travel[rows], added.nonlinear)):
+            return False
+        drop = base.deviance - wider.deviance
+        if drop < self.threshold[min(12, added.signature.values.shape[2])] + self.systematic(rows) + added.spurious:
+            return False
         taken, gained = (float(np.maximum(a[rows] - b[rows], 0.0).sum()) for a, b in ((self.white.sse, base.sse), (base.sse, wider.sse)))
         if self._per_step and gained < _MISFIT * taken:
             return False
         start = wider.start(added)
         names = added.linear_names if added.has_linear else added.nonlinear_names
         offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
-        values, deviations = wider.fit.parameters[start:][: len(names)] + offsets, wider.fit.deviation[start:][: len(names)]
-        for name, value, deviation in zip(names, values, deviations, strict=True):
+        part = slice(start, start + len(names))
+        values, deviations, intervals = wider.fit.parameters[part] + offsets, wider.fit.deviation[part], wider.fit.interval()[part]
+        for name, value, deviation, (least, most) in zip(names, values, deviations, intervals, strict=True):
             low, high = added.parameters[name].bounds
             plausible = added.parameters[name].plausible
-            widest = _IMPLAUSIBLE * max(abs(bound) for bound in plausible)
-            if value < low or value > high + 3 * deviation or abs(value) > widest + 3 * deviation:
+            widest = max(abs(bound) for bound in plausible)
+            if value < low or value > high + 3 * deviation or abs(value) > _IMPLAUSIBLE * widest + 3 * deviation:
+                return False
+            # What is not told from nothing may not be implausible as well.
+            if abs(value) > widest and least <= 0 <= most:
                 return False
         return self.predictor.is_possible(added.effect, added.targets[0], values)
 
@@ -494,7 +507,9 @@ class Search:
             needed = self._needed(len(effect.parameters)) + self.systematic(np.array([row]))
             first = columns[row][:, 0]
             power = (_project(first, projection.get(row)) ** 2).sum(axis=0) / scale[row]
-            if has_linear:
+            if not np.all(effect.shows_within(self._travel[row], self.usual_at(effect, joint))):
+                result[joint] = np.inf
+            elif has_linear:
                 result[joint] = float(np.sqrt(needed / max(power[usual], 1e-30)))
             else:
                 # Sizes in the order of the grid, from weak to strong.
@@ -604,6 +619,24 @@ class Search:
                 by_row.setdefault(row, []).append(s.values[:, k])
             start = stop
         return left, {row: np.linalg.qr(np.concatenate(columns, axis=1))[0] for row, columns in by_row.items()}
+
+    def added(self, explanation: Explanation) -> tuple[Explanation, WhitenedResidual, np.ndarray]:
+        """An explanation when its inertia and sensor effects are in the model, where it has any; the residual that is measured by; and
+        what is left of it, whitened, (B, R).
+
+        An impact shows a heavy foot's mass only if accelerations are not smoothed, noise grows with the masses, and which soles stand is
+        seen when the forces are set right.
+        """
+        if self.inertia is not None or not any(issubclass(c.effect, InertiaEffect | SensorEffect) for c in explanation.candidates):
+            return explanation, self.white, self.leftover(explanation)[0]
+        scenario = self.predictor.scenario
+        found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
+        believed = replace(scenario.believed, effects=scenario.believed.effects | found)
+        white = WhitenedResidual(Predictor(replace(scenario, model=believed), self.predictor.log).residual)
+        # As many squares as before; what is held out exceeds them by as much as it did.
+        share = self.white.count / np.maximum(white.count, 1)
+        sse = white.sse * share * self._torque_factor(explanation.candidates, explanation.fit.parameters)
+        return replace(explanation, sse=sse, held_out_sse=sse + explanation.held_out_sse - explanation.sse), white, white.y
 
     def _signatures(self, explanation: Explanation) -> list[Signature]:
         """Whitened, in the order of the explanation's parameters."""

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fbse_drake.discrepancy.search import Explanation, Search
+from fbse_drake.discrepancy.regression import WhitenedResidual
+from fbse_drake.discrepancy.residual import RecordedMotion
 
 # Pieces of a piecewise linear function of one variable.
 _PIECES = 8
@@ -32,35 +33,37 @@ class Structure:
     share: float
 
 
-def leftover_structure(search: Search, explanation: Explanation) -> list[Structure]:
-    """Rows in which an explanation leaves more than noise."""
-    white, residual = search.white, search.white.residual
-    left, _ = search.leftover(explanation)
+def leftover_structure(motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray) -> list[Structure]:
+    """Rows in which more than noise is left.
+
+    Args:
+        white: the residual by which it is measured.
+        left: what is left of it, (B, R).
+    """
     result = []
-    for k, row in enumerate(residual.rows):
+    for k, row in enumerate(white.residual.rows):
         if white.count[k] < 50:
             continue
         ratio = float(np.sqrt((left[:, k] ** 2).sum() / white.count[k]))
-        variables = _variables(search, k)
+        variables = _variables(motion, white, k)
         if row.kind == "kinematic":
             if ratio < _KINEMATIC_EXCESS:
                 continue
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            if ratio < tolerated and _drop(search, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
+            if ratio < tolerated and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
-        shares = {name: _explained(search, left, k, basis) / excess for name, basis in variables.items()}
+        shares = {name: _explained(white, left, k, basis) / excess for name, basis in variables.items()}
         best = max(shares, key=lambda name: shares[name])
         result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
     return result
 
 
-def _variables(search: Search, row: int) -> dict[str, np.ndarray]:
+def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
     """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces) each."""
-    motion, n = search.predictor.motion, len(search.predictor.robot.joint_names)
-    blocks = motion.blocks
+    blocks, n = motion.blocks, len(motion.robot.joint_names)
     result = {"time": hat_functions(motion.time)}
 
     def without_own_noise(values: np.ndarray) -> np.ndarray:
@@ -81,7 +84,7 @@ def _variables(search: Search, row: int) -> dict[str, np.ndarray]:
     else:
         result["angular velocity"] = without_own_noise(blocks.angular_velocity)
         result["specific force"] = without_own_noise(blocks.specific_force)
-    result["phase"] = search.white.residual.standing.astype(float)
+    result["phase"] = white.residual.standing.astype(float)
     return result
 
 
@@ -93,9 +96,8 @@ def hat_functions(x: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(x, knots, np.eye(len(knots))[k]) for k in range(len(knots))], axis=1)
 
 
-def _fit(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> tuple[float, float]:
+def _fit(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> tuple[float, float]:
     """Sums of squares of a row on held-out data, without and with a smooth function."""
-    white = search.white
     X = white.whiten(row, basis)
     X = X[:, np.abs(X).max(axis=0) > 0]
     y = left[:, row]
@@ -108,12 +110,12 @@ def _fit(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> tuple
     return float((y**2).sum()), float((held_out**2).sum())
 
 
-def _drop(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> float:
-    count = search.white.count[row]
-    before, after = (max(sse / count, 1e-9) for sse in _fit(search, left, row, basis))
+def _drop(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    count = white.count[row]
+    before, after = (max(sse / count, 1e-9) for sse in _fit(white, left, row, basis))
     return float(count * (np.log(max(before, 1)) + before / max(before, 1) - np.log(max(after, 1)) - after / max(after, 1)))
 
 
-def _explained(search: Search, left: np.ndarray, row: int, basis: np.ndarray) -> float:
-    before, after = _fit(search, left, row, basis)
+def _explained(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    before, after = _fit(white, left, row, basis)
     return before - after

@@ -74,6 +74,16 @@ class JointTorqueEffect(Effect):
         raise NotImplementedError
 
     @staticmethod
+    def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | bool:  # noqa: ARG004
+        """Does a joint that moves through a range of angles show what the effect is, and not just its value and slope there?
+
+        Args:
+            travel: from the smallest to the largest angle, shape (n,) [rad].
+            nonlinear: values of the nonlinear parameters, shape (m,) or (m, n).
+        """
+        return True
+
+    @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
         """Memory at the start of each of N steps that follow each other, (rows, ..., N, n), where that can be had faster than step by step.
 

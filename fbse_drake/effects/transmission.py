@@ -35,6 +35,11 @@ class TorqueRipple(JointTorqueEffect):
         angle = nonlinear[0] * motion.position
         return (np.sin(angle), np.cos(angle)), (0.0, 0.0)
 
+    @staticmethod
+    def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+        """Half a wave at least: less of it is a spring."""
+        return nonlinear[0] * travel > np.pi
+
 
 @in_library
 @dataclass(frozen=True)
