@@ -202,6 +202,30 @@ def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
     assert after.mean_torque_command < 0.1 * before.mean_torque_command
 
 
+@pytest.mark.parametrize("hidden", ["!BodyMass {mass: {left_foot: 3.5}}", "!FootForceLag {time_constant: {right: 0.045}}"])
+def test_what_a_large_effect_leaves_over_is_noise(hidden: str) -> None:
+    """A heavy foot hits the ground harder than smoothed accelerations tell; a foot that reads late seems to stand while it lifts."""
+    candidates = [library()[name] for name in (hidden[1:].split()[0], "CoulombFriction", "TorqueBias", "FootForceGain")]
+    diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), candidates)
+    assert diagnosis.verdict == "effect_found"
+    assert [f.effect for f in diagnosis.chosen] == [hidden[1:].split()[0]]
+    assert not diagnosis.unexplained
+    assert diagnosis.held_out_after < 1.1 < 5.0 < diagnosis.held_out_before
+
+
+def test_a_ripple_is_not_seen_in_a_joint_that_stands_still() -> None:
+    """Within a milliradian a ripple of any period is a bias and a spring."""
+    candidates = [library()[name] for name in ("TorqueRipple", "JointSpring", "TorqueBias")]
+    values = "sine: {left_hip_yaw: 2.0, left_knee_pitch: 1.0}, cosine: {left_hip_yaw: 0.5, left_knee_pitch: 0.5}, cycles: {all: 100}"
+    hidden = f"!TorqueRipple {{{values}}}"
+    diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), candidates)
+    named = {target: finding.effect for finding in diagnosis.chosen for target in finding.targets}
+    assert named["left_knee_pitch"] == "TorqueRipple"
+    assert named["left_hip_yaw"] in ("JointSpring", "TorqueBias")
+    assert diagnosis.effects["TorqueRipple"].smallest_detectable["left_hip_yaw"] == np.inf
+    assert diagnosis.effects["TorqueRipple"].smallest_detectable["left_knee_pitch"] < 1.0
+
+
 def test_no_body_loses_more_than_it_weighs() -> None:
     predictor, mass = Predictor(scenario(), log_with("")), library()["BodyMass"]
     foot = predictor.robot.body("left_foot").default_mass()

@@ -10,7 +10,20 @@ import numpy as np
 import pytest
 
 from fbse_drake import InputError, Log, Scenario, load_scenario
-from fbse_drake.discrepancy.hidden import SIZES, Answer, HiddenEffect, draw, hide, make_exercise, reveal, score, seal, unseal
+from fbse_drake.discrepancy.hidden import (
+    SIZES,
+    Answer,
+    HiddenEffect,
+    draw,
+    hide,
+    is_explained,
+    make_exercise,
+    record,
+    reveal,
+    score,
+    seal,
+    unseal,
+)
 from fbse_drake.discrepancy.strangers import STRANGERS
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.joint_torque import JointMotion
@@ -218,6 +231,14 @@ def test_a_robot_that_falls_gets_half_the_size(walk: Scenario):
     assert exercise.log.meta["outcome"]["finished"]
     with pytest.raises(InputError, match=r"nothing can be hidden in this scenario: t = .* s: fell"):
         make_exercise(replace(walk, fall=replace(walk.fall, tilt=1e-7)), "walk", 1, what="EncoderOffset")
+
+
+@pytest.mark.parametrize(("coulomb", "explained"), [(0.3, True), (8.0, False)])
+def test_friction_that_the_step_cannot_follow_is_no_exercise(coulomb: float, explained: bool):
+    """At rest, 8 Nm that change their sign within 5 mrad/s turn an ankle of 0.01 kg m^2 a hundred times in one step."""
+    walk = load_scenario("paper_walk", overrides=["duration=2"])
+    steep = answer("CoulombFriction", "right_ankle_roll", coulomb=coulomb, transition=0.005)
+    assert is_explained(record(walk, "paper_walk", steep, 3)) == explained
 
 
 # Answers and scores.

@@ -85,6 +85,18 @@ def test_gaps_are_left_out_and_touch_nothing_else(walk: tuple[Scenario, Log]) ->
     np.testing.assert_allclose(torn.value[others, :18], whole.value[others, :18], atol=1e-9)
 
 
+def test_a_sole_rests_only_while_its_foot_stands_before_and_after(walk: tuple[Scenario, Log]) -> None:
+    """Right after touch-down and right before lift-off a foot may roll over an edge."""
+    motion = Predictor(*walk).motion
+    rows = [row.name for row in motion.residual.rows]
+    for foot, side in enumerate(motion.robot.description.sides):
+        known = motion.known[:, rows.index(f"{side}_sole/specific_force_z")]
+        assert 0.2 < known.mean() < motion.standing[:, foot].mean()
+        for block in np.flatnonzero(known):
+            around = abs(motion.time - motion.time[block]) < 0.031
+            assert motion.standing[around, foot].all()
+
+
 def test_a_long_log_is_computed_piece_by_piece(walk: tuple[Scenario, Log], monkeypatch: pytest.MonkeyPatch) -> None:
     motion = Predictor(*walk).motion
     whole = motion.equation.residual(motion.steps)
