@@ -40,6 +40,20 @@ _BIASES = (
 )
 _TORQUE_SENSOR = "sensors.joint_torque={noise: 0.3}"
 _UNFILTERED = "compensation=!FeedforwardCompensation {cutoff: 100000}"
+# What limits the estimate of a joint that hardly moves: sensors with a tenth of the noise, and an estimator that knows it.
+_FINER = (
+    "sensors.encoders.resolution=4.8e-6",
+    "sensors.encoders.velocity_noise=5.0e-5",
+    "sensors.imu.acceleration_noise=0.002",
+    "sensors.imu.angular_velocity_noise=1.0e-4",
+    "sensors.foot_force.noise=0.05",
+    *(
+        f"estimator.{stage}.{noise}"
+        for stage in ("joint_acceleration", "link_torque")
+        for noise in ("acceleration_noise=0.002", "angular_velocity_noise=1.0e-4", "joint_velocity_noise=5.0e-5")
+    ),
+    "estimator.link_torque.force_noise=0.05",
+)
 # The errors of the robustness table, by what a scenario says of them; the trunk's, see `_model_override`.
 _DISTURBED = {
     "trunk mass + 10 %": ("heavy",),
@@ -47,6 +61,7 @@ _DISTURBED = {
     "force sensors + 2 %": ("sensors.foot_force.gain=1.02",),
     "force sensors 5 ms late": ("sensors.foot_force.delay=0.005",),
     "IMU turned by 0.5 deg about y": ("sensors.imu.misalignment=[0, 0.00873, 0]",),
+    "all sensors ten times finer": _FINER,
     "friction model twice as steep": ("estimator.friction=!ModelAided {model: {transition: {all: 0.005}}}",),
 }
 
