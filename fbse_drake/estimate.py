@@ -11,6 +11,7 @@ from fbse_drake.estimators.estimator import make_estimator
 from fbse_drake.estimators.foot_pads import measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sampling import state_views
 from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.walking.reference import make_reference
 
@@ -114,6 +115,7 @@ class Replay:
         self._next_context = estimator.CreateDefaultContext()
         self._next = self._next_context.get_mutable_state()
         self._next_values = self._next_context.get_discrete_state()
+        self._views = [*state_views(estimator, self.context), *state_views(estimator, self._next_context)]
         self._sources = []
         for i in range(estimator.num_input_ports()):
             port = estimator.get_input_port(i)

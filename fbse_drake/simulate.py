@@ -19,6 +19,7 @@ from fbse_drake.estimators.foot_pads import FootPads
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, dump_scenario
 from fbse_drake.station import Station, build_station
 
@@ -111,6 +112,7 @@ def _simulate(
 
     # From here on there is something to record.
     simulator.Initialize()
+    views = state_views(diagram, context)
     failure, fell, start = None, False, clock.perf_counter()
     try:
         looks = int(np.ceil(scenario.duration / _LOOK_PERIOD - 1e-9))
@@ -130,6 +132,7 @@ def _simulate(
         fell = True
         failure = f"the solver failed: {str(error).splitlines()[0]}"
     wall_time = clock.perf_counter() - start
+    del views
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()

@@ -168,10 +168,10 @@ def test_slope_is_the_derivative(effect: type[JointTorqueEffect]):
     motion = JointMotion(generator.normal(scale=0.02, size=12), generator.normal(size=12), generator.normal(size=12), 5.0, H)
     if effect.has_memory:
         memory = effect.start(motion, nonlinear)
-        motion = dataclasses.replace(motion, memory=memory)
+        motion = motion._replace(memory=memory)
         for _ in range(3):
-            motion = dataclasses.replace(motion, memory=effect.advance(motion, nonlinear), command=generator.normal(size=12))
-    after, before = (resolved.torque_and_slope(dataclasses.replace(motion, velocity=motion.velocity + d))[0] for d in (e, -e))
+            motion = motion._replace(memory=effect.advance(motion, nonlinear), command=generator.normal(size=12))
+    after, before = (resolved.torque_and_slope(motion._replace(velocity=motion.velocity + d))[0] for d in (e, -e))
     np.testing.assert_allclose(resolved.torque_and_slope(motion)[1], (after - before) / (2 * e), rtol=1e-5, atol=1e-5)
 
 

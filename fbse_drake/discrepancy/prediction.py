@@ -187,7 +187,7 @@ class Predictor:
             Shape (p, B, T), or (p, G, B, T).
         """
         whole = self.noisier_joint_motion if noisier else self.joint_motion
-        motion = replace(whole, **{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command", "load")})
+        motion = whole._replace(**{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command", "load")})
         if nonlinear.ndim == 2:
             return np.stack([self.motion.averages(column) for column in basis_over_time(effect, motion, nonlinear)])
         sets = max(1, _CHUNK // motion.velocity.size)

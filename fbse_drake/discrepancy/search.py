@@ -746,8 +746,8 @@ def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
     time = np.arange(10.0)[:, None]
     motion = JointMotion(velocity=np.sin(time), position=np.cos(time), command=np.exp(0.1 * time), time=time, time_step=1e-3)
     nonlinear = Search.usual_values(effect)[:, None]
-    motion = replace(motion, load=motion.command)
-    larger = replace(motion, command=100 * motion.command, load=(100 if load_too else 1) * motion.load)
+    motion = motion._replace(load=motion.command)
+    larger = motion._replace(command=100 * motion.command, load=(100 if load_too else 1) * motion.load)
     columns = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
     return not np.array_equal(*columns)
 

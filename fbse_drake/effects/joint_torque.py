@@ -10,8 +10,8 @@ is one basis torque as it stands.
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,8 +20,7 @@ from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.robot.description import RobotDescription
 
 
-@dataclass(frozen=True)
-class JointMotion:
+class JointMotion(NamedTuple):
     """A plant step, or many, as joint torque effects see it: arrays that broadcast to (..., n), the last axis is the joints.
 
     An effect that depends on the velocity alone can be given the velocity alone.
@@ -133,7 +132,7 @@ def basis_over_time(effect: type[JointTorqueEffect], motion: JointMotion, nonlin
     sets = nonlinear.shape[1:-1]
     memory = effect.memory_over_time(motion, nonlinear[..., None, :]) if effect.has_memory else ()
     if memory is not None:
-        basis, _ = effect.basis(replace(motion, memory=memory), nonlinear[..., None, :])
+        basis, _ = effect.basis(motion._replace(memory=memory), nonlinear[..., None, :])
         return np.stack([np.broadcast_to(b, (*sets, samples, n)) for b in basis])
     names = ("velocity", "position", "command", "time")
     columns = [np.broadcast_to(getattr(motion, name), (samples, n)) for name in names]

@@ -1,7 +1,7 @@
 """Torques of gears and cables: springs, ripple, hysteresis, backlash."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -145,7 +145,7 @@ class Backlash(JointTorqueEffect):
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        first = Backlash.start(replace(motion, command=motion.command[:1]), nonlinear)
+        first = Backlash.start(motion._replace(command=motion.command[:1]), nonlinear)
         # Time first, all else in one axis.
         command, *values = np.broadcast_arrays(motion.command, *nonlinear)
         steps = [np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1) for array in (command, *values)]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
@@ -14,7 +15,6 @@ from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.estimators.spatial import (
     Quaternion,
-    Rotation,
     Vector,
     add,
     cross,
@@ -24,6 +24,7 @@ from fbse_drake.estimators.spatial import (
     quaternion_product,
     rotate,
     rotate_back,
+    rotation_at,
     rotation_matrix,
     rotation_vector_to_quaternion,
     scale,
@@ -256,20 +257,19 @@ def _estimate_attitude(
     last: np.ndarray,
     elapsed: float,
     measured: np.ndarray,
-    support: np.ndarray,
     model: np.ndarray,
-    places: tuple[int, ...],
-    R_BI: Rotation,
-    q_IB: Quaternion,
-    config: tuple[float, ...],
+    places: np.ndarray,
+    frames: np.ndarray,
+    config: np.ndarray,
 ) -> None:
     """One tick of `AttitudeEstimator`; fills the posterior.
 
     Args:
         places: of what is read, see the first lines.
+        frames: rotation of the IMU, and the quaternion of the base in its axes.
         config: the values of `AttitudeConfig`.
     """
-    imu_trust, specific_force, angular_velocity, foot_rotation, age_at, filters_at = places
+    imu_trust, support_start, support_stop, specific_force, angular_velocity, foot_rotation, age_at, filters_at = to_fixed_tuple(places, 8)
     (
         acceleration_noise,
         rate_noise,
@@ -282,7 +282,8 @@ def _estimate_attitude(
         standing_rate,
         level_feet,
         stance_time,
-    ) = config
+    ) = to_fixed_tuple(config, 11)
+    R_BI, q_IB = rotation_at(frames, 0), to_fixed_tuple(frames[9:], 4)
     first, trust = math.isnan(elapsed), measured[imu_trust]
     f, w = vector_at(measured, specific_force), vector_at(measured, angular_velocity)
     age = 0.0 if first else last[age_at] + elapsed
@@ -320,7 +321,7 @@ def _estimate_attitude(
             tilt_variance = gravity.covariance[0] / 9.81**2
             quaternion = predict_quaternion(quaternion, w, rate_noise**2, elapsed)
             by_gravity = quaternion_from_gravity(gravity.gravity, yaw_of(quaternion.q))
-            up_B, soles = level_direction(support, model, foot_rotation)
+            up_B, soles = level_direction(measured[support_start:support_stop], model, foot_rotation)
             up_I = rotate_back(R_BI, up_B)
             use_feet = level_feet > 0 and soles > 0
             level_variance = level_feet**2 / max(1.0, soles)
@@ -401,22 +402,23 @@ class AttitudeEstimator(RecursiveEstimator):
             },
             clock,
         )
-        self._places = (
-            measurements["trust"].start + 1,
-            *starts(measurements, "specific_force", "angular_velocity"),
-            *starts(model, "foot_rotation"),
-            *starts(self.fields.slices, "age", "imu_orientation"),
+        self._places = np.array(
+            [
+                measurements["trust"].start + 1,
+                measurements["support"].start,
+                measurements["support"].stop,
+                *starts(measurements, "specific_force", "angular_velocity"),
+                *starts(model, "foot_rotation"),
+                *starts(self.fields.slices, "age", "imu_orientation"),
+            ]
         )
-        self._support = measurements["support"]
         R_BI = ImuMount(robot).R_BI
-        self._R_BI = tuple(R_BI.ravel().tolist())
-        self._q_IB = tuple(RotationMatrix(R_BI.T).ToQuaternion().wxyz().tolist())
-        self._config = tuple(float(value) for value in astuple(config))
+        self._frames = np.concatenate([R_BI.ravel(), RotationMatrix(R_BI.T).ToQuaternion().wxyz()])
+        self._config = np.array(astuple(config), dtype=float)
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._model = self.DeclareVectorInputPort("model", max(part.stop for part in model.values()))
         self._declare_posterior("measurements", "model")
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
-        support = measured[self._support]
-        _estimate_attitude(posterior, last, elapsed, measured, support, model, self._places, self._R_BI, self._q_IB, self._config)
+        _estimate_attitude(posterior, last, elapsed, measured, model, self._places, self._frames, self._config)

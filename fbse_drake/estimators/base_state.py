@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
@@ -144,10 +145,9 @@ def _follow_legs(
     measured: np.ndarray,
     R_WB: Rotation,
     model: np.ndarray,
-    support: np.ndarray,
     pad_position: np.ndarray,
     pad_foot: np.ndarray,
-    places: tuple[int, ...],
+    places: np.ndarray,
     origin: Vector,
 ) -> LegOdometry:
     """Starts a posterior of `BaseStateEstimator` as a copy of the last; anchors the feet that land; ZMP from the foot forces (eqs. 8, 9).
@@ -156,8 +156,10 @@ def _follow_legs(
         places: of what is read and written, see the first lines.
         origin: where the middle of the soles is at the start [m].
     """
-    trust, pad_force, foot_position, foot_rotation, foot_jacobian, velocity_start, velocity_stop = places[:7]
-    base_position, zmp_at, anchors, standing = places[7:]
+    trust, pad_force, support_start, support_stop = to_fixed_tuple(places, 4)
+    foot_position, foot_rotation, foot_jacobian, velocity_start, velocity_stop = to_fixed_tuple(places[4:], 5)
+    base_position, zmp_at, anchors, standing = to_fixed_tuple(places[9:], 4)
+    support = measured[support_start:support_stop]
     first, feet, v = math.isnan(elapsed), len(support), velocity_stop - velocity_start
     posterior[:] = last
     posterior[STATUS] = measured[trust : trust + 2 + feet].max()
@@ -253,18 +255,20 @@ class BaseStateEstimator(RecursiveEstimator):
             clock,
         )
         self._mount, self._pads, self._origin = ImuMount(robot), FootPads(robot), (*origin, 0.0)
-        self._gravity: Vector = tuple(robot.plant.gravity_field().gravity_vector().tolist())
-        self._leg_places = (
-            *starts(measurements, "trust", "pad_force"),
-            *starts(model, "foot_position", "foot_rotation", "foot_jacobian", "velocity"),
-            model["velocity"].stop,
-            *starts(self.fields.slices, "base_position", "zmp", "anchors", "standing"),
+        self._gravity = robot.plant.gravity_field().gravity_vector()
+        self._leg_places = np.array(
+            [
+                *starts(measurements, "trust", "pad_force", "support"),
+                measurements["support"].stop,
+                *starts(model, "foot_position", "foot_rotation", "foot_jacobian", "velocity"),
+                model["velocity"].stop,
+                *starts(self.fields.slices, "base_position", "zmp", "anchors", "standing"),
+            ]
         )
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         names = ("measurements", "attitude", "model")
         self._measurements, self._attitude, self._model = (self.GetInputPort(name) for name in names)
-        self._support = measurements["support"]
         self._declare_posterior(*names)
 
 
@@ -315,7 +319,6 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, attitude, model = self._measurements.Eval(context), self._attitude.Eval(context), self._model.Eval(context)
-        support = measured[self._support]
         first, fields, config = math.isnan(elapsed), self.fields, self._config
         R_WB = attitude[self._rotation].reshape(3, 3)
         legs = _follow_legs(
@@ -325,7 +328,6 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
             measured,
             tuple(R_WB.ravel().tolist()),
             model,
-            support,
             self._pads.position,
             self._pads.foot,
             self._leg_places,
@@ -453,13 +455,12 @@ def _estimate_base_state(
     measured: np.ndarray,
     attitude: np.ndarray,
     model: np.ndarray,
-    support: np.ndarray,
     pad_position: np.ndarray,
     pad_foot: np.ndarray,
-    leg_places: tuple[int, ...],
-    places: tuple[int, ...],
-    frames: tuple[Vector, Rotation, Vector, Vector],
-    config: tuple[float, ...],
+    leg_places: np.ndarray,
+    places: np.ndarray,
+    frames: np.ndarray,
+    config: np.ndarray,
 ) -> None:
     """One tick of `ContactAidedEstimator`; fills the posterior.
 
@@ -468,11 +469,11 @@ def _estimate_base_state(
         frames: where the middle of the soles is at the start, rotation and lever arm of the IMU, gravity.
         config: the values of `ContactAided`.
     """
-    imu_trust, specific_force, rotation, angular_velocity, com, base_position, further = places
-    acceleration_noise, position_noise, velocity_noise, acceleration_error, acceleration_error_time = config
-    origin, R_BI, p_BI, gravity = frames
+    imu_trust, specific_force, rotation, angular_velocity, com, base_position, further = to_fixed_tuple(places, 7)
+    acceleration_noise, position_noise, velocity_noise, acceleration_error, acceleration_error_time = to_fixed_tuple(config, 5)
+    origin, R_BI, p_BI, gravity = vector_at(frames, 0), rotation_at(frames, 3), vector_at(frames, 12), vector_at(frames, 15)
     R_WB, w_B = rotation_at(attitude, rotation), vector_at(attitude, angular_velocity)
-    legs = _follow_legs(posterior, last, elapsed, measured, R_WB, model, support, pad_position, pad_foot, leg_places, origin)
+    legs = _follow_legs(posterior, last, elapsed, measured, R_WB, model, pad_position, pad_foot, leg_places, origin)
     w_W = rotate(R_WB, w_B)
     covariance_at, innovation_at, variance_at, rate_at = further + 3, further + 9, further + 15, further + 17
     x = ContactAidedEstimate(
@@ -549,26 +550,26 @@ class ContactAidedEstimator(BaseStateEstimator):
     ):
         further = {"acceleration_error": 3, "covariance": 6, "innovation": 6, "innovation_variance": 2, "rate": 3}
         super().__init__(robot, measurements, attitude, model, clock, origin, further)
-        self._places = (
-            measurements["trust"].start + 1,
-            *starts(measurements, "specific_force"),
-            *starts(attitude, "rotation", "angular_velocity"),
-            *starts(model, "com"),
-            *starts(self.fields.slices, "base_position", "acceleration_error"),
+        self._places = np.array(
+            [
+                measurements["trust"].start + 1,
+                *starts(measurements, "specific_force"),
+                *starts(attitude, "rotation", "angular_velocity"),
+                *starts(model, "com"),
+                *starts(self.fields.slices, "base_position", "acceleration_error"),
+            ]
         )
-        self._frames = (self._origin, self._mount.rotation, self._mount.lever_arm, self._gravity)
-        self._config = tuple(float(value) for value in astuple(config))
+        self._frames = np.concatenate([self._origin, self._mount.R_BI.ravel(), self._mount.p_BI, self._gravity])
+        self._config = np.array(astuple(config), dtype=float)
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        measured = self._measurements.Eval(context)
         _estimate_base_state(
             posterior,
             last,
             elapsed,
-            measured,
+            self._measurements.Eval(context),
             self._attitude.Eval(context),
             self._model.Eval(context),
-            measured[self._support],
             self._pads.position,
             self._pads.foot,
             self._leg_places,

@@ -10,12 +10,13 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
-from fbse_drake.estimators.spatial import Rotation, Vector, add, cross, dot, put, rotate, scale, vector_at
+from fbse_drake.estimators.spatial import Rotation, Vector, add, cross, dot, put, rotate, rotation_at, scale, vector_at
 from fbse_drake.robot.plant import Robot
 
 _ORIGIN = np.zeros(3)
@@ -26,10 +27,8 @@ class ImuMount:
 
     def __init__(self, robot: Robot):
         X_BI = robot.imu.CalcPose(robot.plant.CreateDefaultContext(), robot.base.body_frame())
-        # Rotation (3, 3) and lever arm (3,) [m]; and the two as tuples.
+        # Rotation (3, 3) and lever arm (3,) [m].
         self.R_BI, self.p_BI = X_BI.rotation().matrix(), X_BI.translation()
-        self.rotation: Rotation = tuple(self.R_BI.ravel().tolist())
-        self.lever_arm: Vector = tuple(self.p_BI.tolist())
 
 
 @njit(cache=True)
@@ -48,7 +47,7 @@ def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: 
 
 @njit(cache=True)
 def _plant_state(
-    state: np.ndarray, measured: np.ndarray, q_index: np.ndarray, v_index: np.ndarray, places: tuple[int, ...], R_BI: Rotation
+    state: np.ndarray, measured: np.ndarray, q_index: np.ndarray, v_index: np.ndarray, places: np.ndarray, R_BI: np.ndarray
 ) -> bool:
     """Puts joint angles and velocities and the base's angular velocity into a plant's state, in place; says whether all are finite.
 
@@ -57,9 +56,10 @@ def _plant_state(
         q_index: place of each joint's angle in it, shape (n,).
         v_index: place of each of our velocities [base angular, base linear, joints] in it, shape (6 + n,).
         places: of what is read, see the first line.
+        R_BI: rotation of the IMU, shape (9,).
     """
-    joint_position, joint_velocity, angular_velocity = places
-    w = rotate(R_BI, vector_at(measured, angular_velocity))
+    joint_position, joint_velocity, angular_velocity = to_fixed_tuple(places, 3)
+    w = rotate(rotation_at(R_BI, 0), vector_at(measured, angular_velocity))
     for i in range(3):
         state[v_index[i]] = w[i]
     for i in range(len(q_index)):
@@ -76,7 +76,7 @@ def _put_terms(
     feet: tuple[tuple[np.ndarray, np.ndarray], ...],
     order: np.ndarray,
     v_index: np.ndarray,
-    places: tuple[int, ...],
+    places: np.ndarray,
 ) -> None:
     """Fills a posterior of `FloatingBaseModel` from what Drake says of the plant.
 
@@ -87,7 +87,7 @@ def _put_terms(
         order: place of each of our velocities in the plant's, shape (6 + n,); v_index: in its state.
         places: of the fields, see the first line.
     """
-    mass_matrix, bias_at, com, com_velocity, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = places
+    mass_matrix, bias_at, com, com_velocity, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = to_fixed_tuple(places, 9)
     v, posterior[STATUS] = len(order), 0.0
     for i in range(v):
         posterior[velocity + i] = state[v_index[i]]
@@ -172,15 +172,15 @@ class FloatingBaseModel(RecursiveEstimator):
         )
         self._plant, self._plant_context = robot.plant, robot.plant.CreateDefaultContext()
         self._world, self._soles = robot.plant.world_frame(), [robot.sole(side) for side in robot.description.sides]
-        self._R_BI = ImuMount(robot).rotation
+        self._R_BI = ImuMount(robot).R_BI.flatten()
         # Place in the plant's velocities, and in its state, of each of ours.
         base = robot.base.floating_velocities_start_in_v()
         self._order = np.concatenate([np.arange(base, base + 6), robot.velocity_index])
         self._q_index, self._v_index = robot.position_index, robot.plant.num_positions() + self._order
         self._state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(robot.plant.num_velocities())])
-        self._measured_places = starts(measurements, "joint_position", "joint_velocity", "angular_velocity")
+        self._measured_places = np.array(starts(measurements, "joint_position", "joint_velocity", "angular_velocity"))
         feet = ("foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
-        self._places = starts(self.fields.slices, "mass_matrix", "bias", "com", "com_velocity", "velocity", *feet)
+        self._places = np.array(starts(self.fields.slices, "mass_matrix", "bias", "com", "com_velocity", "velocity", *feet))
         self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
         self._declare_posterior("measurements")
         self.DeclareStateOutputPort("at_step_start", self._last)

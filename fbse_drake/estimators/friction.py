@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
@@ -240,7 +241,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 @njit(cache=True)
 def smooth_velocity(
-    velocity: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, places: tuple[int, int, int], time_constant: float
+    velocity: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, places: np.ndarray, time_constant: float
 ) -> None:
     """Low-pass of first order over joint velocities.
 
@@ -250,7 +251,7 @@ def smooth_velocity(
         places: of what is read, see the first line.
         time_constant: of the low-pass [s], 0 does not smooth.
     """
-    joint_velocity, smoothed, measured_last = places
+    joint_velocity, smoothed, measured_last = to_fixed_tuple(places, 3)
     keep = math.exp(-elapsed / time_constant) if time_constant > 0 else 0.0
     for joint in range(len(velocity)):
         # The joint's velocity over the tick is the mean of those at its ends.
@@ -265,12 +266,11 @@ def _estimate_friction(
     elapsed: float,
     measured: np.ndarray,
     link_torque: np.ndarray,
-    support: np.ndarray,
     phi: tuple[np.ndarray, ...],
     joint_leg: np.ndarray,
-    places: tuple[int, ...],
+    places: np.ndarray,
     measures_swing: bool,
-    walks: tuple[float, float],
+    walks: np.ndarray,
 ) -> None:
     """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint; fills the posterior but for its `velocity`.
 
@@ -281,22 +281,25 @@ def _estimate_friction(
         measures_swing: whether the measurement counts while the leg swings.
         walks: random walks of disturbance and parameters, see `ModelAided`.
     """
-    trust, joint_velocity, residual, torque_variance, impulse_variance, valid_at = places[:6]
-    friction, parameters, variances, covariance, innovations, innovation_variances, disturbance, impulse_at, measured_at = places[6:]
-    disturbance_walk, parameter_walk = walks
-    m, n = len(phi), len(joint_leg)
+    trust, joint_velocity, support_start, support_stop = to_fixed_tuple(places, 4)
+    residual, torque_variance, impulse_variance, valid_at = to_fixed_tuple(places[4:], 4)
+    friction, parameters, variances, covariance, innovations, innovation_variances = to_fixed_tuple(places[8:], 6)
+    disturbance, impulse_at, measured_at = to_fixed_tuple(places[14:], 3)
+    disturbance_walk, parameter_walk = to_fixed_tuple(walks, 2)
+    support, m, n = measured[support_start:support_stop], len(phi), len(joint_leg)
     size = m + 2
-    regressor, x = np.ones(m + 1), np.empty(m + 1)
+    regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior[STATUS] = measured[trust : trust + 2 + len(support)].max()
+    stop = covariance + n * size * size
+    posterior[covariance:stop] = last[covariance:stop]
+    covariances = posterior[covariance:stop].reshape(n, size, size)
     for joint in range(n):
         valid = link_torque[valid_at + joint] > 0 and (measures_swing or support[joint_leg[joint]] > 0)
         # Parameters and disturbance, whose regressor is one.
         for k in range(m):
             regressor[k], x[k] = phi[k][joint], last[parameters + joint * m + k]
         x[m] = last[disturbance + joint]
-        start = covariance + joint * size * size
-        posterior[start : start + size * size] = last[start : start + size * size]
-        P = posterior[start : start + size * size].reshape(size, size)
+        P, impulse_uncertainty = covariances[joint], covariances[joint, 0, 0]
         # Prediction: the impulse error grows by the friction's error times the tick.
         innovation = last[impulse_at + joint] + elapsed * link_torque[residual + joint]
         added = elapsed**2 * link_torque[torque_variance + joint]
@@ -310,14 +313,14 @@ def _estimate_friction(
             if i > 0:
                 added += elapsed * regressor[i - 1] * c
         # Its own row and column are the same.
-        P[0, 0] += P[0, 0] - last[start] + added
+        P[0, 0] += P[0, 0] - impulse_uncertainty + added
         P[size - 1, size - 1] += disturbance_walk**2 * elapsed
         for i in range(1, m + 1):
             P[0, i] = P[i, 0]
             P[i, i] += parameter_walk**2 * elapsed
         P[0, size - 1] = P[size - 1, 0]
         # Update.
-        column = P[:, 0].copy()
+        column[:] = P[:, 0]
         S = column[0] + link_torque[impulse_variance + joint]
         impulse = innovation
         if valid:
@@ -367,20 +370,24 @@ class ModelAidedEstimator(FrictionEstimator):
         further = {"disturbance": n, "impulse": n, "velocity": n, "last_velocity": n}
         super().__init__(config.model, robot, measurements, link_torque, clock, 2, further)
         self._config, self._measures_swing = config, config.swing == "measurement"
-        self._velocity_places = (*starts(measurements, "joint_velocity"), *starts(self.fields.slices, "velocity", "last_velocity"))
-        self._smoothing, self._walks = float(config.velocity_smoothing), (float(config.disturbance_walk), float(config.parameter_walk))
+        self._velocity_places = np.array(
+            [*starts(measurements, "joint_velocity"), *starts(self.fields.slices, "velocity", "last_velocity")]
+        )
+        self._smoothing, self._walks = float(config.velocity_smoothing), np.array([config.disturbance_walk, config.parameter_walk], float)
         self._velocity = self.fields["velocity"]
         model, innovation = ("parameters", "parameter_variance", "covariance"), ("innovation", "innovation_variance")
         written = ("friction", *model, *innovation, "disturbance", "impulse", "last_velocity")
-        self._places = (
-            *starts(measurements, "trust", "joint_velocity"),
-            *starts(link_torque, "residual", "torque_variance", "impulse_variance", "valid"),
-            *starts(self.fields.slices, *written),
+        self._places = np.array(
+            [
+                *starts(measurements, "trust", "joint_velocity", "support"),
+                measurements["support"].stop,
+                *starts(link_torque, "residual", "torque_variance", "impulse_variance", "valid"),
+                *starts(self.fields.slices, *written),
+            ]
         )
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
-        support = measured[self._measured["support"]]
         if math.isnan(elapsed):
             self._start(posterior, measured)
             return
@@ -392,7 +399,6 @@ class ModelAidedEstimator(FrictionEstimator):
             elapsed,
             measured,
             link_torque,
-            support,
             self._regressor(velocity),
             self._leg,
             self._places,

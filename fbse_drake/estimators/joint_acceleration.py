@@ -1,16 +1,17 @@
 """Joint accelerations of a robot whose standing feet do not slip (paper Sec. 5)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
-from fbse_drake.estimators.spatial import Rotation, Vector, put, rotate, rotate_back, rotation_at, scale, subtract, vector_at
+from fbse_drake.estimators.spatial import put, rotate, rotate_back, rotation_at, scale, subtract, vector_at
 from fbse_drake.robot.plant import Robot
 
 
@@ -101,16 +102,16 @@ def fuse(
 
 
 @njit(cache=True)
-def measured_acceleration(
-    measured: np.ndarray, model: np.ndarray, elapsed: float, places: tuple[int, ...], R_BI: Rotation, p_BI: Vector
-) -> np.ndarray:
+def measured_acceleration(measured: np.ndarray, model: np.ndarray, elapsed: float, places: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """What gyro, accelerometer and encoders say of the accelerations of base and joints, shape (v,), see `JointAccelerationEstimator`.
 
     Args:
         measured, model: posteriors of `SensorMonitor`, and of `FloatingBaseModel` where the tick began.
         places: of what is read, see the first line.
+        frames: rotation and lever arm of the IMU.
     """
-    joint_velocity, specific_force, angular_velocity, velocity_start, velocity_stop = places
+    joint_velocity, specific_force, angular_velocity, velocity_start, velocity_stop = to_fixed_tuple(places, 5)
+    R_BI, p_BI = rotation_at(frames, 0), vector_at(frames, 9)
     v = velocity_stop - velocity_start
     acceleration = np.empty(v)
     w_start = vector_at(model, velocity_start)
@@ -124,7 +125,7 @@ def measured_acceleration(
 
 @njit(cache=True)
 def no_slip_condition(
-    model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, places: tuple[int, ...], v: int, gravity: Vector
+    model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, places: np.ndarray, v: int, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
 
@@ -134,11 +135,11 @@ def no_slip_condition(
         model, attitude: posteriors of `FloatingBaseModel` where the tick began, and of `AttitudeEstimator`.
         stands: the feet that stand, shape (feet,), bool.
         places: of what is read, see the first line.
-        gravity: in world axes [m/s^2].
+        gravity: in world axes, shape (3,) [m/s^2].
     """
-    foot_jacobian, foot_bias, foot_rotation, rotation = places
+    foot_jacobian, foot_bias, foot_rotation, rotation = to_fixed_tuple(places, 4)
     J, y = np.empty((6 * stands.sum(), v)), np.empty(6 * stands.sum())
-    gravity_B = rotate_back(rotation_at(attitude, rotation), gravity)
+    gravity_B = rotate_back(rotation_at(attitude, rotation), vector_at(gravity, 0))
     row = 0
     for foot in range(len(stands)):
         if stands[foot]:
@@ -162,7 +163,7 @@ def standing_feet(support: np.ndarray, measured: np.ndarray, trust: int) -> np.n
 
 
 @njit(cache=True)
-def _begin(posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray, trust: int, places: tuple[int, ...]) -> bool:
+def _begin(posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray, trust: int, places: np.ndarray) -> bool:
     """Sets a posterior to zero but for its status; says whether there is something to estimate from.
 
     Args:
@@ -183,34 +184,32 @@ def _fuse_accelerations(
     measured: np.ndarray,
     attitude: np.ndarray,
     model: np.ndarray,
-    support: np.ndarray,
-    trust: int,
-    sensor_places: tuple[int, ...],
-    no_slip_places: tuple[int, ...],
-    places: tuple[int, ...],
-    frames: tuple[Rotation, Vector, Vector],
-    noise: tuple[float, ...],
+    sensor_places: np.ndarray,
+    no_slip_places: np.ndarray,
+    places: np.ndarray,
+    frames: np.ndarray,
+    noise: np.ndarray,
 ) -> None:
     """One tick of `JointAccelerationEstimator` by the fused method; fills the posterior.
 
     Args:
-        trust: where in `measured`; sensor_places: see `measured_acceleration`; no_slip_places: see `no_slip_condition`.
-        places: of the fields, see the first line.
+        sensor_places: see `measured_acceleration`; no_slip_places: see `no_slip_condition`.
+        places: of what is read and written besides, see the first lines.
         frames: rotation and lever arm of the IMU, gravity.
         noise: standard deviations, see `JointAccelerationConfig`.
     """
-    acceleration_at, known, sensitivity_at, innovation_at, variance_at = places
-    acceleration_noise, angular_velocity_noise, joint_velocity_noise, foot_angular_acceleration, foot_acceleration = noise
-    R_BI, p_BI, gravity = frames
+    trust, support_start, support_stop = to_fixed_tuple(places, 3)
+    acceleration_at, known, sensitivity_at, innovation_at, variance_at = to_fixed_tuple(places[3:], 5)
+    acceleration_noise, rate_noise, joint_velocity_noise, foot_angular_acceleration, foot_acceleration = to_fixed_tuple(noise, 5)
     if not _begin(posterior, elapsed, measured, model, trust, sensor_places):
         return
-    stands = standing_feet(support, measured, trust)
-    raw = measured_acceleration(measured, model, elapsed, sensor_places, R_BI, p_BI)
+    stands = standing_feet(measured[support_start:support_stop], measured, trust)
+    raw = measured_acceleration(measured, model, elapsed, sensor_places, frames)
     v = len(raw)
     # Differences of velocities have their noise twice.
     variance = np.full(v, 2 * (joint_velocity_noise / elapsed) ** 2)
-    variance[:3], variance[3:6] = 2 * (angular_velocity_noise / elapsed) ** 2, acceleration_noise**2
-    J, y = no_slip_condition(model, attitude, stands, no_slip_places, v, gravity)
+    variance[:3], variance[3:6] = 2 * (rate_noise / elapsed) ** 2, acceleration_noise**2
+    J, y = no_slip_condition(model, attitude, stands, no_slip_places, v, frames[12:])
     foot_variance = np.full(len(y), foot_acceleration**2)
     for row in range(0, len(y), 6):
         foot_variance[row : row + 3] = foot_angular_acceleration**2
@@ -275,39 +274,33 @@ class JointAccelerationEstimator(RecursiveEstimator):
         )
         self._method, self._n, self._v = config.method, n, v
         mount = ImuMount(robot)
-        gravity: Vector = tuple(robot.plant.gravity_field().gravity_vector().tolist())
-        self._frames = (mount.rotation, mount.lever_arm, gravity)
-        self._noise = (
-            float(config.acceleration_noise),
-            float(config.angular_velocity_noise),
-            float(config.joint_velocity_noise),
-            float(config.foot_angular_acceleration),
-            float(config.foot_acceleration),
+        self._frames = np.concatenate([mount.R_BI.ravel(), mount.p_BI, robot.plant.gravity_field().gravity_vector()])
+        self._noise = np.array(astuple(config)[1:], dtype=float)  # All but the method.
+        self._trust, self._support = measurements["trust"].start, measurements["support"]
+        self._sensor_places = np.array(
+            [
+                *starts(measurements, "joint_velocity", "specific_force", "angular_velocity"),
+                model["velocity"].start,
+                model["velocity"].stop,
+            ]
         )
-        self._trust, self._velocity = measurements["trust"].start, model["velocity"]
-        self._sensor_places = (
-            *starts(measurements, "joint_velocity", "specific_force", "angular_velocity"),
-            self._velocity.start,
-            self._velocity.stop,
-        )
-        self._no_slip_places = (*starts(model, "foot_jacobian", "foot_bias", "foot_rotation"), *starts(attitude, "rotation"))
-        self._places = starts(self.fields.slices, "base_angular_acceleration", "known", "sensitivity", "innovation", "innovation_variance")
+        self._no_slip_places = np.array([*starts(model, "foot_jacobian", "foot_bias", "foot_rotation"), *starts(attitude, "rotation")])
+        written = ("base_angular_acceleration", "known", "sensitivity", "innovation", "innovation_variance")
+        self._places = np.array([self._trust, self._support.start, self._support.stop, *starts(self.fields.slices, *written)])
         legs = [leg.joints for leg in robot.description.legs.values()]
         self._legs = [np.array([robot.joint_names.index(name) for name in joints]) for joints in legs]
         for name, parts in (("measurements", measurements), ("attitude", attitude), ("model_at_step_start", model)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         names = ("measurements", "attitude", "model_at_step_start")
         self._measurements, self._attitude, self._model = (self.GetInputPort(name) for name in names)
-        self._support = measurements["support"]
         self._declare_posterior(*names)
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, attitude, model = self._measurements.Eval(context), self._attitude.Eval(context), self._model.Eval(context)
-        support = measured[self._support]
         if last.item(STATUS):
             elapsed = math.nan  # Velocities are differentiated: both ends of the tick must be trusted.
         if self._method != "fused":
-            self._solve_no_slip(posterior, elapsed, measured, attitude, model, support)
+            self._solve_no_slip(posterior, elapsed, measured, attitude, model)
             return
         _fuse_accelerations(
             posterior,
@@ -315,8 +308,6 @@ class JointAccelerationEstimator(RecursiveEstimator):
             measured,
             attitude,
             model,
-            support,
-            self._trust,
             self._sensor_places,
             self._no_slip_places,
             self._places,
@@ -324,19 +315,16 @@ class JointAccelerationEstimator(RecursiveEstimator):
             self._noise,
         )
 
-    def _solve_no_slip(
-        self, posterior: np.ndarray, elapsed: float, measured: np.ndarray, attitude: np.ndarray, model: np.ndarray, support: np.ndarray
-    ) -> None:
+    def _solve_no_slip(self, posterior: np.ndarray, elapsed: float, measured: np.ndarray, attitude: np.ndarray, model: np.ndarray) -> None:
         """One tick by one of the paper's methods, which have the joints of the feet that stand from the other sensors."""
         if not _begin(posterior, elapsed, measured, model, self._trust, self._sensor_places):
             return
-        stands = standing_feet(support, measured, self._trust)
-        R_BI, p_BI, gravity = self._frames
-        acceleration = measured_acceleration(measured, model, elapsed, self._sensor_places, R_BI, p_BI)
+        stands = standing_feet(measured[self._support], measured, self._trust)
+        acceleration = measured_acceleration(measured, model, elapsed, self._sensor_places, self._frames)
         sensitivity, known = np.eye(self._v), np.zeros(self._n)
         acceleration[6:] = sensitivity[6:] = 0.0
         if stands.any():
-            J, y = no_slip_condition(model, attitude, stands, self._no_slip_places, self._v, gravity)
+            J, y = no_slip_condition(model, attitude, stands, self._no_slip_places, self._v, self._frames[12:])
             joints = np.concatenate([self._legs[k] for k in np.flatnonzero(stands)])
             known[joints] = 1.0
             columns = 6 + joints

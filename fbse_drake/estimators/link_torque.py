@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context, State
 
 from fbse_drake.errors import require_positive
@@ -42,8 +43,8 @@ def _estimate_link_torque(
     wrench_variance: np.ndarray,
     smallest_load: np.ndarray,
     joint_leg: np.ndarray,
-    places: tuple[int, ...],
-    noise: tuple[float, float, float],
+    places: np.ndarray,
+    noise: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
@@ -58,8 +59,8 @@ def _estimate_link_torque(
     if not np.isfinite(torque_command).all():
         posterior[STATUS], posterior[STATUS + 1 :] = _NOT_FINITE, 0.0
         return
-    trust, pad_force, mass_matrix, bias, foot_jacobian, acceleration_at, known, sensitivity_at = places
-    acceleration_noise, angular_velocity_noise, joint_velocity_noise = noise
+    trust, pad_force, mass_matrix, bias, foot_jacobian, acceleration_at, known, sensitivity_at = to_fixed_tuple(places, 8)
+    acceleration_noise, angular_velocity_noise, joint_velocity_noise = to_fixed_tuple(noise, 3)
     n, feet = len(torque_command), len(smallest_load)
     v = 6 + n
     posterior[STATUS] = measured[trust : trust + 2 + feet].max()
@@ -75,9 +76,10 @@ def _estimate_link_torque(
         to_sensors[:] = 0.0
         for k in range(v):
             inertia = model[row + k]
-            link_torque += inertia * acceleration[acceleration_at + k]
-            for j in range(v):
-                to_sensors[j] += inertia * sensitivity[k, j]
+            if inertia != 0.0:  # A joint of another leg.
+                link_torque += inertia * acceleration[acceleration_at + k]
+                for j in range(v):
+                    to_sensors[j] += inertia * sensitivity[k, j]
         torque_variance, impulse_variance = 0.0, 0.0
         for j in range(v):
             if j < 3:
@@ -143,12 +145,14 @@ class LinkTorqueEstimator(RecursiveEstimator):
         self._wrench_variance = np.array([config.force_noise**2 * (G**2).sum(axis=1) for G in grasp])
         self._smallest_load = np.array([config.force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()])
         self._joint_leg = leg_of_joint(robot)
-        self._places = (
-            *starts(measurements, "trust", "pad_force"),
-            *starts(model, "mass_matrix", "bias", "foot_jacobian"),
-            *starts(acceleration, "base_angular_acceleration", "known", "sensitivity"),
+        self._places = np.array(
+            [
+                *starts(measurements, "trust", "pad_force"),
+                *starts(model, "mass_matrix", "bias", "foot_jacobian"),
+                *starts(acceleration, "base_angular_acceleration", "known", "sensitivity"),
+            ]
         )
-        self._noise = (float(config.acceleration_noise), float(config.angular_velocity_noise), float(config.joint_velocity_noise))
+        self._noise = np.array([config.acceleration_noise, config.angular_velocity_noise, config.joint_velocity_noise], dtype=float)
         for name, parts in (("measurements", measurements), ("model_at_step_start", model), ("joint_acceleration", acceleration)):
             self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
         names = ("measurements", "model_at_step_start", "joint_acceleration")
@@ -164,7 +168,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             self._measurements.Eval(context),
             self._model.Eval(context),
             self._acceleration.Eval(context),
-            context.get_discrete_state(1).value(),
+            context.get_discrete_state().value(1),
             self._pads.position,
             self._pads.foot,
             self._wrench_variance,

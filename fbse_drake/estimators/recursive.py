@@ -57,7 +57,10 @@ class Fields:
 
 
 def starts(parts: Mapping[str, slice], *names: str) -> tuple[int, ...]:
-    """Where these parts of a vector start; kernels get them as a tuple."""
+    """Where these parts of a vector start.
+
+    Kernels get such places, and their other constants, as arrays and name them with `to_fixed_tuple`: numba unboxes a tuple item by item.
+    """
     return tuple(parts[name].start for name in names)
 
 
@@ -116,7 +119,7 @@ class RecursiveEstimator(LeafSystem):
         """
 
     def _calc_posterior(self, context: Context, output: BasicVector) -> None:
-        last, time = context.get_discrete_state(0).value(), context.get_time()
+        last, time = context.get_discrete_state().value(0), context.get_time()
         elapsed = time - last.item(0)
         if elapsed < self._shortest:
             output.SetFromVector(last)

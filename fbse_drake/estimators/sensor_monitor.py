@@ -5,6 +5,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
@@ -57,20 +58,17 @@ def _watch_sensors(
     channel_sensor: np.ndarray,
     pad_foot: np.ndarray,
     feet: int,
-    weighed_mass: float,
-    config: tuple[float, float, float],
-    support_thresholds: tuple[float, float, float],
+    limits: np.ndarray,
 ) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
         sensors: their readings, see `SensorMonitor`.
         channel_sensor: which sensor each channel belongs to, shape (channels,).
-        weighed_mass: that the feet carry [kg]; 0 where they need not.
-        config: the values of `SensorMonitorConfig`.
-        support_thresholds: see `detect_support`.
+        limits: the values of `SensorMonitorConfig`; the mass that the feet carry [kg], 0 where they need not; the thresholds of
+            `detect_support`.
     """
-    stuck_after, smallest_load_share, lost_after = config
+    stuck_after, smallest_load_share, lost_after, weighed_mass = to_fixed_tuple(limits, 4)
     first, channels = math.isnan(elapsed), len(channel_sensor)
     n, start = joints, STATUS + 3 + feet
     light_at = start + 2 * channels
@@ -102,7 +100,7 @@ def _watch_sensors(
     posterior[STATUS] = trust.max()
     support, waiting = light_at + 1, light_at + 1 + feet
     detect_support(
-        posterior[support:waiting], posterior[waiting:], last[support:waiting], last[waiting:], elapsed, load, trust[2:], support_thresholds
+        posterior[support:waiting], posterior[waiting:], last[support:waiting], last[waiting:], elapsed, load, trust[2:], limits[4:]
     )
 
 
@@ -138,12 +136,11 @@ class SensorMonitor(RecursiveEstimator):
         self._channel_sensor = np.concatenate([np.zeros(2 * n, dtype=int), np.ones(6, dtype=int), np.repeat(2 + self._pad_foot, 3)])
         checks_load = bool(legs) and robot.has_floating_base
         mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-        self._weighed_mass = mass if checks_load else 0.0
         measured = support if isinstance(support, MeasuredSupport) else MeasuredSupport()
         weight = 9.81 * mass
-        self._thresholds = (measured.on * weight, measured.off * weight, float(measured.debounce))
+        thresholds = (measured.on * weight, measured.off * weight, measured.debounce)
+        self._limits = np.array([*astuple(config), mass if checks_load else 0.0, *thresholds], dtype=float)
         self._support = self.fields["support"]
-        self._config = tuple(float(value) for value in astuple(config))
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         _watch_sensors(
@@ -155,9 +152,7 @@ class SensorMonitor(RecursiveEstimator):
             self._channel_sensor,
             self._pad_foot,
             self._feet,
-            self._weighed_mass,
-            self._config,
-            self._thresholds,
+            self._limits,
         )
         if self._planned is not None:
             posterior[self._support] = self._planned.Eval(context) > 0

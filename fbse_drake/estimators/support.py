@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from fbse_drake.errors import InputError, require_not_negative
 
@@ -42,7 +43,7 @@ def detect_support(
     elapsed: float,
     load: np.ndarray,
     trust: np.ndarray,
-    thresholds: tuple[float, float, float],
+    thresholds: np.ndarray,
 ) -> None:
     """One tick of `MeasuredSupport`; all arrays have shape (feet,). A foot whose sensors are not trusted stays what it was.
 
@@ -55,7 +56,7 @@ def detect_support(
         trust: status of each foot's sensors, 0 for trusted ones.
         thresholds: loads that begin and end a stance [N], and the debounce [s].
     """
-    on, off, debounce = thresholds
+    on, off, debounce = to_fixed_tuple(thresholds, 3)
     for foot in range(len(support)):
         if math.isnan(elapsed):
             support[foot], waiting[foot] = 1.0 if load[foot] > on else 0.0, 0.0
