@@ -34,7 +34,7 @@ _SHARE = 1 / 8
 # A robot that falls, or that does not follow the law that is hidden in it, gets half the size, this often.
 _HALVINGS = 6
 # With the answer in the model, what is left in the joints it is hidden in exceeds the sensors' noise by no more than this factor.
-_FAITHFUL = 2.0
+_FAITHFUL = 1.5
 # Step at which the reference is looked at [s].
 _COARSE = 0.01
 # Bodies lighter than this share of the robot hide nothing.
