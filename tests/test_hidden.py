@@ -236,7 +236,7 @@ def test_a_robot_that_falls_gets_half_the_size(walk: Scenario):
 @pytest.mark.parametrize(("coulomb", "explained"), [(0.3, True), (8.0, False)])
 def test_friction_that_the_step_cannot_follow_is_no_exercise(coulomb: float, explained: bool):
     """At rest, 8 Nm that change their sign within 5 mrad/s turn an ankle of 0.01 kg m^2 a hundred times in one step."""
-    walk = load_scenario("paper_walk", overrides=["duration=2"])
+    walk = load_scenario("paper_walk", overrides=["duration=1.5"])
     steep = answer("CoulombFriction", "right_ankle_roll", coulomb=coulomb, transition=0.005)
     assert is_explained(record(walk, "paper_walk", steep, 3)) == explained
 
