@@ -255,10 +255,15 @@ class Result:
         return bool(self.chosen) and self.truth in self.chosen[0]["confusable_with"]
 
     def is_visible(self, stated: dict[str, dict[str, float]]) -> bool:
-        """Is every hidden effect, on some target, larger than the smallest size that can be found?"""
+        """Is every hidden effect, on some target, larger than the smallest size that can be found?
+
+        Where nothing is found, also larger than the size that this log's own diagnosis states: what is hidden may keep a joint still.
+        """
+        own = {name: status["smallest_detectable_by_target"] for name, status in self.diagnosis["effects"].items()}
+        limits = [stated] if self.chosen else [stated, own]
 
         def exceeds(hidden: dict[str, Any], target: str) -> bool:
-            return _strength(hidden, target) > _limit(stated, hidden, target)
+            return all(_strength(hidden, target) > _limit(sizes, hidden, target) for sizes in limits)
 
         return all(any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden)
 

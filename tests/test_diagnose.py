@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from fbse_drake.discrepancy.add import add, read_findings
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnose import Diagnosis, _equals, diagnose, diagnosis_json
 from fbse_drake.discrepancy.experiment import planned_log
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.rollout import rollout
 from fbse_drake.discrepancy.search import Search
 from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
@@ -200,6 +202,26 @@ def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
     before, after = (rollout(model, log, planned_with=clean.believed) for model in (clean, heavier))
     assert after.mean_position < 0.1 * before.mean_position
     assert after.mean_torque_command < 0.1 * before.mean_torque_command
+
+
+def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
+    walk = load_scenario("paper_walk", overrides=["duration=0.6", "seed=3"])
+    log = simulate(replace(walk, seed=9)).log
+    walks = [simulate(replace(walk, seed=seed)).log["joint/position"] for seed in (4, 5, 6)]
+    errors = sorted(float(np.sqrt(np.mean((walk - log["joint/position"]) ** 2))) for walk in walks)
+    assert errors[0] < errors[1] < errors[2]
+    assert rollout(replace(walk, model=walk.robot), log).mean_position == pytest.approx(errors[1])
+
+
+def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_difference() -> None:
+    search = Search(Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}")), [JointSpring, TorqueBias])
+    spring, bias = (
+        next(e for e in search.best_additions(search.explain([])) if e.candidates[0].effect is c) for c in (JointSpring, TorqueBias)
+    )
+    for charge, equals in ((11.0, True), (60.0, False)):
+        assert _equals(search, bias, replace(spring, deviance=bias.deviance - charge)) == equals
+        # The other way round, parameters that are not needed are none in its favour.
+        assert not _equals(search, spring, replace(bias, deviance=spring.deviance - charge))
 
 
 @pytest.mark.parametrize("hidden", ["!BodyMass {mass: {left_foot: 3.5}}", "!FootForceLag {time_constant: {right: 0.045}}"])

@@ -7,7 +7,7 @@ import pytest
 
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual import Residual, Row, block_means
+from fbse_drake.discrepancy.residual import Residual, Row, block_means, rms
 from fbse_drake.discrepancy.sanity import check_sensors
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
@@ -36,8 +36,8 @@ def kinds(residual: Residual, kind: str) -> list[int]:
 
 def test_nothing_but_noise_is_left_where_nothing_is_missing(walk: tuple[Scenario, Log]) -> None:
     white = WhitenedResidual(Predictor(*walk).residual)
-    rms = np.sqrt(white.sse / white.count)
-    assert np.all((0.85 < rms) & (rms < 1.2)), dict(zip((r.name for r in white.residual.rows), rms.round(2), strict=True))
+    ratio = np.sqrt(white.sse / white.count)
+    assert np.all((0.85 < ratio) & (ratio < 1.2)), dict(zip((r.name for r in white.residual.rows), ratio.round(2), strict=True))
     # White: no block knows anything of the next.
     y = white.y[:, kinds(white.residual, "joint") + kinds(white.residual, "base")]
     correlation = (y[1:] * y[:-1]).sum(axis=0) / (y**2).sum(axis=0)
@@ -71,6 +71,29 @@ def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenar
     assert np.abs(residual.value[:, :n] - friction).max() < 1e-2
     # No joint effect appears in the base rows, where the robot's weight is 850 N.
     assert np.abs(residual.value[:, n : n + 6]).max() < 0.2
+
+
+def test_soles_give_way_as_the_contact_says(walk: tuple[Scenario, Log]) -> None:
+    """Without noise next to nothing is left of what a standing sole turns and sinks."""
+    scenario, _ = walk
+    scenario = replace(scenario, sensors=type(scenario.sensors)(), duration=3.0)
+    predictor = Predictor(scenario, simulate(scenario).log)
+    before, after = predictor.motion.residual, predictor.residual
+    largest = {"angular_velocity_x": 0.01, "angular_velocity_y": 0.01, "specific_force_z": 0.05}
+    for foot in predictor.robot.description.sides:
+        for name, share in largest.items():
+            row = after.row_index[f"{foot}_sole/{name}"]
+            assert rms(after.value, after.known)[row] < share * rms(before.value, before.known)[row], name
+
+
+def test_a_force_at_the_end_of_the_range_is_not_known(walk: tuple[Scenario, Log]) -> None:
+    scenario, log = walk
+    force = log["foot/left/pad_force"].copy()
+    force[1234, 2, 2] = scenario.sensors.foot_force.range
+    clipped = Predictor(scenario, changed(log, foot__left__pad_force=force)).residual
+    assert np.flatnonzero(~clipped.known[:, 0]).tolist() == [123]
+    force[1234, 2, 2] -= 1.0
+    assert Predictor(scenario, changed(log, foot__left__pad_force=force)).residual.known[:, 0].all()
 
 
 def test_gaps_are_left_out_and_touch_nothing_else(walk: tuple[Scenario, Log]) -> None:

@@ -267,7 +267,7 @@ def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Exp
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
-        equal = tuple(dict.fromkeys(e.candidates[-1].name for e in rivals[k] if e.deviance < final.deviance + MARGIN))
+        equal = tuple(dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(search, e, final)))
         findings.append(finding_of(white, rest, final, member, equal, chosen=True))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted((e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance)
@@ -341,7 +341,11 @@ def _status(
     parameter = next(iter(effect.parameters))
     smallest = search.smallest_detectable(final, effect)
     scenario = None
-    mistaken_for = [final.candidates[k] for k, alternatives in rivals.items() if any(_equals(e, final, effect) for e in alternatives)]
+    mistaken_for = [
+        final.candidates[k]
+        for k, alternatives in rivals.items()
+        if any(e.candidates[-1].effect is effect and _equals(search, e, final) for e in alternatives)
+    ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"
     elif mistaken_for:
@@ -357,9 +361,10 @@ def _status(
     return EffectStatus(verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario)
 
 
-def _equals(explanation: Explanation, final: Explanation, effect: type[Effect]) -> bool:
-    """Does an explanation that ends in this effect explain as much as the final one?"""
-    return explanation.candidates[-1].effect is effect and explanation.deviance < final.deviance + MARGIN
+def _equals(search: Search, rival: Explanation, final: Explanation) -> bool:
+    """Does a rival explain as much? One with fewer parameters does also if chance may have brought what the final explanation has more."""
+    more = len(final.fit.parameters) - len(rival.fit.parameters)
+    return rival.deviance < final.deviance + (search.threshold[min(12, more)] if more > 0 else MARGIN)
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:

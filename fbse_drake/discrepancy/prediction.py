@@ -353,11 +353,16 @@ class Predictor:
         return self._split_feet(self.motion.signals.pad_force)
 
     def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pad forces (N, P, 3), smoothed, with their springs' share as normal component, and places (P, 3) of each foot."""
-        pads = self.motion.equation.pads
-        force = savgol_filter(pad_force, _SMOOTHING, 2, axis=0)
+        """Pad forces (N, P, 3) with their springs' share as normal component, and places (P, 3) of each foot."""
+        pads, force = self.motion.equation.pads, pad_force.copy()
         force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
         return list(zip(pads.split(force), pads.split(pads.position), strict=True))
+
+    def _rate(self, values: np.ndarray) -> np.ndarray:
+        """Derivative of sampled values, (N, ...): of samples per step that of the step which ended, as velocities are in a simulation."""
+        if self.motion.recording.rows == "per_step":
+            return np.diff(values, axis=0, prepend=values[:1]) / self.motion.period
+        return np.gradient(values, self.motion.period, axis=0)
 
     def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Kinematic rows for soles that move like this.
@@ -370,7 +375,7 @@ class Predictor:
         place = result.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
         velocities = []
         for rotation, displacement in motions:
-            angular, linear = np.gradient(rotation, period, axis=0), np.gradient(displacement, period, axis=0)
+            angular, linear = self._rate(rotation), self._rate(displacement)
             g = self.motion.equation.gravity
             # R_WF^T g z for a sole turned by the rotation vector, less g z.
             tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)

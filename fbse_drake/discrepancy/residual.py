@@ -438,7 +438,8 @@ class Residual:
     rows: list[Row]
     # Centre of each block [s], shape (B,).
     time: np.ndarray
-    # (B, R); and which are known: no gap in the log, for joint rows a torque, for kinematic rows a sole that stands; no unused row.
+    # (B, R); and which are known: no gap in the log and no force at the end of its sensor's range, for joint rows a torque, for kinematic
+    # rows a sole that stands; no unused row.
     value: np.ndarray
     known: np.ndarray
     # Noise of the sensors: variance of each average, and its covariance with the next block's, each (B, R).
@@ -535,7 +536,9 @@ class RecordedMotion:
     def known(self) -> np.ndarray:
         """Which averages of which rows are known, (B, R)."""
         rows = residual_rows(self.robot)
-        in_gap = block_means(1.0 - (self.measured[:-1] & self.measured[1:]), self.length) > 0
+        # A force at the end of the sensor's range is any force beyond it.
+        measured = self.measured & (np.abs(self.signals.pad_force) < self.sensors.foot_force.range).all(axis=(1, 2))
+        in_gap = block_means(1.0 - (measured[:-1] & measured[1:]), self.length) > 0
         known = np.repeat(~in_gap[:, None], len(rows), axis=1)
         if "joint/torque_command" not in self.log:
             known[:, [row.kind == "joint" for row in rows]] = False
