@@ -53,11 +53,13 @@ def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> F
     """
     joints = [channel for channel in comparison.channels if channel.row.kind == "joint"]
     others = [channel for channel in comparison.channels if channel.row.kind != "joint"]
-    rows = max(len(joints), len(others))
+    # Of a log without torques nothing is known of the joints.
+    groups = [known for group in (joints, others) if (known := [channel for channel in group if not np.isnan(channel.rmse)])]
+    rows = max(len(group) for group in groups)
     figure = Figure(figsize=(WIDTH, max(4.5, 1.4 + 0.24 * rows)), layout="constrained")
-    body, *maps = figure.subplots(1, 3 if others else 2, width_ratios=[1.7, 1, 1] if others else [1.2, 1])
+    body, *maps = figure.subplots(1, 1 + len(groups), width_ratios=[1.7, 1, 1] if len(groups) == 2 else [1.2, 1])
     _draw_robot(body, robot, {channel.row.name: _ratio(channel.rmse, channel.noise_floor) for channel in joints}, posture)
-    for axes, channels in zip(maps, (joints, others), strict=False):
+    for axes, channels in zip(maps, groups, strict=True):
         _draw_phases(axes, channels)
     bar = figure.colorbar(ScalarMappable(_RATIO_NORM, _RATIO_COLORS), ax=maps[-1], fraction=0.06, extend="max")
     bar.set_label("error over noise, root mean squares [1]", fontsize=9)
