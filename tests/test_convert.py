@@ -290,6 +290,7 @@ def test_damaged_csv_gets_one_line(tmp_path: Path, content: str, message: str):
         ("log.xlsx", b"", "unknown kind of file (known: .csv, .txt, .json, .mat, .npz, .db3, .mcap or .bag"),
         ("log.csv", None, "No such file or directory"),
         ("log.mcap", None, "No such file or directory"),
+        ("log.mat", None, "No such file or directory"),
     ],
 )
 def test_files_of_another_kind_get_one_line(tmp_path: Path, name: str, content: bytes | None, message: str):

@@ -229,7 +229,8 @@ def _open_mat(path: Path) -> Table:
 
 def _load_mat(path: Path) -> dict[str, Any]:
     faulthandler.disable()
-    return scipy.io.loadmat(path, simplify_cells=True)
+    with path.open("rb") as file:
+        return scipy.io.loadmat(file, simplify_cells=True)
 
 
 def _open_hdf5(path: Path) -> Table:
