@@ -204,6 +204,17 @@ def test_a_log_that_does_not_fit_is_said_in_one_line(walk: tuple[Scenario, Log],
     assert channel.replace("__", "/").split("/")[0] in str(error.value)
 
 
+def test_a_log_that_tells_nothing_is_said_in_one_line() -> None:
+    scenario = load_scenario("leg_swing_gantry", overrides=["duration=1"])
+    log = simulate(scenario).log
+    silent = replace(log, channels={name: values for name, values in log.channels.items() if name != "joint/torque_command"})
+    with pytest.raises(InputError, match=r"nothing to compare a model with, joint/torque_command is missing"):
+        _ = Predictor(scenario, silent).residual
+    recording = replace(scenario.recording, unused_rows=["*"])
+    with pytest.raises(InputError, match="nothing to compare a model with"):
+        _ = Predictor(replace(scenario, recording=recording), log).residual
+
+
 def test_feet_read_upside_down_or_sideways(walk: tuple[Scenario, Log]) -> None:
     scenario, log = walk
     feet = [f"foot__{side}__pad_force" for side in log.sides]

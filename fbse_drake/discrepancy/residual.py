@@ -556,7 +556,17 @@ class RecordedMotion:
 
     @cached_property
     def residual(self) -> Residual:
-        """The residual of the model's rigid bodies; what its effects explain is not taken off."""
+        """The residual of the model's rigid bodies; what its effects explain is not taken off.
+
+        Raises:
+            InputError: no row of it is known at any time.
+        """
+        if not self.known.any():
+            lacking = "" if "joint/torque_command" in self.log else ", joint/torque_command is missing"
+            raise InputError(
+                f"the log has nothing to compare a model with{lacking} (needed: torques, or feet and an IMU, without gaps for "
+                f"{self.recording.block:g} s, in rows that recording.unused_rows and recording.least_speed leave)"
+            )
         value = self.equation.residual(self.steps)
         if self.recording.recorded_cutoff > 0:
             measured = np.zeros_like(value)
