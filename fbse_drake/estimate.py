@@ -8,15 +8,11 @@ import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import make_estimator
-from fbse_drake.estimators.foot_pads import measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
-from fbse_drake.scenario import Scenario, build_robot
-from fbse_drake.walking.reference import make_reference
-
-# Time constant of the smoothing of joint velocities that are differentiated from angles [s].
-_DIFFERENTIATION_TIME = 0.004
+from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.signals import port_values, signals_of
 
 
 @dataclass(frozen=True)
@@ -44,51 +40,16 @@ def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] 
     return EstimationResult(replace(log, channels=kept | values), tick_time)
 
 
-_CHANNELS_OF = {
-    "measured_joint_state": "joint/position",
-    "measured_imu": "imu/linear_acceleration, imu/angular_velocity",
-    "measured_pad_force": "foot/<side>/pad_force",
-    "torque_command": "joint/torque_command",
-    "measured_torque": "joint/torque_measured",
-    "torque_loss": "truth/joint/friction_torque",
-}
-
-
-def _inputs(robot: Robot, log: Log) -> dict[str, np.ndarray]:
-    """Samples for the estimator's input ports, as far as the log has them; each (N, size)."""
+def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:
+    """What the ports of a station told when the log was recorded, as far as the log says it; each
+    (N, size)."""
     if log.joints != robot.joint_names:
         raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
-    q = log["joint/position"]
-    velocity = log["joint/velocity"] if "joint/velocity" in log else differentiate(log.time, q, _DIFFERENTIATION_TIME)
-    inputs = {"measured_joint_state": np.hstack([q, velocity]), "torque_command": log["joint/torque_command"]}
-    if "imu/linear_acceleration" in log and "imu/angular_velocity" in log:
-        inputs["measured_imu"] = np.hstack([log["imu/linear_acceleration"], log["imu/angular_velocity"]])
-    if any(name.startswith("foot/") for name in log):
-        inputs["measured_pad_force"] = measured_pad_forces(robot, log).reshape(len(log.time), -1)
-    for port, name in (("measured_torque", "joint/torque_measured"), ("torque_loss", "truth/joint/friction_torque")):
-        if name in log:
-            inputs[port] = log[name]
+    values = {port: port_values(port, log) for port in ("torque_command", "torque_loss")}
+    inputs = {port: value for port, value in values.items() if value is not None}
+    for sensor in scenario.sensors.by_name.values():
+        inputs |= sensor.readings(robot, log)
     return inputs
-
-
-def differentiate(time: np.ndarray, position: np.ndarray, time_constant: float) -> np.ndarray:
-    """Causal velocity of sampled angles: differences behind two low-passes of first order.
-
-    Args:
-        time: (N,) [s]; position: (N, n) [rad]; time_constant: of each low-pass [s].
-
-    Returns:
-        Shape (N, n) [rad/s].
-    """
-    velocity = np.zeros_like(position)
-    stage = np.zeros((2, position.shape[1]))
-    for k in range(1, len(time)):
-        elapsed = time[k] - time[k - 1]
-        keep = np.exp(-elapsed / time_constant)
-        stage[0] = keep * stage[0] + (1 - keep) * (position[k] - position[k - 1]) / elapsed
-        stage[1] = keep * stage[1] + (1 - keep) * stage[0]
-        velocity[k] = stage[1]
-    return velocity
 
 
 class Replay:
@@ -97,10 +58,8 @@ class Replay:
     def __init__(self, scenario: Scenario, log: Log):
         with located("model: "):
             robot = build_robot(scenario.believed)
-        inputs = _inputs(robot, log)
-        ticks = np.arange(round(scenario.duration / scenario.control.period) + 1) * scenario.control.period
-        with located("reference: "):
-            plan = make_reference(scenario.reference, robot, ticks).plan
+        inputs = _inputs(scenario, robot, log)
+        plan = planned_reference(scenario, robot).plan
         period = float(log.meta["period"])
         estimator = make_estimator(scenario.estimator, robot, period=period, plan=plan, every_sample=True)
         if estimator is None:
@@ -108,7 +67,8 @@ class Replay:
         for i in range(estimator.num_input_ports()):
             name = estimator.get_input_port(i).get_name()
             if name not in inputs:
-                raise InputError(f"the log has no channel for the estimator's input {name} ({_CHANNELS_OF[name]})")
+                channels = ", ".join(signal.text for signal in signals_of(name))
+                raise InputError(f"the log has no channel for the estimator's input {name} ({channels})")
         self.estimator, self.time = estimator, log.time
         self.context = estimator.CreateDefaultContext()
         # Takes the update of every tick.

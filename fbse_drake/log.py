@@ -5,7 +5,6 @@ then; commanded torque and friction torque of the step that begins then.
 """
 
 import json
-import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -17,41 +16,10 @@ import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.files import write_atomically
+from fbse_drake.signals import channel_kind
 
 FORMAT_VERSION = 1
 
-# Channel name pattern -> unit, shape of one sample (n joints, m rows of any number).
-_CHANNELS: list[tuple[str, str, tuple[str | int, ...]]] = [
-    (r"time", "s", ()),
-    (r"(truth/|reference/|estimate/)?joint/position", "rad", ("n",)),
-    (r"(truth/|reference/|estimate/)?joint/velocity", "rad/s", ("n",)),
-    (r"(truth/|reference/|estimate/)?joint/acceleration", "rad/s^2", ("n",)),
-    (r"(truth/|reference/|estimate/)?joint/\w*torque\w*", "Nm", ("n",)),
-    (r"joint/temperature", "degC", ("n",)),
-    (r"joint/voltage_command", "V", ("n",)),
-    # 1 where a motor is driven, 0 where its bridge is open.
-    (r"joint/enabled", "1", ("n",)),
-    (r"imu/linear_acceleration", "m/s^2", (3,)),
-    (r"imu/angular_velocity", "rad/s", (3,)),
-    (r"(truth/)?foot/\w+/pad_force", "N", ("m", 3)),
-    (r"(truth/)?foot/\w+/wrench", "Nm, N", (6,)),
-    (r"\w+/foot/\w+/position", "m", (3,)),
-    (r"\w+/foot/\w+/support", "1", ()),
-    (r"\w+/(base|com)/position", "m", (3,)),
-    (r"\w+/base/orientation", "1", (4,)),
-    (r"\w+/(base|com)/velocity", "m/s", (3,)),
-    (r"\w+/(base|com)/acceleration", "m/s^2", (3,)),
-    (r"\w+/base/angular_velocity", "rad/s", (3,)),
-    (r"\w+/base/angular_acceleration", "rad/s^2", (3,)),
-    (r"\w+/zmp", "m", (2,)),
-    (r"estimate/support", "1", ("m",)),
-    (r"estimate/imu/angular_velocity_bias", "rad/s", (3,)),
-    (r"estimate/sensors/status", "1", ("m",)),
-    (r"estimate/\w+/status", "1", ()),
-    # Units of the filter's own states, see its LeafSystem.
-    (r"estimate/\w+/(covariance|innovation|innovation_variance)", "-", ("m",)),
-    (r"estimate/friction/parameter(s|_variance)", "-", ("n", "m")),
-]
 _REQUIRED = ("time", "joint/position")
 
 
@@ -62,8 +30,8 @@ class Log(Mapping[str, np.ndarray]):
     The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`, `joint/velocity` and
     `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force) and `imu/angular_velocity` (N, 3) in the IMU frame,
     `foot/<side>/pad_force` (N, pads, 3) in the sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
-    `reference/`, `estimate/` or `truth/`. A robot that does not know its joint torques has no `joint/torque_command`; nothing is said
-    about the torques of its joints then.
+    `reference/`, `estimate/` or `truth/`. Units and shapes of all are in `fbse_drake.signals`. A robot that
+    does not know its joint torques has no `joint/torque_command`; nothing is said about the torques of its joints then.
 
     Raises:
         InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.
@@ -171,18 +139,6 @@ class Log(Mapping[str, np.ndarray]):
             raise InputError(f"{path}: log format version {version}, this program reads {FORMAT_VERSION}")
         with located(f"{path}: "):
             return cls(content, meta)
-
-
-def channel_kind(name: str) -> tuple[str, tuple[str | int, ...]]:
-    """Unit of a channel (of a revolute joint) and the shape of a sample: numbers, "n" for all joints, "m" for any number.
-
-    Raises:
-        InputError: no such channel.
-    """
-    for pattern, unit, shape in _CHANNELS:
-        if re.fullmatch(pattern, name):
-            return unit, shape
-    raise InputError(f"channel {name}: not a channel of a log (see fbse_drake.log.Log)")
 
 
 def _shape_text(shape: tuple[Any, ...]) -> str:

@@ -4,10 +4,11 @@ A file holds one or more named scenarios. What is left out has the default below
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
@@ -22,13 +23,14 @@ from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
-from fbse_drake.robot.description import load_description
+from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
-from fbse_drake.walking.reference import ReferenceConfig
+from fbse_drake.sensors.sensor import Sensor
+from fbse_drake.walking.reference import Reference, ReferenceConfig, make_reference
 from fbse_drake.walking.walk import Walk
 
 
@@ -50,6 +52,17 @@ class RobotConfig:
             if value < 0:
                 raise InputError(f"rotor_inertia.{joint}: expected a number >= 0, found {value:g}")
 
+    def effects_of(self, kind: type[Effect], names: RobotDescription, *, key: str) -> list[Any]:
+        """Its effects of one kind (a subclass of `Effect`), with values per target.
+
+        Args:
+            key: where the config stands in the scenario, for messages: `robot` or `model`.
+
+        Raises:
+            InputError: see `Effect.resolve`.
+        """
+        return [effect.resolve(names, key=f"{key}.effects.{name}") for name, effect in self.effects.items() if isinstance(effect, kind)]
+
 
 @dataclass(frozen=True)
 class SensorsConfig:
@@ -60,6 +73,41 @@ class SensorsConfig:
     foot_force: FootForceConfig = field(default_factory=FootForceConfig)
     # Joint torque sensors, for robots that have them.
     joint_torque: JointTorqueConfig | None = None
+    # Further sensors, each under a name of your choice, as {winding: !JointTemperature {noise: 0.5}}.
+    more: dict[str, Sensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        given_by: dict[str, str] = {}
+        for name in self.more:
+            if name in self._usual:
+                raise InputError(f"more.{name}: there is a sensor of this name already")
+        for name, sensor in self.by_name.items():
+            for port in sensor.ports():
+                if port in given_by:
+                    raise InputError(f"more.{name}: gives {port}, as {given_by[port]} does already")
+                given_by[port] = name
+
+    @property
+    def _usual(self) -> dict[str, Sensor]:
+        usual = {name: getattr(self, name) for name in ("encoders", "imu", "foot_force", "joint_torque")}
+        return {name: sensor for name, sensor in usual.items() if sensor is not None}
+
+    @property
+    def by_name(self) -> dict[str, Sensor]:
+        """All sensors of the robot."""
+        return self._usual | self.more
+
+    @property
+    def without_errors(self) -> "SensorsConfig":
+        """The same sensors, where the controller and the estimators see them, as they would measure
+        exactly."""
+        return replace(
+            self,
+            encoders=EncoderConfig(period=self.encoders.period),
+            imu=ImuConfig(),
+            foot_force=FootForceConfig(),
+            joint_torque=self.joint_torque and JointTorqueConfig(),
+        )
 
 
 @dataclass(frozen=True)
@@ -153,7 +201,7 @@ class Scenario:
     seed: int = 0
     # Length of the experiment [s].
     duration: float = 11.5
-    # Python files (relative to the scenario's) or modules with physical effects of your own.
+    # Python files (relative to the scenario's) or modules with physical effects and sensors of your own.
     effect_modules: list[str] = field(default_factory=list)
     # What really happens.
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -191,17 +239,15 @@ class Scenario:
             raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
         if self.duration < self.control.period:
             raise InputError(f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}")
-        if isinstance(self.estimator, NoEstimator) and not isinstance(self.compensation, NoCompensation):
+        if isinstance(self.estimator, NoEstimator) and self.compensation.uses_estimate:
             raise InputError("compensation: needs an estimator (estimator: !Fbse {})")
         if isinstance(self.estimator, TorqueSensor) and self.sensors.joint_torque is None:
             raise InputError("estimator: !TorqueSensor needs sensors.joint_torque (as in sensors.joint_torque: {noise: 0.3})")
-        periods = {
-            "control.period": self.control.period,
-            "log.period": self.log.period,
-            "sensors.encoders.period": self.sensors.encoders.period,
-        }
-        if self.sensors.foot_force.delay > 0:
-            periods["sensors.foot_force.delay"] = self.sensors.foot_force.delay
+        periods = {"control.period": self.control.period, "log.period": self.log.period}
+        for name, sensor in self.sensors.by_name.items():
+            where = f"sensors.more.{name}" if name in self.sensors.more else f"sensors.{name}"
+            times = {f"{where}.{key}": getattr(sensor, key) for key in sensor.whole_steps}
+            periods |= {key: time for key, time in times.items() if time != 0}
         for key, period in periods.items():
             steps = period / self.plant.time_step
             if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:
@@ -243,6 +289,18 @@ def build_robot(
         ground=ground,
     )
     return robot
+
+
+def planned_reference(scenario: Scenario, model: Robot) -> Reference:
+    """The scenario's motion as a model plans it, sampled at the ticks of the control.
+
+    Raises:
+        InputError: see `make_reference`.
+    """
+    ticks = round(scenario.duration / scenario.control.period)
+    with located("reference: "):
+        time = np.arange(ticks + 1) * scenario.control.period
+        return make_reference(scenario.reference, model, time)
 
 
 def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> Scenario:
@@ -292,6 +350,9 @@ def check_joints(scenario: Scenario) -> None:
             for effect, value in config.effects.items():
                 value.resolve(names, key=f"effects.{effect}")
     names, _ = load_description(scenario.robot.description)
+    for name, sensor in scenario.sensors.more.items():
+        with located(f"sensors.more.{name}."):
+            sensor.check(names)
     for key in ("kp", "kd", "torque_limit"):
         names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
     for key in ("torque_noise", "torque_noise_share", "least_speed"):

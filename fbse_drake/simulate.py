@@ -4,7 +4,7 @@ import math
 import signal
 import threading
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -13,27 +13,17 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, VectorLogSink
 
-from fbse_drake.estimators.foot_pads import FootPads
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
-from fbse_drake.scenario import FallConfig, Scenario, dump_scenario
+from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
+from fbse_drake.signals import channels_of, ports
 from fbse_drake.station import Station, build_station
+from fbse_drake.walking.reference import Reference
 
-# Output ports that every station has and that are recorded.
-_RECORDED = (
-    "measured_joint_state",
-    "measured_imu",
-    "measured_pad_force",
-    "torque_command",
-    "plant_state",
-    "generalized_acceleration",
-    "true_pad_force",
-    "torque_loss",
-)
 # The run is looked at (fall, progress, interruption) this often in simulated time [s].
 _LOOK_PERIOD = 0.01
 
@@ -96,12 +86,7 @@ def _simulate(
 ) -> SimulationResult:
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
-    # One sink for all signals: every sink has an event of its own, which costs more than its data.
-    recorded = [station.GetOutputPort(name) for name in _recorded(station)]
-    record = builder.AddNamedSystem("record", Multiplexer([port.size() for port in recorded]))
-    for i, port in enumerate(recorded):
-        builder.Connect(port, record.get_input_port(i))
-    sink = LogVectorOutput(record.get_output_port(), builder, scenario.log.period)
+    sink = add_record(builder, station, _recorded(station), scenario.log.period)
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
@@ -164,8 +149,19 @@ def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_h
 
 def _recorded(station: Station) -> list[str]:
     """Output ports of the station that are recorded."""
-    torque = ["measured_torque"] if station.HasOutputPort("measured_torque") else []
-    return [*_RECORDED, *torque, *(station.estimator.channels if station.estimator is not None else ())]
+    return [name for name in ports(recorded=True) if station.HasOutputPort(name)]
+
+
+def add_record(builder: DiagramBuilder, station: Station, names: Sequence[str], period: float) -> VectorLogSink:
+    """Adds what records output ports of a station with a period [s], one after the other in a row.
+
+    One sink for all: every sink has an event of its own, which costs more than its data.
+    """
+    recorded = [station.GetOutputPort(name) for name in names]
+    record = builder.AddNamedSystem("record", Multiplexer([port.size() for port in recorded]))
+    for i, port in enumerate(recorded):
+        builder.Connect(port, record.get_input_port(i))
+    return LogVectorOutput(record.get_output_port(), builder, period)
 
 
 def _base_pose(robot: Robot, context: Context) -> RigidTransform:
@@ -173,30 +169,20 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
 
 
 def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
-    robot, n = station.robot, len(station.robot.joint_names)
-    ports = _recorded(station)
-    ends = np.cumsum([station.GetOutputPort(port).size() for port in ports])[:-1]
+    robot = station.robot
+    names = _recorded(station)
+    ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
     # A run that diverges may end in rows that are not numbers.
     rows = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
-    raw = dict(zip(ports, np.split(record.data().T[rows], ends, axis=1), strict=True))
+    raw = dict(zip(names, np.split(record.data().T[rows], ends, axis=1), strict=True))
     # The recorded times are sums of periods; the ticks they stand for are exact.
     time = np.round(record.sample_times()[rows] / scenario.log.period) * scenario.log.period
     channels = {
         "time": time,
-        "joint/position": raw["measured_joint_state"][:, :n],
-        "joint/velocity": raw["measured_joint_state"][:, n:],
-        "joint/torque_command": raw["torque_command"],
-        **_imu_channels(robot, raw["measured_imu"]),
-        **_measured_forces(robot, raw["measured_pad_force"]),
-        **_reference_channels(station, time),
-        **({"joint/torque_measured": raw["measured_torque"]} if "measured_torque" in raw else {}),
-        "truth/joint/friction_torque": raw["torque_loss"],
-        **_true_forces(robot, raw["true_pad_force"]),
+        **_port_channels(scenario.sensors, robot, raw),
+        **_reference_channels(station.reference, time),
         **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
     }
-    if station.estimator is not None:
-        shapes = station.estimator.channels.items()
-        channels |= {name: raw[name].reshape(len(time), *shape) for name, shape in shapes}
     meta = {
         "joints": robot.joint_names,
         "sides": robot.description.sides,
@@ -217,38 +203,20 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 
 
-def _imu_channels(robot: Robot, readings: np.ndarray) -> dict[str, np.ndarray]:
-    if not robot.description.imu:
-        return {}
-    return {"imu/linear_acceleration": readings[:, :3], "imu/angular_velocity": readings[:, 3:]}
+def _port_channels(sensors: SensorsConfig, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Channels that recorded ports, (N, size) each, become: a sensor's as it says, others as the table of
+    signals says."""
+    channels, left = {}, dict(recorded)
+    for sensor in sensors.by_name.values():
+        channels |= sensor.channels(robot, recorded)
+        for port in sensor.ports():
+            del left[port]
+    for port, values in left.items():
+        channels |= channels_of(port, values, len(robot.joint_names))
+    return channels
 
 
-def _measured_forces(robot: Robot, pad_force: np.ndarray) -> dict[str, np.ndarray]:
-    """What each foot's sensors read: the forces on its pads, or the wrench on its sole."""
-    forces, wrenches = _by_foot(robot, pad_force)
-    pads = {f"foot/{side}/pad_force": force for side, force in forces.items() if side not in wrenches}
-    return pads | {f"foot/{side}/wrench": wrench for side, wrench in wrenches.items()}
-
-
-def _true_forces(robot: Robot, pad_force: np.ndarray) -> dict[str, np.ndarray]:
-    forces, wrenches = _by_foot(robot, pad_force)
-    pads = {f"truth/foot/{side}/pad_force": force for side, force in forces.items()}
-    return pads | {f"truth/foot/{side}/wrench": wrench for side, wrench in wrenches.items()}
-
-
-def _by_foot(robot: Robot, pad_force: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Forces at each foot's pads or corners, (N, points, 3), and the wrench on each foot with a six-axis sensor, (N, 6)."""
-    forces = dict(zip(robot.description.sides, FootPads(robot).split(pad_force.reshape(len(pad_force), -1, 3)), strict=True))
-    wrenches = {
-        side: force.reshape(len(force), -1) @ G.T
-        for (side, force), G in zip(forces.items(), robot.grasp_maps, strict=True)
-        if robot.description.legs[side].corners
-    }
-    return forces, wrenches
-
-
-def _reference_channels(station: Station, time: np.ndarray) -> dict[str, np.ndarray]:
-    reference = station.reference
+def _reference_channels(reference: Reference, time: np.ndarray) -> dict[str, np.ndarray]:
     rows = np.clip(np.searchsorted(reference.time, time + 1e-9) - 1, 0, len(reference.time) - 1)
     channels = {
         "reference/joint/position": reference.joint_position[rows],

@@ -1,12 +1,18 @@
-"""The closed loop as a Drake diagram: robot, sensors, controller, reference."""
+"""The closed loop as a Drake diagram: robot, sensors, reference, controller, estimator, compensation.
 
-import numpy as np
+A station is a list of steps. Each adds its systems to the builder, takes the ports that it needs by name
+and returns the ports that it gives by name; a part that a scenario does not have gives none. What the
+names mean is in the table of signals (`fbse_drake.signals`).
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
-from pydrake.math import RigidTransform
-from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, MatrixGain
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import Demultiplexer, MatrixGain, PassThrough
 
-from fbse_drake.control.compensation import FrictionCompensation, NoCompensation
+from fbse_drake.control.compensation import FrictionCompensation
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.contact import contact_with_effects
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -15,13 +21,15 @@ from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
-from fbse_drake.robot.plant import Ground, Robot
-from fbse_drake.scenario import Scenario, build_robot
-from fbse_drake.sensors.encoders import Encoders
-from fbse_drake.sensors.foot_force import FootForceSensors
-from fbse_drake.sensors.imu import Imu
-from fbse_drake.sensors.joint_torque import JointTorqueSensors
-from fbse_drake.walking.reference import Reference, ReferenceSource, make_reference
+from fbse_drake.robot.description import RobotDescription
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.sensors.sensor import Run
+from fbse_drake.signals import ports as signal_ports
+from fbse_drake.walking.reference import RecordedReference, Reference
+from fbse_drake.wiring import connect_by_name, outputs_by_name
+
+Ports = Mapping[str, OutputPort]
 
 
 class Station(Diagram):
@@ -44,163 +52,214 @@ class Station(Diagram):
         - true_pad_force
         - torque_loss
 
-    Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration, ideal pad forces, torque
-    loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the command and may be left unconnected; a station that
-    compensates its own estimate does not have it. A station with an estimator also has a port for each of `estimator.channels`, see
-    `EstimatorDiagram`; one with joint torque sensors has `measured_torque`.
+    Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration,
+    ideal pad forces, torque loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the
+    command and may be left unconnected; a station that compensates its own estimate does not have it. A
+    station with an estimator also has a port for each of `estimator.channels`, see `EstimatorDiagram`; one
+    with joint torque sensors has `measured_torque`, one with further sensors their ports. A recorded
+    reference has a `feedforward_torque` where its log has one.
     """
 
     robot: Robot
     model: Robot
-    reference: Reference
+    reference: Reference | RecordedReference
     # None without an estimator.
     estimator: EstimatorDiagram | None
 
-    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None):
+    def __init__(
+        self,
+        scenario: Scenario,
+        meshcat: Meshcat | None = None,
+        recorded: RecordedReference | None = None,
+    ):
         super().__init__()
         builder = DiagramBuilder()
-        config = scenario.robot
-        with located("robot: "):
-            ground, settings = contact_with_effects(config.effects.values(), scenario.ground, scenario.plant, config.description)
-            self.robot = build_robot(config, builder=builder, plant=settings, ground=ground)
         with located("model: "):
             self.model = build_robot(scenario.believed)
-            if self.model.joint_names != self.robot.joint_names:
-                raise InputError(f"expected the robot's joints {self.robot.joint_names}, found {self.model.joint_names}")
-        with located("reference: "):
-            ticks = round(scenario.duration / scenario.control.period)
-            self.reference = make_reference(scenario.reference, self.model, np.arange(ticks + 1) * scenario.control.period)
-        robot, names, time_step = self.robot, self.robot.description, scenario.plant.time_step
-        n, plant = len(robot.joint_names), self.robot.plant
-        _set_initial_state(robot, self.reference, ground)
-
-        joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
-        builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
-
-        # Physical effects.
-        context = plant.CreateDefaultContext()
-        inertia = conservative_inertia(robot.joint_compliance(context))
-        resolved = [
-            effect.resolve(names, key=f"robot.effects.{key}")
-            for key, effect in config.effects.items()
-            if isinstance(effect, JointTorqueEffect)
-        ]
-        effects = builder.AddNamedSystem("effects", JointTorqueEffects(resolved, inertia, time_step))
-        loss_to_force = builder.AddNamedSystem("torque_loss_to_force", MatrixGain(-robot.joint_force_selector))
-        builder.Connect(joint_state.get_output_port(), effects.GetInputPort("joint_state"))
-        builder.Connect(effects.get_output_port(), loss_to_force.get_input_port())
-        builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
-
-        # Sensors.
-        draw = (scenario.seed, scenario.duration)
-        encoders = builder.AddNamedSystem("encoders", Encoders(scenario.sensors.encoders, n, *draw))
-        builder.Connect(joint_state.get_output_port(), encoders.get_input_port())
-        imu = builder.AddNamedSystem("imu", Imu(scenario.sensors.imu, robot, *draw))
-        for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
-            builder.Connect(plant.GetOutputPort(name), imu.GetInputPort(name))
-        if names.legs:
-            foot_force = builder.AddNamedSystem("foot_force", FootForceSensors(scenario.sensors.foot_force, robot, time_step, *draw))
-            builder.Connect(plant.get_reaction_forces_output_port(), foot_force.get_input_port())
-            pad_force = {name: foot_force.GetOutputPort(name) for name in ("measured_pad_force", "true_pad_force")}
-        else:
-            no_force = builder.AddNamedSystem("no_foot_force", ConstantVectorSource(np.zeros(0)))
-            pad_force = dict.fromkeys(("measured_pad_force", "true_pad_force"), no_force.get_output_port())
-        available = {
-            "measured_joint_state": encoders.get_output_port(),
-            "measured_imu": imu.get_output_port(),
-            "measured_pad_force": pad_force["measured_pad_force"],
-        }
-        distorting = [
-            effect.resolve(names, key=f"robot.effects.{key}") for key, effect in config.effects.items() if isinstance(effect, SensorEffect)
-        ]
-        if distorting:
-            sensor_effects = builder.AddNamedSystem("sensor_effects", SensorEffects(distorting, robot, scenario.control.period))
-            for name, port in available.items():
-                builder.Connect(port, sensor_effects.GetInputPort(name.removeprefix("measured_")))
-            # A robot without feet has no forces there to split off.
-            sizes = {name: port.size() for name, port in available.items() if port.size() > 0}
-            split = builder.AddNamedSystem("distorted", Demultiplexer(list(sizes.values())))
-            builder.Connect(sensor_effects.get_output_port(), split.get_input_port())
-            available |= {name: split.get_output_port(i) for i, name in enumerate(sizes)}
-
-        # Reference and controller.
-        source = builder.AddNamedSystem("reference", ReferenceSource(self.reference))
-        controller = builder.AddNamedSystem("controller", PositionLoop(scenario.control, names, time_step))
-        command = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
-        builder.Connect(available["measured_joint_state"], controller.GetInputPort("estimated_state"))
-        builder.Connect(source.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))
-        if scenario.control.feedforward:
-            builder.Connect(source.GetOutputPort("feedforward_torque"), controller.GetInputPort("feedforward_torque"))
-        builder.Connect(controller.get_output_port(), command.get_input_port())
-        builder.Connect(controller.get_output_port(), effects.GetInputPort("torque_command"))
-        builder.Connect(command.get_output_port(), plant.get_actuation_input_port())
-        if distorting:
-            builder.Connect(controller.get_output_port(), sensor_effects.GetInputPort("torque_command"))
-
-        # Estimator and compensation.
-        period = scenario.control.period
-        self.estimator = make_estimator(scenario.estimator, self.model, period=period, plan=self.reference.plan)
-        available |= {"torque_command": controller.get_output_port(), "torque_loss": effects.get_output_port()}
-        if scenario.sensors.joint_torque is not None:
-            sensors = JointTorqueSensors(scenario.sensors.joint_torque, n, time_step, *draw)
-            torque_sensors = builder.AddNamedSystem("joint_torque_sensors", sensors)
-            for name in ("torque_command", "torque_loss"):
-                builder.Connect(available[name], torque_sensors.GetInputPort(name))
-            available["measured_torque"] = torque_sensors.get_output_port()
-            builder.ExportOutput(torque_sensors.get_output_port(), "measured_torque")
-        if self.estimator is not None:
-            builder.AddNamedSystem("estimator", self.estimator)
-            for i in range(self.estimator.num_input_ports()):
-                port = self.estimator.get_input_port(i)
-                builder.Connect(available[port.get_name()], port)
-            for channel in self.estimator.channels:
-                builder.ExportOutput(self.estimator.GetOutputPort(channel), channel)
-        if self.estimator is not None and not isinstance(scenario.compensation, NoCompensation):
-            compensation = FrictionCompensation(scenario.compensation, names, Clock(period, period * (1 - 1e-6)))
-            builder.AddNamedSystem("compensation", compensation)
-            torque = builder.AddNamedSystem("compensation_torque", Demultiplexer([1, n]))
-            builder.Connect(self.estimator.GetOutputPort("friction_estimate"), compensation.get_input_port())
-            builder.Connect(compensation.get_output_port(), torque.get_input_port())
-            builder.Connect(torque.get_output_port(1), controller.GetInputPort("friction_estimate"))
-        else:
-            builder.ExportInput(controller.GetInputPort("friction_estimate"), "friction_estimate")
-
-        for name in ("measured_joint_state", "measured_imu", "measured_pad_force"):
-            builder.ExportOutput(available[name], name)
-        builder.ExportOutput(controller.get_output_port(), "torque_command")
-        builder.ExportOutput(source.GetOutputPort("desired_state"), "desired_state")
-        builder.ExportOutput(source.GetOutputPort("feedforward_torque"), "feedforward_torque")
-        builder.ExportOutput(plant.get_state_output_port(), "plant_state")
-        builder.ExportOutput(plant.get_generalized_acceleration_output_port(), "generalized_acceleration")
-        builder.ExportOutput(pad_force["true_pad_force"], "true_pad_force")
-        builder.ExportOutput(effects.get_output_port(), "torque_loss")
-        if meshcat is not None:
-            parameters = MeshcatVisualizerParams(publish_period=1 / 32)
-            MeshcatVisualizer.AddToBuilder(builder, builder.GetSubsystemByName("scene_graph"), meshcat, parameters)
+        self.reference = recorded or planned_reference(scenario, self.model)
+        simulated = add_robot(builder, scenario, self.reference)
+        self.robot = simulated.robot
+        if self.model.joint_names != self.robot.joint_names:
+            raise InputError(f"model: expected the robot's joints {self.robot.joint_names}, found {self.model.joint_names}")
+        ports = dict(simulated.ports)
+        ports |= add_sensors(builder, scenario, self.robot, ports)
+        ports |= add_sensor_effects(builder, scenario, self.robot, ports)
+        ports |= add_reference(builder, self.reference, scenario.plant.time_step)
+        controller = add_controller(builder, scenario, simulated, ports)
+        self.estimator = make_estimator(
+            scenario.estimator,
+            self.model,
+            period=scenario.control.period,
+            plan=self.reference.plan,
+        )
+        ports |= add_estimator(builder, self.estimator, ports)
+        add_compensation(builder, scenario, self.robot.description, controller, ports)
+        add_meshcat(builder, meshcat)
+        export(builder, ports)
         builder.BuildInto(self)
 
 
-def build_station(scenario: Scenario, *, meshcat: Meshcat | None = None) -> Station:
+def build_station(
+    scenario: Scenario,
+    *,
+    meshcat: Meshcat | None = None,
+    recorded: RecordedReference | None = None,
+) -> Station:
     """Builds the closed loop of a scenario.
 
     Args:
         meshcat: also draws the robot there.
+        recorded: what the robot is asked for, in the place of the scenario's reference; the robot then
+            starts where its context is set to, by default at zero.
 
     Raises:
         InputError: a part of the scenario that does not fit the robot, or a motion that it cannot make.
     """
-    return Station(scenario, meshcat)
+    return Station(scenario, meshcat, recorded)
 
 
-def _set_initial_state(robot: Robot, reference: Reference, ground: Ground) -> None:
-    """Makes the plant's default state the start of the reference, standing where the ground carries the weight."""
-    plant = robot.plant
-    context = plant.CreateDefaultContext()
-    if robot.has_floating_base:
-        pads = sum(leg.points for leg in robot.description.legs.values())
-        weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
-        penetration = weight / (pads * ground.stiffness)
-        p_WB = reference.base.position[0] - [0.0, 0.0, penetration]
-        plant.SetPositions(context, robot.base_pose_positions(RigidTransform(p_WB)))
-    robot.set_joint_positions(context, reference.joint_position[0])
-    plant.SetDefaultPositions(plant.GetPositions(context))
+class SimulatedRobot(NamedTuple):
+    """A robot in a diagram; see `add_robot`."""
+
+    robot: Robot
+    # Takes the torque that each joint's motor is to give, (n,) [Nm].
+    torque_command: InputPort
+    ports: dict[str, OutputPort]
+
+
+def add_robot(builder: DiagramBuilder, scenario: Scenario, reference: Reference | RecordedReference) -> SimulatedRobot:
+    """Adds the robot on its ground, with its physical effects, at the start of the reference.
+
+    Returns:
+        With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and `torque_loss` of the
+        effects (n,) [Nm], `plant_state`, `generalized_acceleration` and those of the plant that sensors
+        need: `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.
+
+    Raises:
+        InputError: effects or parts that the robot does not have.
+    """
+    config, settings = scenario.robot, scenario.plant
+    with located("robot: "):
+        ground, settings = contact_with_effects(config.effects.values(), scenario.ground, settings, config.description)
+        robot = build_robot(config, builder=builder, plant=settings, ground=ground)
+    reference.set_start(robot, ground)
+    plant, n = robot.plant, len(robot.joint_names)
+    joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
+    command = builder.AddNamedSystem("torque_command", PassThrough(n))
+    actuation = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
+    torque_effects = config.effects_of(JointTorqueEffect, robot.description, key="robot")
+    inertia = conservative_inertia(robot.joint_compliance(plant.CreateDefaultContext()))
+    system = JointTorqueEffects(torque_effects, inertia, scenario.plant.time_step)
+    effects = builder.AddNamedSystem("effects", system)
+    loss_to_force = MatrixGain(-robot.joint_force_selector)
+    loss_to_force = builder.AddNamedSystem("torque_loss_to_force", loss_to_force)
+    force = plant.get_applied_generalized_force_input_port()
+    for source, target in (
+        (plant.get_state_output_port(), joint_state.get_input_port()),
+        (joint_state.get_output_port(), effects.GetInputPort("joint_state")),
+        (command.get_output_port(), effects.GetInputPort("torque_command")),
+        (command.get_output_port(), actuation.get_input_port()),
+        (actuation.get_output_port(), plant.get_actuation_input_port()),
+        (effects.get_output_port(), loss_to_force.get_input_port()),
+        (loss_to_force.get_output_port(), force),
+    ):
+        builder.Connect(source, target)
+    ports = {
+        "joint_state": joint_state.get_output_port(),
+        "torque_command": command.get_output_port(),
+        "torque_loss": effects.get_output_port(),
+        "plant_state": plant.get_state_output_port(),
+        "generalized_acceleration": plant.get_generalized_acceleration_output_port(),
+        "reaction_forces": plant.get_reaction_forces_output_port(),
+    }
+    for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
+        ports[name] = plant.GetOutputPort(name)
+    return SimulatedRobot(robot, command.get_input_port(), ports)
+
+
+def add_sensors(builder: DiagramBuilder, scenario: Scenario, robot: Robot, ports: Ports) -> dict[str, OutputPort]:
+    """Adds the sensors to a robot with these ports; returns what they give."""
+    run, given = Run(scenario.plant.time_step, scenario.seed, scenario.duration), {}
+    for name, sensor in scenario.sensors.by_name.items():
+        given |= sensor.add(builder, name, robot, ports, run)
+    return given
+
+
+def add_sensor_effects(builder: DiagramBuilder, scenario: Scenario, robot: Robot, ports: Ports) -> dict[str, OutputPort]:
+    """Adds the robot's effects in its sensors; returns, in their place, what the sensors then give."""
+    resolved = scenario.robot.effects_of(SensorEffect, robot.description, key="robot")
+    if not resolved:
+        return {}
+    system = SensorEffects(resolved, robot, scenario.control.period)
+    effects = builder.AddNamedSystem("sensor_effects", system)
+    measured = {name: ports[f"measured_{name}"] for name in ("joint_state", "imu", "pad_force")}
+    connect_by_name(builder, {**measured, "torque_command": ports["torque_command"]}, effects)
+    # A robot without feet has no forces there to split off.
+    sizes = {name: port.size() for name, port in measured.items() if port.size() > 0}
+    split = builder.AddNamedSystem("distorted", Demultiplexer(list(sizes.values())))
+    builder.Connect(effects.get_output_port(), split.get_input_port())
+    return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(sizes)}
+
+
+def add_reference(builder: DiagramBuilder, reference: Reference | RecordedReference, time_step: float) -> dict[str, OutputPort]:
+    """Adds what the robot is asked for; returns `desired_state` and what comes with it."""
+    return outputs_by_name(builder.AddNamedSystem("reference", reference.source(time_step)))
+
+
+def add_controller(builder: DiagramBuilder, scenario: Scenario, robot: SimulatedRobot, ports: Ports) -> PositionLoop:
+    """Adds the position loop, which commands the robot; its input `friction_estimate` stays open."""
+    config, names = scenario.control, robot.robot.description
+    system = PositionLoop(config, names, scenario.plant.time_step)
+    controller = builder.AddNamedSystem("controller", system)
+    builder.Connect(ports["measured_joint_state"], controller.GetInputPort("estimated_state"))
+    wanted = {"desired_state", "enabled"} | ({"feedforward_torque"} if config.feedforward else set())
+    asked = {name: port for name, port in ports.items() if name in wanted}
+    connect_by_name(builder, asked, controller)
+    builder.Connect(controller.get_output_port(), robot.torque_command)
+    return controller
+
+
+def add_estimator(builder: DiagramBuilder, estimator: EstimatorDiagram | None, ports: Ports) -> dict[str, OutputPort]:
+    """Adds the friction estimator; returns its estimates."""
+    if estimator is None:
+        return {}
+    builder.AddNamedSystem("estimator", estimator)
+    connect_by_name(builder, ports, estimator)
+    return outputs_by_name(estimator)
+
+
+def add_compensation(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    names: RobotDescription,
+    controller: PositionLoop,
+    ports: Ports,
+) -> None:
+    """Adds what the controller makes of the estimate; without it, an input port of the station's."""
+    target = controller.GetInputPort("friction_estimate")
+    if not scenario.compensation.uses_estimate:
+        builder.ExportInput(target, "friction_estimate")
+        return
+    period, n = scenario.control.period, target.size()
+    system = FrictionCompensation(scenario.compensation, names, Clock(period, period * (1 - 1e-6)))
+    compensation = builder.AddNamedSystem("compensation", system)
+    torque = builder.AddNamedSystem("compensation_torque", Demultiplexer([1, n]))
+    builder.Connect(ports["friction_estimate"], compensation.get_input_port())
+    builder.Connect(compensation.get_output_port(), torque.get_input_port())
+    builder.Connect(torque.get_output_port(1), target)
+
+
+def add_meshcat(builder: DiagramBuilder, meshcat: Meshcat | None) -> None:
+    """Adds what draws the robot, where it is to be drawn."""
+    if meshcat is None:
+        return
+    parameters = MeshcatVisualizerParams(publish_period=1 / 32)
+    scene_graph = builder.GetSubsystemByName("scene_graph")
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+
+
+def export(builder: DiagramBuilder, ports: Ports) -> None:
+    """Makes those of the ports that are in the table of signals output ports of the station."""
+    for name in signal_ports():
+        if name in ports:
+            builder.ExportOutput(ports[name], name)

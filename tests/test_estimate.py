@@ -8,11 +8,12 @@ import pytest
 from conftest import scenario
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
-from fbse_drake.estimate import differentiate, estimate
+from fbse_drake.estimate import estimate
 from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse, make_estimator
 from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.robot.plant import make_robot
+from fbse_drake.sensors.encoders import differentiate
 
 Run = Callable[..., Log]
 # The plan, of which the duration is, only says where the feet stand at first.

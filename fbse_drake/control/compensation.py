@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -11,14 +12,28 @@ from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.description import RobotDescription
 
 
+class LowPass(NamedTuple):
+    """What a compensation makes of the estimate: its share through a low-pass, within limits."""
+
+    # Bandwidth of each joint, shape (n,) [rad/s].
+    rate: np.ndarray
+    share: float
+    # Largest torque in either direction [Nm].
+    limit: float
+
+
 @dataclass(frozen=True)
 class NoCompensation:
     """The estimate is only watched."""
+
+    uses_estimate: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class IntegralCompensation:
     """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor): the estimate through a low-pass of bandwidth k_i."""
+
+    uses_estimate: ClassVar[bool] = True
 
     # Integral gain by joint [rad/s]; the paper has 1 in the hip pitch, 4 in the ankle roll and 2 elsewhere.
     gain: dict[str, float] = field(default_factory=lambda: {"all": 2.0})
@@ -28,10 +43,16 @@ class IntegralCompensation:
             if value < 0:
                 raise InputError(f"gain.{joint}: expected a number >= 0, found {value:g}")
 
+    def low_pass(self, names: RobotDescription) -> LowPass:
+        """Raises InputError for an unknown joint, or one without a gain."""
+        return LowPass(names.per_joint(self.gain, key="compensation.gain"), 1.0, math.inf)
+
 
 @dataclass(frozen=True)
 class FeedforwardCompensation:
     """The estimate, low-passed and limited, is added to the command."""
+
+    uses_estimate: ClassVar[bool] = True
 
     # Cut-off of the low-pass of first order [Hz].
     cutoff: float = 20.0
@@ -44,6 +65,11 @@ class FeedforwardCompensation:
         require_positive(self, "cutoff", "limit")
         if not 0 <= self.share <= 1:
             raise InputError(f"share: expected a number in [0, 1], found {self.share:g}")
+
+    def low_pass(self, names: RobotDescription) -> LowPass:
+        """The same for all joints."""
+        rate = np.full(len(names.joint_names), 2 * math.pi * self.cutoff)
+        return LowPass(rate, self.share, self.limit)
 
 
 CompensationConfig = NoCompensation | IntegralCompensation | FeedforwardCompensation
@@ -67,12 +93,7 @@ class FrictionCompensation(RecursiveEstimator):
         """Raises InputError for an unknown joint, or one without a gain."""
         n = len(names.joint_names)
         super().__init__({"torque": n}, clock)
-        if isinstance(config, IntegralCompensation):
-            self._rate = names.per_joint(config.gain, key="compensation.gain")
-            self._share, self._limit = 1.0, math.inf
-        else:
-            self._rate = np.full(n, 2 * math.pi * config.cutoff)
-            self._share, self._limit = config.share, config.limit
+        self._rate, self._share, self._limit = config.low_pass(names)
         self._estimate = self.DeclareVectorInputPort("friction_estimate", n)
         self._declare_posterior("friction_estimate")
 

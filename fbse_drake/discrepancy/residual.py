@@ -27,11 +27,11 @@ from scipy.signal import butter, sosfiltfilt
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.foot_pads import FootPads, measured_pad_forces
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
+from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
 
 # Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
 _ORDER, _PADDING = 4, 100

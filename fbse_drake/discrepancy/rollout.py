@@ -2,31 +2,26 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, LogVectorOutput, MatrixGain, Multiplexer, TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
 
-from fbse_drake.control.position_loop import PositionLoop, PositionLoopConfig
 from fbse_drake.discrepancy.servo import scaled_gains, stretches
-from fbse_drake.effects.joint_torque import JointTorqueEffect
-from fbse_drake.effects.sensor import SensorEffect, SensorEffects, SensorSignals
-from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
+from fbse_drake.effects.effect import ResolvedEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
-from fbse_drake.scenario import RobotConfig, Scenario, build_robot
-from fbse_drake.simulate import simulate
-from fbse_drake.walking.reference import Recorded
+from fbse_drake.scenario import RobotConfig, Scenario
+from fbse_drake.signals import channels_of
+from fbse_drake.simulate import add_record, simulate
+from fbse_drake.station import build_station
+from fbse_drake.walking.reference import Recorded, RecordedReference
 
 # Where velocities were not measured, that at the start of a stretch is the slope of a parabola through so many samples.
 _STARTING_SAMPLES = 10
-# A sample that is late by less than this share of a step still belongs to it.
-_EARLY = 0.1
 # A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and then noise alone lets a foot land or a
 # joint slip otherwise, and the rest of the walk is another.
 _DRAWS = 3
@@ -66,13 +61,13 @@ def rollout(
 ) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
-    Reference and controller are the scenario's; sensor noise is drawn anew, three times, and the median of the errors is returned. A
-    `!Recorded` reference is that of the log: the model starts where each stretch of the log starts, and its position loop gets what the
+    Reference and controller are the scenario's, and so are estimator and compensation, where the estimate is compensated: it moves the robot.
+    Sensor noise is drawn anew, three times, and the median of the errors is returned. A `!Recorded` reference is that of the log: the model starts where each stretch of the log starts, and its position loop gets what the
     robot's got. Played open loop, a recorded torque would say little: its errors add up, and what is not stable in itself falls.
 
     Args:
-        planned_with: the model that reference and feed-forward were planned with when the log was made, which did not know what has been
-            added since; by default the scenario's.
+        planned_with: the model that reference and feed-forward were planned with, and that the estimator believed, when the log was made,
+            which did not know what has been added since; by default the scenario's.
 
     Returns:
         None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
@@ -80,13 +75,23 @@ def rollout(
     Raises:
         InputError: see `simulate`; or the log and the simulation share no time.
     """
+    believed = _believed(scenario, planned_with or scenario.believed)
     if isinstance(scenario.reference, Recorded):
-        return _recorded_rollout(scenario, scenario.reference, log, progress) if "reference/joint/position" in log else None
-    duration = min(scenario.duration, float(log.time[-1]))
-    planned_with = planned_with or scenario.believed
-    believed = replace(scenario, robot=scenario.believed, model=planned_with, estimator=NoEstimator(), duration=duration)
+        if "reference/joint/position" not in log:
+            return None
+        return _recorded_rollout(believed, scenario.reference, log, progress)
+    believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
     draws = [_simulated_error(replace(believed, seed=scenario.seed + 1 + k), log, progress) for k in range(_DRAWS)]
     return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[_DRAWS // 2]
+
+
+def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
+    """The scenario with its model in the place of the robot, and what controller and estimator believed.
+
+    An estimate that nobody uses does not move the robot, and takes its time.
+    """
+    estimator = scenario.estimator if scenario.compensation.uses_estimate else NoEstimator()
+    return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
 
 
 def _simulated_error(scenario: Scenario, log: Log, progress: Callable[[float], None] | None) -> RolloutError:
@@ -128,7 +133,7 @@ def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress
     for stretch, constants in stretches(log):
         with located("control: "):
             control = scaled_gains(scenario.control, recorded, constants)
-        done, failure = _simulate_stretch(scenario, control, log.part(stretch))
+        done, failure = _simulate_stretch(replace(scenario, control=control), log.part(stretch))
         count = len(next(iter(done.values())))
         rows[stretch.start : stretch.start + count] = True
         channels.append(done)
@@ -142,67 +147,29 @@ def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress
     return _rollout_error(log, rows, {name: np.concatenate([c[name] for c in channels]) for name in names}, simulated_time, failure)
 
 
-def _simulate_stretch(scenario: Scenario, control: PositionLoopConfig, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
-    """The model in the log's place, from the log's first state on.
+def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
+    """The scenario's robot, which here is the model, in the log's place, from the log's first state on;
+    its sensors measure exactly.
 
     Returns:
         What it did at the log's sample times, by channel; and why these are fewer than the log's, or None.
     """
-    builder, time_step, start = DiagramBuilder(), scenario.plant.time_step, float(log.time[0])
-    with located("model: "):
-        robot = build_robot(scenario.believed, builder=builder, plant=scenario.plant)
-    if robot.has_floating_base:
-        raise InputError("reference: a recorded motion is only simulated for a robot with a fixed base")
-    plant, names, n = robot.plant, robot.description, len(robot.joint_names)
-    effects = {
-        kind: [e.resolve(names, key=f"model.effects.{key}") for key, e in scenario.believed.effects.items() if isinstance(e, kind)]
-        for kind in (JointTorqueEffect, SensorEffect)
-    }
-    inertia = conservative_inertia(robot.joint_compliance(plant.CreateDefaultContext()))
-
-    joint_state = builder.AddSystem(MatrixGain(robot.joint_state_selector))
-    losses = builder.AddSystem(JointTorqueEffects(effects[JointTorqueEffect], inertia, time_step))
-    loss_to_force = builder.AddSystem(MatrixGain(-robot.joint_force_selector))
-    sensors = builder.AddSystem(SensorEffects(effects[SensorEffect], robot, control.period))
-    others = sensors.get_output_port().size() - 2 * n
-    measured = builder.AddSystem(Demultiplexer([2 * n, others]))
-    controller = builder.AddSystem(PositionLoop(control, names, time_step))
-    actuation = builder.AddSystem(MatrixGain(robot.actuation_selector))
-    at_rest = np.zeros_like(log["reference/joint/position"])
-    held = {"desired_state": np.hstack([log["reference/joint/position"], log.get("reference/joint/velocity", at_rest)])}
-    if control.feedforward and "reference/joint/feedforward_torque" in log:
-        held["feedforward_torque"] = log["reference/joint/feedforward_torque"]
-    if "joint/enabled" in log:
-        held["enabled"] = log["joint/enabled"]
-    for name, values in held.items():
-        source = builder.AddSystem(TrajectorySource(PiecewisePolynomial.ZeroOrderHold(log.time - start - _EARLY * time_step, values.T)))
-        builder.Connect(source.get_output_port(), controller.GetInputPort(name))
-    for name in ("imu", "pad_force"):
-        unread = builder.AddSystem(ConstantVectorSource(np.zeros(sensors.GetInputPort(name).size())))
-        builder.Connect(unread.get_output_port(), sensors.GetInputPort(name))
-
-    builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
-    builder.Connect(joint_state.get_output_port(), losses.GetInputPort("joint_state"))
-    builder.Connect(joint_state.get_output_port(), sensors.GetInputPort("joint_state"))
-    builder.Connect(losses.get_output_port(), loss_to_force.get_input_port())
-    builder.Connect(loss_to_force.get_output_port(), plant.get_applied_generalized_force_input_port())
-    builder.Connect(sensors.get_output_port(), measured.get_input_port())
-    builder.Connect(measured.get_output_port(0), controller.GetInputPort("estimated_state"))
-    for port in (losses.GetInputPort("torque_command"), sensors.GetInputPort("torque_command"), actuation.get_input_port()):
-        builder.Connect(controller.get_output_port(), port)
-    builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port())
-    record = builder.AddSystem(Multiplexer([2 * n, n]))
-    builder.Connect(measured.get_output_port(0), record.get_input_port(0))
-    builder.Connect(controller.get_output_port(), record.get_input_port(1))
-    sink = LogVectorOutput(record.get_output_port(), builder, time_step)
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
+    time_step, start = scenario.plant.time_step, float(log.time[0])
+    duration = float(log.time[-1]) - start + time_step
+    exact = replace(scenario, sensors=scenario.sensors.without_errors, duration=duration)
+    builder = DiagramBuilder()
+    station = builder.AddSystem(build_station(exact, recorded=RecordedReference(log)))
+    robot = station.robot
+    sink = add_record(builder, station, ("measured_joint_state", "torque_command"), time_step)
+    simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    robot.set_state(plant.GetMyMutableContextFromRoot(context), *_first_state(robot, effects[SensorEffect], log, control.period))
+    effects = scenario.robot.effects_of(SensorEffect, robot.description, key="model")
+    state = _first_state(robot, effects, log, scenario.control.period)
+    robot.set_state(robot.plant.GetMyMutableContextFromRoot(context), *state)
 
     failure = None
     try:
-        simulator.AdvanceTo(float(log.time[-1]) - start + time_step)
+        simulator.AdvanceTo(duration)
     except RuntimeError as error:
         failure = f"t = {start + context.get_time():.3f} s: the solver failed: {str(error).splitlines()[0]}"
     found = sink.FindLog(context)
@@ -213,12 +180,14 @@ def _simulate_stretch(scenario: Scenario, control: PositionLoopConfig, log: Log)
     time, rows = time[finite], rows[finite]
     wanted = (log.time - start)[log.time - start <= time[-1] + 1e-9]
     # Motion between the steps, and the command of the step that a sample is in.
+    n = len(robot.joint_names)
     motion = np.stack([np.interp(wanted, time, column) for column in rows[:, : 2 * n].T], axis=1)
     command = rows[np.clip(np.searchsorted(time, wanted + 1e-9) - 1, 0, None), 2 * n :]
-    return dict(zip(_COMPARED, (motion[:, :n], motion[:, n:], command), strict=True)), failure
+    channels = channels_of("measured_joint_state", motion, n)
+    return channels | channels_of("torque_command", command, n), failure
 
 
-def _first_state(robot: Robot, effects: list[Any], log: Log, period: float) -> tuple[np.ndarray, np.ndarray]:
+def _first_state(robot: Robot, effects: list[ResolvedEffect], log: Log, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
     few = slice(0, _STARTING_SAMPLES)
     q = log["joint/position"][0]

@@ -12,7 +12,6 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
-from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.estimators.spatial import (
     Rotation,
@@ -27,6 +26,7 @@ from fbse_drake.estimators.spatial import (
     vector_at,
 )
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
 
 @dataclass(frozen=True)

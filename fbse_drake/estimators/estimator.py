@@ -41,6 +41,7 @@ from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorCon
 from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal
+from fbse_drake.signals import estimates
 from fbse_drake.walking.plan import TaskPlan
 
 
@@ -64,40 +65,6 @@ class Fbse:
 
 
 EstimatorConfig = NoEstimator | Fbse | TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
-
-# Fields of the estimators' posteriors that a log keeps: system, field, channel.
-_CHANNELS = [
-    ("sensor_monitor", "trust", "estimate/sensors/status"),
-    ("sensor_monitor", "support", "estimate/support"),
-    ("attitude", "status", "estimate/attitude/status"),
-    ("attitude", "orientation", "estimate/base/orientation"),
-    ("attitude", "angular_velocity_bias", "estimate/imu/angular_velocity_bias"),
-    ("attitude", "covariance", "estimate/attitude/covariance"),
-    ("attitude", "innovation", "estimate/attitude/innovation"),
-    ("attitude", "innovation_variance", "estimate/attitude/innovation_variance"),
-    ("base_state", "status", "estimate/base_state/status"),
-    ("base_state", "base_position", "estimate/base/position"),
-    ("base_state", "base_velocity", "estimate/base/velocity"),
-    ("base_state", "com_position", "estimate/com/position"),
-    ("base_state", "com_velocity", "estimate/com/velocity"),
-    ("base_state", "zmp", "estimate/zmp"),
-    ("base_state", "covariance", "estimate/base_state/covariance"),
-    ("base_state", "innovation", "estimate/base_state/innovation"),
-    ("base_state", "innovation_variance", "estimate/base_state/innovation_variance"),
-    ("joint_acceleration", "status", "estimate/joint_acceleration/status"),
-    ("joint_acceleration", "joint_acceleration", "estimate/joint/acceleration"),
-    ("joint_acceleration", "innovation", "estimate/joint_acceleration/innovation"),
-    ("joint_acceleration", "innovation_variance", "estimate/joint_acceleration/innovation_variance"),
-    ("link_torque", "status", "estimate/link_torque/status"),
-    ("link_torque", "link_torque", "estimate/joint/link_torque"),
-    ("link_torque", "residual", "estimate/joint/residual_torque"),
-    ("friction", "status", "estimate/friction/status"),
-    ("friction", "friction", "estimate/joint/friction_torque"),
-    ("friction", "parameters", "estimate/friction/parameters"),
-    ("friction", "parameter_variance", "estimate/friction/parameter_variance"),
-    ("friction", "innovation", "estimate/friction/innovation"),
-    ("friction", "innovation_variance", "estimate/friction/innovation_variance"),
-]
 
 
 class EstimatorDiagram(Diagram):
@@ -247,12 +214,12 @@ class EstimatorDiagram(Diagram):
 
     def _export(self, n: int) -> None:
         self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
-        for system, name, channel in _CHANNELS:
+        for row in estimates():
+            system, name = row.estimator, row.field
             size = self._systems[system].fields.sizes.get(name, 0) if system in self._systems else 0
             if size > 0:
-                self._builder.ExportOutput(self._field_port(system, name), channel)
-                per_joint = name in ("parameters", "parameter_variance")
-                self.channels[channel] = (n, size // n) if per_joint else () if name == "status" else (size,)
+                self._builder.ExportOutput(self._field_port(system, name), row.port)
+                self.channels[row.channel] = row.sample_shape(n, size)
 
 
 def make_estimator(

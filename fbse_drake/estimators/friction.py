@@ -16,9 +16,9 @@ from pydrake.systems.framework import Context
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
-from fbse_drake.estimators.foot_pads import leg_of_joint
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import leg_of_joint
 
 
 def _adopted_model() -> CoulombViscousFriction:

@@ -9,9 +9,9 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context, State
 
 from fbse_drake.errors import require_positive
-from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches, leg_of_joint
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
 from fbse_drake.robot.plant import Robot, grasp_map
+from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
 _NOT_FINITE = float(Status.NOT_FINITE)
 

@@ -9,9 +9,9 @@ from pydrake.systems.framework import Context, State
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion
 from fbse_drake.errors import require_positive
-from fbse_drake.estimators.foot_pads import FootPads, foot_wrenches
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
 
 @dataclass(frozen=True)

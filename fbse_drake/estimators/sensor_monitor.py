@@ -9,10 +9,10 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
-from fbse_drake.estimators.foot_pads import FootPads, vertical_loads
 from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, detect_support
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
 _OK, _NOT_FINITE, _STUCK, _LOST = float(Status.OK), float(Status.NOT_FINITE), float(Status.STUCK), float(Status.LOST)
 

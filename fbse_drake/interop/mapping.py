@@ -18,7 +18,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from fbse_drake import resources, schema
 from fbse_drake.errors import InputError, located, require_positive
 from fbse_drake.interop.units import si_factor
-from fbse_drake.log import channel_kind
+from fbse_drake.signals import channel_kind
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,30 @@
 """Joint encoders."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
+from fbse_drake.sensors.sensor import Run, Sensor, in_library
+from fbse_drake.signals import Signal, signals_of
+
+# Time constant of the smoothing of joint velocities that are differentiated from angles [s].
+_DIFFERENTIATION_TIME = 0.004
 
 
+@in_library
 @dataclass(frozen=True)
-class EncoderConfig:
+class EncoderConfig(Sensor):
     """Angles are read as `resolution * round((angle + noise) / resolution)`."""
+
+    signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_joint_state")
+    whole_steps: ClassVar[tuple[str, ...]] = ("period",)
 
     # One count [rad]; 0 reads exactly. A 17-bit encoder has 2 pi / 2^17 = 4.8e-5.
     resolution: float = 0.0
@@ -31,9 +43,39 @@ class EncoderConfig:
             raise InputError(f"velocity: expected exact or differenced, found {self.velocity}")
         require_positive(self, "period")
 
+    def system(self, robot: Robot, run: Run) -> "Encoders":
+        return Encoders(self, len(robot.joint_names), run.seed, run.duration)
+
+    def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:
+        """Without `joint/velocity` the angles are differentiated and smoothed."""
+        if "joint/velocity" not in log:
+            velocity = differentiate(log.time, log["joint/position"], _DIFFERENTIATION_TIME)
+            log = replace(log, channels={**log.channels, "joint/velocity": velocity})
+        return super().readings(robot, log)
+
+
+def differentiate(time: np.ndarray, position: np.ndarray, time_constant: float) -> np.ndarray:
+    """Causal velocity of sampled angles: differences behind two low-passes of first order.
+
+    Args:
+        time: (N,) [s]; position: (N, n) [rad]; time_constant: of each low-pass [s].
+
+    Returns:
+        Shape (N, n) [rad/s].
+    """
+    velocity = np.zeros_like(position)
+    stage = np.zeros((2, position.shape[1]))
+    for k in range(1, len(time)):
+        elapsed = time[k] - time[k - 1]
+        keep = np.exp(-elapsed / time_constant)
+        stage[0] = keep * stage[0] + (1 - keep) * (position[k] - position[k - 1]) / elapsed
+        stage[1] = keep * stage[1] + (1 - keep) * stage[0]
+        velocity[k] = stage[1]
+    return velocity
+
 
 def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:
-    """Angle in whole counts [rad]; a resolution of 0 leaves it as it is."""
+    """Angle [rad], or another quantity, in whole counts; a resolution of 0 leaves it as it is."""
     return angle if resolution == 0 else resolution * np.rint(angle / resolution)
 
 

@@ -1,22 +1,35 @@
 """Force sensors under the feet: three-axis sensors in pads, or one six-axis sensor per foot."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import Adder, DiscreteTimeDelay, Gain, MatrixGain, Saturation
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
+from pydrake.systems.primitives import Adder, ConstantVectorSource, DiscreteTimeDelay, Gain, MatrixGain, Saturation
 from scipy.linalg import block_diag
 
 from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
+from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
+from fbse_drake.sensors.sensor import Run, Sensor, in_library
+from fbse_drake.signals import Signal, signals_of
 
 
+@in_library
 @dataclass(frozen=True)
-class FootForceConfig:
+class FootForceConfig(Sensor):
     """Errors of each axis of each pad, or of a six-axis sensor; the defaults measure exactly."""
+
+    signals: ClassVar[tuple[Signal, ...]] = (
+        *signals_of("measured_pad_force"),
+        *signals_of("true_pad_force"),
+    )
+    whole_steps: ClassVar[tuple[str, ...]] = ("delay",)
 
     # Standard deviation of white noise of a force [N], and of the moment of a six-axis sensor [Nm].
     noise: float = 0.0
@@ -33,6 +46,40 @@ class FootForceConfig:
     def __post_init__(self) -> None:
         require_not_negative(self, "noise", "moment_noise", "delay")
         require_positive(self, "gain", "range", "period")
+
+    def system(self, robot: Robot, run: Run) -> System:
+        return FootForceSensors(self, robot, *run) if robot.description.legs else NoFeet()
+
+    def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The forces on the pads of each foot, or the wrench on its sole; of the true forces both."""
+        forces, wrenches = _by_foot(robot, recorded["measured_pad_force"])
+        pads = {side: force for side, force in forces.items() if side not in wrenches}
+        true_forces, true_wrenches = _by_foot(robot, recorded["true_pad_force"])
+        return {
+            **{f"foot/{side}/pad_force": force for side, force in pads.items()},
+            **{f"foot/{side}/wrench": wrench for side, wrench in wrenches.items()},
+            **{f"truth/foot/{side}/pad_force": force for side, force in true_forces.items()},
+            **{f"truth/foot/{side}/wrench": wrench for side, wrench in true_wrenches.items()},
+        }
+
+    def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:
+        if robot.description.legs and not any(name.startswith("foot/") for name in log):
+            return {}
+        force = measured_pad_forces(robot, log)
+        return {"measured_pad_force": force.reshape(len(log.time), -1)}
+
+
+def _by_foot(robot: Robot, pad_force: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Forces at each foot's pads or corners, (N, points, 3), and the wrench on each foot with a six-axis
+    sensor, (N, 6)."""
+    pad_force = pad_force.reshape(len(pad_force), -1, 3)
+    forces = dict(zip(robot.description.sides, FootPads(robot).split(pad_force), strict=True))
+    wrenches = {
+        side: force.reshape(len(force), -1) @ G.T
+        for (side, force), G in zip(forces.items(), robot.grasp_maps, strict=True)
+        if robot.description.legs[side].corners
+    }
+    return forces, wrenches
 
 
 def wrench_deviations(config: FootForceConfig, robot: Robot) -> list[np.ndarray]:
@@ -82,6 +129,26 @@ class PadForces(LeafSystem):
         reactions = self._reaction_forces.Eval(context)
         # A joint's reaction acts on the pad, against the ground's force.
         output.SetFromVector(-np.concatenate([reactions[joint].translational() for joint in self._joints]))
+
+
+class NoFeet(Diagram):
+    """The force sensors of a robot without feet: ports of size 0.
+
+    .. pydrake_system::
+
+        name: NoFeet
+        output_ports:
+        - true_pad_force
+        - measured_pad_force
+    """
+
+    def __init__(self):
+        super().__init__()
+        builder = DiagramBuilder()
+        nothing = builder.AddNamedSystem("nothing", ConstantVectorSource(np.zeros(0)))
+        for name in ("true_pad_force", "measured_pad_force"):
+            builder.ExportOutput(nothing.get_output_port(), name)
+        builder.BuildInto(self)
 
 
 class FootForceSensors(Diagram):

@@ -1,6 +1,8 @@
 """Inertial measurement unit."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
@@ -12,11 +14,16 @@ from scipy.spatial.transform import Rotation
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
+from fbse_drake.sensors.sensor import Run, Sensor, in_library
+from fbse_drake.signals import Signal, signals_of
 
 
+@in_library
 @dataclass(frozen=True)
-class ImuConfig:
+class ImuConfig(Sensor):
     """Errors of the IMU; all 0 measures exactly."""
+
+    signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_imu")
 
     # Standard deviation of white noise per axis and sample [m/s^2], [rad/s].
     acceleration_noise: float = 0.0
@@ -38,6 +45,13 @@ class ImuConfig:
             if len(getattr(self, name)) != 3:
                 raise InputError(f"{name}: expected three numbers, found {getattr(self, name)}")
         require_positive(self, "period")
+
+    def system(self, robot: Robot, run: Run) -> "Imu":
+        return Imu(self, robot, run.seed, run.duration)
+
+    def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """None of a robot that has no IMU."""
+        return super().channels(robot, recorded) if robot.description.imu else {}
 
 
 def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:

@@ -1,17 +1,24 @@
 """Joint torque sensors, between joint and link; few robots have them."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
+from fbse_drake.sensors.sensor import Run, Sensor, in_library
+from fbse_drake.signals import Signal, signals_of
 
 
+@in_library
 @dataclass(frozen=True)
-class JointTorqueConfig:
+class JointTorqueConfig(Sensor):
     """Errors of every sensor."""
+
+    signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_torque")
 
     # Standard deviation of white noise [Nm].
     noise: float = 0.0
@@ -21,6 +28,9 @@ class JointTorqueConfig:
     def __post_init__(self) -> None:
         require_not_negative(self, "noise")
         require_positive(self, "period")
+
+    def system(self, robot: Robot, run: Run) -> "JointTorqueSensors":
+        return JointTorqueSensors(self, len(robot.joint_names), *run)
 
 
 class TransmittedTorque(LeafSystem):

@@ -6,18 +6,21 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import MultibodyForces
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from fbse_drake.errors import InputError, require_positive
+from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
-from fbse_drake.robot.plant import Robot
+from fbse_drake.robot.plant import Ground, Robot
 from fbse_drake.walking.leg_kinematics import LegKinematics, LegMotion, UnreachableError
 from fbse_drake.walking.plan import PointMotion, TaskPlan
 from fbse_drake.walking.stand import Squat, Sway, smooth_sine
 from fbse_drake.walking.walk import Walk
 
+# A sample that is late by less than this share of a step still belongs to it.
+_EARLY = 0.1
 # The base position is found to this [m].
 _COM_TOLERANCE = 1e-12
 _MAX_ITERATIONS = 100
@@ -68,6 +71,44 @@ class Reference:
     base: PointMotion
     # None for motions that are not planned in task space.
     plan: TaskPlan | None
+
+    def source(self, time_step: float) -> System:  # noqa: ARG002
+        """What plays it, see `ReferenceSource`."""
+        return ReferenceSource(self)
+
+    def set_start(self, robot: Robot, ground: Ground) -> None:
+        """Makes its start the default positions of a robot, standing where the ground carries the weight."""
+        plant = robot.plant
+        context = plant.CreateDefaultContext()
+        if robot.has_floating_base:
+            pads = sum(leg.points for leg in robot.description.legs.values())
+            weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
+            penetration = weight / (pads * ground.stiffness)
+            p_WB = self.base.position[0] - [0.0, 0.0, penetration]
+            plant.SetPositions(context, robot.base_pose_positions(RigidTransform(p_WB)))
+        robot.set_joint_positions(context, self.joint_position[0])
+        plant.SetDefaultPositions(plant.GetPositions(context))
+
+
+@dataclass(frozen=True)
+class RecordedReference:
+    """What a robot was asked for while a log was recorded, whose start is time 0.
+
+    Where the robot starts is not the reference's: who simulates sets it.
+    """
+
+    log: Log
+    # Nobody knows what the motion was planned from.
+    plan: None = None
+
+    def source(self, time_step: float) -> System:
+        """What plays it on a plant with this step [s], see `RecordedSource`."""
+        return RecordedSource(self.log, time_step)
+
+    def set_start(self, robot: Robot, ground: Ground) -> None:  # noqa: ARG002
+        """Raises InputError for a robot with a floating base, whose start no log tells well enough."""
+        if robot.has_floating_base:
+            raise InputError("reference: a recorded motion is only simulated for a robot with a fixed base")
 
 
 def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> Reference:
@@ -302,4 +343,45 @@ class ReferenceSource(Diagram):
         feedforward = builder.AddNamedSystem("feedforward_torque", TrajectorySource(torque))
         builder.ExportOutput(desired_state.get_output_port(), "desired_state")
         builder.ExportOutput(feedforward.get_output_port(), "feedforward_torque")
+        builder.BuildInto(self)
+
+
+class RecordedSource(Diagram):
+    """Plays what a log says that its robot was asked for, each sample held until the next.
+
+    .. pydrake_system::
+
+        name: RecordedSource
+        output_ports:
+        - desired_state
+        - feedforward_torque
+        - enabled
+
+    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s], at rest where the log
+    has no velocities; `feedforward_torque` (n,) [Nm] and `enabled` (n,) (0 for a drive that is switched
+    off) are there where the log has them.
+    """
+
+    def __init__(self, log: Log, time_step: float):
+        """Reads the log.
+
+        Args:
+            log: with `reference/joint/position`.
+            time_step: the plant's step [s].
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        position = log["reference/joint/position"]
+        velocity = log.get("reference/joint/velocity", np.zeros_like(position))
+        held = {
+            "desired_state": np.hstack([position, velocity]),
+            "feedforward_torque": log.get("reference/joint/feedforward_torque"),
+            "enabled": log.get("joint/enabled"),
+        }
+        time = log.time - log.time[0] - _EARLY * time_step
+        for name, values in held.items():
+            if values is not None:
+                hold = PiecewisePolynomial.ZeroOrderHold(time, values.T)
+                source = builder.AddNamedSystem(name, TrajectorySource(hold))
+                builder.ExportOutput(source.get_output_port(), name)
         builder.BuildInto(self)

@@ -45,7 +45,7 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
     Raises:
         InputError: a foot without force channel, or one with another number of pads than the model.
     """
-    forces = []
+    forces = [np.zeros((len(log.time), 0, 3))]
     for side, leg in robot.description.legs.items():
         pads, wrench = f"foot/{side}/pad_force", f"foot/{side}/wrench"
         if pads in log:

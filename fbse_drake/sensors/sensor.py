@@ -1,0 +1,137 @@
+"""What a sensor is, and the library of all of them.
+
+A sensor is one class in one file: a frozen dataclass that says how it errs (what a scenario file says
+of it), the signals that it gives, and the Drake system that measures. Behind `@in_library` its signals
+are in the table of all signals (`fbse_drake.signals`), and a scenario file can name it:
+
+    sensors: {more: {winding: !JointTemperature {noise: 0.5}}}
+
+A sensor of a user's own is such a class in a module that the scenario names (`effect_modules`).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+
+from fbse_drake.errors import InputError, located
+from fbse_drake.log import Log
+from fbse_drake.robot.description import RobotDescription
+from fbse_drake.robot.plant import Robot
+from fbse_drake.signals import Signal, channels_of, port_values, register
+from fbse_drake.wiring import connect_by_name, outputs_by_name
+
+
+class Run(NamedTuple):
+    """The simulation in which a sensor measures."""
+
+    # The plant's step [s].
+    time_step: float
+    # Of all errors.
+    seed: int
+    # Errors are drawn for this time [s].
+    duration: float
+
+
+@dataclass(frozen=True)
+class Sensor(ABC):
+    """Base of the sensors: a frozen dataclass whose fields say how the sensor errs, by default not at all."""
+
+    # What it gives: rows of the table of signals.
+    signals: ClassVar[tuple[Signal, ...]]
+    # Fields [s] that must be whole multiples of the plant's step, or 0.
+    whole_steps: ClassVar[tuple[str, ...]] = ()
+
+    @staticmethod
+    def alternatives() -> tuple[type["Sensor"], ...]:
+        """What can stand under `sensors.more` in a scenario file (see `fbse_drake.schema`)."""
+        return tuple(_LIBRARY.values())
+
+    @classmethod
+    def ports(cls) -> list[str]:
+        """Names of its output ports."""
+        return list(dict.fromkeys(signal.port for signal in cls.signals))
+
+    @abstractmethod
+    def system(self, robot: Robot, run: Run) -> System:
+        """The system that measures.
+
+        Its output ports are those of its signals. Its input ports are named like the robot's ports, of
+        which it takes what it needs: `joint_state` [q, v], `torque_command` and `torque_loss` (of the
+        step that begins), `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations` and
+        `reaction_forces` (of the step that ends), see `fbse_drake.station.add_robot`.
+        """
+
+    def add(
+        self,
+        builder: DiagramBuilder,
+        name: str,
+        robot: Robot,
+        ports: Mapping[str, OutputPort],
+        run: Run,
+    ) -> dict[str, OutputPort]:
+        """Adds its system, under this name, to the diagram of a robot with these ports.
+
+        Returns:
+            Its output ports by name.
+        """
+        system = builder.AddNamedSystem(name, self.system(robot, run))
+        connect_by_name(builder, ports, system)
+        return outputs_by_name(system)
+
+    def check(self, names: RobotDescription) -> None:  # noqa: B027
+        """Raises InputError for values of joints that a robot has not."""
+
+    def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Log channels, (N, ...) each, that its recorded ports, (N, size) each, become."""
+        n = len(robot.joint_names)
+        parts = (channels_of(port, recorded[port], n) for port in self.ports())
+        return {name: values for part in parts for name, values in part.items()}
+
+    def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:  # noqa: ARG002
+        """What its ports told when a log was recorded, (N, size) each, as far as the log says it.
+
+        Raises:
+            InputError: channels that do not fit the robot.
+        """
+        values = {port: port_values(port, log) for port in self.ports()}
+        return {port: value for port, value in values.items() if value is not None}
+
+
+_LIBRARY: dict[str, type[Sensor]] = {}
+
+T = TypeVar("T", bound=type[Sensor])
+
+
+def in_library(sensor: T) -> T:
+    """Class decorator: puts a sensor into the library, under its class name, and its signals into the
+    table.
+
+    Raises:
+        InputError: it lacks its signals or its system, or there is another sensor, port or channel of
+            one of its names.
+    """
+    if not getattr(sensor, "signals", ()):
+        raise InputError(f"sensor {sensor.__name__}: the class variable signals is missing")
+    if sensor.__abstractmethods__:
+        missing = min(sensor.__abstractmethods__)
+        raise InputError(f"sensor {sensor.__name__}: the method {missing} is missing")
+    known = _LIBRARY.get(sensor.__name__)
+    if known is not None and _place(known) != _place(sensor):
+        raise InputError(f"sensor {sensor.__name__}: there is another one of this name, in {known.__module__}")
+    with located(f"sensor {sensor.__name__}: "):
+        register(*sensor.signals)
+    _LIBRARY[sensor.__name__] = sensor
+    return sensor
+
+
+def _place(sensor: type[Sensor]) -> tuple[str, str]:
+    return sensor.__module__, sensor.__qualname__
+
+
+def library() -> dict[str, type[Sensor]]:
+    """All sensors by class name."""
+    return dict(_LIBRARY)

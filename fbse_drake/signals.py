@@ -1,0 +1,208 @@
+"""The table of signals: what the ports of a station are called, which channels of a log they become, in which units and shapes.
+
+A sensor of a user's own adds its rows with `register`.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fbse_drake.errors import InputError
+
+# Sizes of one sample's axes: a number, "n" for all joints, "m" for any number.
+Shape = tuple[int | str, ...]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One row of the table: a channel of a log and the port that it comes from.
+
+    A port with several channels has a row for each; its vector is their samples one after the other.
+    """
+
+    # Pattern of the channel's name (a regular expression); empty for a port that is recorded but
+    # for which no channel stands: others are computed from it.
+    channel: str
+    # Of a revolute joint where it is one for each joint.
+    unit: str = "1"
+    shape: Shape = ()
+    # Name of the station's output port; empty for what no port gives.
+    port: str = ""
+    # Does a simulation record the port?
+    recorded: bool = True
+    # Of an estimate: the estimator of the chain and the field of its posterior.
+    estimator: str = ""
+    field: str = ""
+
+    @property
+    def text(self) -> str:
+        """The channel's name for messages, as `foot/<side>/pad_force`."""
+        return self.channel.replace(r"\w+", "<side>")
+
+    def sample_shape(self, joints: int, size: int) -> tuple[int, ...]:
+        """Shape of a sample that has `size` numbers in all."""
+        shape = tuple(joints if axis == "n" else axis for axis in self.shape)
+        known = int(np.prod([axis for axis in shape if axis != "m"]))
+        return tuple(size // known if axis == "m" else int(axis) for axis in shape)
+
+
+def _estimate(channel: str, estimator: str, field: str, unit: str = "-", shape: Shape = ("m",)) -> Signal:
+    """A field of an estimator's posterior, whose port is named like its channel. The unit "-" is that
+    of the filter's own states, see its LeafSystem."""
+    name = f"estimate/{channel}"
+    return Signal(name, unit, shape, name, estimator=estimator, field=field)
+
+
+def _status(estimator: str) -> Signal:
+    return _estimate(f"{estimator}/status", estimator, "status", "1", ())
+
+
+# The first row that fits a channel counts. Ports are exported in this order.
+_TABLE: list[Signal] = [
+    Signal("time", "s"),
+    # What sensors measure.
+    Signal("joint/position", "rad", ("n",), "measured_joint_state"),
+    Signal("joint/velocity", "rad/s", ("n",), "measured_joint_state"),
+    Signal("imu/linear_acceleration", "m/s^2", (3,), "measured_imu"),
+    Signal("imu/angular_velocity", "rad/s", (3,), "measured_imu"),
+    Signal(r"foot/\w+/pad_force", "N", ("m", 3), "measured_pad_force"),
+    Signal(r"foot/\w+/wrench", "Nm, N", (6,), "measured_pad_force"),
+    Signal("joint/torque_measured", "Nm", ("n",), "measured_torque"),
+    Signal("joint/temperature", "degC", ("n",), "measured_temperature"),
+    Signal("joint/voltage_command", "V", ("n",)),
+    # 1 where a motor is driven, 0 where its bridge is open.
+    Signal("joint/enabled", "1", ("n",)),
+    # Controller and reference, of which the log has what was planned.
+    Signal("joint/torque_command", "Nm", ("n",), "torque_command"),
+    Signal("reference/joint/position", "rad", ("n",), "desired_state", recorded=False),
+    Signal("reference/joint/velocity", "rad/s", ("n",), "desired_state", recorded=False),
+    Signal("reference/joint/feedforward_torque", "Nm", ("n",), "feedforward_torque", recorded=False),
+    # What a real robot would not tell.
+    Signal("", port="plant_state"),
+    Signal("", port="generalized_acceleration"),
+    Signal(r"truth/foot/\w+/pad_force", "N", ("m", 3), "true_pad_force"),
+    Signal(r"truth/foot/\w+/wrench", "Nm, N", (6,), "true_pad_force"),
+    Signal("truth/joint/friction_torque", "Nm", ("n",), "torque_loss"),
+    # Estimates.
+    _estimate("sensors/status", "sensor_monitor", "trust", "1"),
+    _estimate("support", "sensor_monitor", "support", "1"),
+    _status("attitude"),
+    _estimate("base/orientation", "attitude", "orientation", "1", (4,)),
+    _estimate("imu/angular_velocity_bias", "attitude", "angular_velocity_bias", "rad/s", (3,)),
+    _estimate("attitude/covariance", "attitude", "covariance"),
+    _estimate("attitude/innovation", "attitude", "innovation"),
+    _estimate("attitude/innovation_variance", "attitude", "innovation_variance"),
+    _status("base_state"),
+    _estimate("base/position", "base_state", "base_position", "m", (3,)),
+    _estimate("base/velocity", "base_state", "base_velocity", "m/s", (3,)),
+    _estimate("com/position", "base_state", "com_position", "m", (3,)),
+    _estimate("com/velocity", "base_state", "com_velocity", "m/s", (3,)),
+    _estimate("zmp", "base_state", "zmp", "m", (2,)),
+    _estimate("base_state/covariance", "base_state", "covariance"),
+    _estimate("base_state/innovation", "base_state", "innovation"),
+    _estimate("base_state/innovation_variance", "base_state", "innovation_variance"),
+    _status("joint_acceleration"),
+    _estimate("joint/acceleration", "joint_acceleration", "joint_acceleration", "rad/s^2", ("n",)),
+    _estimate("joint_acceleration/innovation", "joint_acceleration", "innovation"),
+    _estimate("joint_acceleration/innovation_variance", "joint_acceleration", "innovation_variance"),
+    _status("link_torque"),
+    _estimate("joint/link_torque", "link_torque", "link_torque", "Nm", ("n",)),
+    _estimate("joint/residual_torque", "link_torque", "residual", "Nm", ("n",)),
+    _status("friction"),
+    _estimate("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
+    _estimate("friction/parameters", "friction", "parameters", shape=("n", "m")),
+    _estimate("friction/parameter_variance", "friction", "parameter_variance", shape=("n", "m")),
+    _estimate("friction/innovation", "friction", "innovation"),
+    _estimate("friction/innovation_variance", "friction", "innovation_variance"),
+    # What is computed from the above, planned, or comes with recordings of other robots.
+    Signal(r"(truth|reference|estimate)/joint/position", "rad", ("n",)),
+    Signal(r"(truth|reference|estimate)/joint/velocity", "rad/s", ("n",)),
+    Signal(r"((truth|reference|estimate)/)?joint/acceleration", "rad/s^2", ("n",)),
+    Signal(r"((truth|reference|estimate)/)?joint/\w*torque\w*", "Nm", ("n",)),
+    Signal(r"\w+/foot/\w+/position", "m", (3,)),
+    Signal(r"\w+/foot/\w+/support", "1", ()),
+    Signal(r"\w+/(base|com)/position", "m", (3,)),
+    Signal(r"\w+/base/orientation", "1", (4,)),
+    Signal(r"\w+/(base|com)/velocity", "m/s", (3,)),
+    Signal(r"\w+/(base|com)/acceleration", "m/s^2", (3,)),
+    Signal(r"\w+/base/angular_velocity", "rad/s", (3,)),
+    Signal(r"\w+/base/angular_acceleration", "rad/s^2", (3,)),
+    Signal(r"\w+/zmp", "m", (2,)),
+    Signal(r"estimate/\w+/status", "1", ()),
+    Signal(r"estimate/\w+/(covariance|innovation|innovation_variance)", "-", ("m",)),
+]
+
+
+def register(*signals: Signal) -> None:
+    """Adds rows to the table; such as are in it already stay.
+
+    Raises:
+        InputError: a channel or a port that the table has already, with another meaning.
+    """
+    new = [signal for signal in signals if signal not in _TABLE]
+    for signal in new:
+        if any(re.fullmatch(row.channel, signal.channel) for row in _TABLE):
+            raise InputError(f"channel {signal.channel}: there is one of this name already")
+        if signal.port in ports():
+            raise InputError(f"port {signal.port}: there is one of this name already")
+    _TABLE.extend(new)
+
+
+def ports(*, recorded: bool = False) -> list[str]:
+    """Names of the ports of all stations, in order; or of those that a simulation records."""
+    rows = [row for row in _TABLE if row.port and (row.recorded or not recorded)]
+    return list(dict.fromkeys(row.port for row in rows))
+
+
+def signals_of(port: str) -> tuple[Signal, ...]:
+    """The rows of a port."""
+    return tuple(row for row in _TABLE if row.port == port)
+
+
+def estimates() -> list[Signal]:
+    """The rows of the estimators' posteriors."""
+    return [row for row in _TABLE if row.estimator]
+
+
+def channel_kind(channel: str) -> tuple[str, Shape]:
+    """Unit of a channel (of a revolute joint) and the shape of a sample.
+
+    Raises:
+        InputError: no such channel.
+    """
+    for row in _TABLE:
+        if re.fullmatch(row.channel, channel):
+            return row.unit, row.shape
+    raise InputError(f"channel {channel}: not a channel of a log (see fbse_drake.log.Log)")
+
+
+def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndarray]:
+    """Channels that a port's recorded values become.
+
+    Args:
+        values: (N, size).
+        joints: how many the robot has.
+
+    Returns:
+        By channel, (N, ...) each; nothing where none stands for the port.
+    """
+    rows = [row for row in signals_of(port) if row.channel]
+    fixed = [int(np.prod(row.sample_shape(joints, 0))) for row in rows]
+    left = values.shape[1] - sum(fixed)
+    channels, start = {}, 0
+    for row, size in zip(rows, fixed, strict=True):
+        stop = start + size + ("m" in row.shape) * left
+        shape = row.sample_shape(joints, stop - start)
+        channels[row.channel] = values[:, start:stop].reshape(len(values), *shape)
+        start = stop
+    return channels
+
+
+def port_values(port: str, log: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """What a port would have told when a log was recorded, (N, size); None where the log lacks it."""
+    names = [row.channel for row in signals_of(port) if row.channel]
+    if not names or any(name not in log for name in names):
+        return None
+    return np.hstack([log[name].reshape(len(log[name]), -1) for name in names])

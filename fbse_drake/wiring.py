@@ -1,0 +1,19 @@
+"""Systems of a diagram are wired by name: a port goes where an input of its name is."""
+
+from collections.abc import Mapping
+
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+
+
+def connect_by_name(builder: DiagramBuilder, ports: Mapping[str, OutputPort], system: System) -> None:
+    """Connects each input of a system to the port of its name; others stay open."""
+    for i in range(system.num_input_ports()):
+        port = system.get_input_port(i)
+        if port.get_name() in ports:
+            builder.Connect(ports[port.get_name()], port)
+
+
+def outputs_by_name(system: System) -> dict[str, OutputPort]:
+    """The output ports of a system."""
+    ports = [system.get_output_port(i) for i in range(system.num_output_ports())]
+    return {port.get_name(): port for port in ports}
