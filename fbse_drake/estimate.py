@@ -68,7 +68,8 @@ class Replay:
             name = estimator.get_input_port(i).get_name()
             if name not in inputs:
                 channels = ", ".join(signal.text for signal in signals_of(name))
-                raise InputError(f"the log has no channel for the estimator's input {name} ({channels})")
+                where = f"the estimator's input {name} ({channels})"
+                raise InputError(f"the log has no channel for {where}")
         self.estimator, self.time = estimator, log.time
         self.context = estimator.CreateDefaultContext()
         # Takes the update of every tick.

@@ -30,8 +30,9 @@ class Log(Mapping[str, np.ndarray]):
     The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`, `joint/velocity` and
     `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force) and `imu/angular_velocity` (N, 3) in the IMU frame,
     `foot/<side>/pad_force` (N, pads, 3) in the sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
-    `reference/`, `estimate/` or `truth/`. Units and shapes of all are in `fbse_drake.signals`. A robot that
-    does not know its joint torques has no `joint/torque_command`; nothing is said about the torques of its joints then.
+    `reference/`, `estimate/` or `truth/`, or are those of further sensors. Units and shapes of all
+    are in `fbse_drake.signals`. A robot that does not know its joint torques has no
+    `joint/torque_command`; nothing is said about the torques of its joints then.
 
     Raises:
         InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.

@@ -61,7 +61,8 @@ class RobotConfig:
         Raises:
             InputError: see `Effect.resolve`.
         """
-        return [effect.resolve(names, key=f"{key}.effects.{name}") for name, effect in self.effects.items() if isinstance(effect, kind)]
+        wanted = {name: e for name, e in self.effects.items() if isinstance(e, kind)}
+        return [e.resolve(names, key=f"{key}.effects.{name}") for name, e in wanted.items()]
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class SensorsConfig:
     foot_force: FootForceConfig = field(default_factory=FootForceConfig)
     # Joint torque sensors, for robots that have them.
     joint_torque: JointTorqueConfig | None = None
-    # Further sensors, each under a name of your choice, as {winding: !JointTemperature {noise: 0.5}}.
+    # Further sensors, each under a name of your choice, as {winding: !JointTemperature {}}.
     more: dict[str, Sensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -89,7 +90,8 @@ class SensorsConfig:
 
     @property
     def _usual(self) -> dict[str, Sensor]:
-        usual = {name: getattr(self, name) for name in ("encoders", "imu", "foot_force", "joint_torque")}
+        names = ("encoders", "imu", "foot_force", "joint_torque")
+        usual = {name: getattr(self, name) for name in names}
         return {name: sensor for name, sensor in usual.items() if sensor is not None}
 
     @property
@@ -201,7 +203,7 @@ class Scenario:
     seed: int = 0
     # Length of the experiment [s].
     duration: float = 11.5
-    # Python files (relative to the scenario's) or modules with physical effects and sensors of your own.
+    # Python files (relative to the scenario's) or modules with effects and sensors of your own.
     effect_modules: list[str] = field(default_factory=list)
     # What really happens.
     robot: RobotConfig = field(default_factory=RobotConfig)

@@ -1,4 +1,4 @@
-"""The table of signals: what the ports of a station are called, which channels of a log they become, in which units and shapes.
+"""The table of signals: ports of a station, channels of a log that they become, units and shapes.
 
 A sensor of a user's own adds its rows with `register`.
 """
@@ -19,7 +19,8 @@ Shape = tuple[int | str, ...]
 class Signal:
     """One row of the table: a channel of a log and the port that it comes from.
 
-    A port with several channels has a row for each; its vector is their samples one after the other.
+    A port with several channels has a row for each; its vector is their samples one after the
+    other.
     """
 
     # Pattern of the channel's name (a regular expression); empty for a port that is recorded but
@@ -48,15 +49,28 @@ class Signal:
         return tuple(size // known if axis == "m" else int(axis) for axis in shape)
 
 
-def _estimate(channel: str, estimator: str, field: str, unit: str = "-", shape: Shape = ("m",)) -> Signal:
-    """A field of an estimator's posterior, whose port is named like its channel. The unit "-" is that
-    of the filter's own states, see its LeafSystem."""
+def _estimate(
+    channel: str,
+    estimator: str,
+    field: str,
+    unit: str = "-",
+    shape: Shape = ("m",),
+) -> Signal:
+    """A field of an estimator's posterior, whose port is named like its channel.
+
+    The unit "-" is that of the filter's own states, see its LeafSystem.
+    """
     name = f"estimate/{channel}"
     return Signal(name, unit, shape, name, estimator=estimator, field=field)
 
 
+def _own(estimator: str, field: str, unit: str = "-", shape: Shape = ("m",)) -> Signal:
+    """A field whose channel is named like its estimator and itself."""
+    return _estimate(f"{estimator}/{field}", estimator, field, unit, shape)
+
+
 def _status(estimator: str) -> Signal:
-    return _estimate(f"{estimator}/status", estimator, "status", "1", ())
+    return _own(estimator, "status", "1", ())
 
 
 # The first row that fits a channel counts. Ports are exported in this order.
@@ -78,7 +92,13 @@ _TABLE: list[Signal] = [
     Signal("joint/torque_command", "Nm", ("n",), "torque_command"),
     Signal("reference/joint/position", "rad", ("n",), "desired_state", recorded=False),
     Signal("reference/joint/velocity", "rad/s", ("n",), "desired_state", recorded=False),
-    Signal("reference/joint/feedforward_torque", "Nm", ("n",), "feedforward_torque", recorded=False),
+    Signal(
+        "reference/joint/feedforward_torque",
+        "Nm",
+        ("n",),
+        "feedforward_torque",
+        recorded=False,
+    ),
     # What a real robot would not tell.
     Signal("", port="plant_state"),
     Signal("", port="generalized_acceleration"),
@@ -91,31 +111,31 @@ _TABLE: list[Signal] = [
     _status("attitude"),
     _estimate("base/orientation", "attitude", "orientation", "1", (4,)),
     _estimate("imu/angular_velocity_bias", "attitude", "angular_velocity_bias", "rad/s", (3,)),
-    _estimate("attitude/covariance", "attitude", "covariance"),
-    _estimate("attitude/innovation", "attitude", "innovation"),
-    _estimate("attitude/innovation_variance", "attitude", "innovation_variance"),
+    _own("attitude", "covariance"),
+    _own("attitude", "innovation"),
+    _own("attitude", "innovation_variance"),
     _status("base_state"),
     _estimate("base/position", "base_state", "base_position", "m", (3,)),
     _estimate("base/velocity", "base_state", "base_velocity", "m/s", (3,)),
     _estimate("com/position", "base_state", "com_position", "m", (3,)),
     _estimate("com/velocity", "base_state", "com_velocity", "m/s", (3,)),
     _estimate("zmp", "base_state", "zmp", "m", (2,)),
-    _estimate("base_state/covariance", "base_state", "covariance"),
-    _estimate("base_state/innovation", "base_state", "innovation"),
-    _estimate("base_state/innovation_variance", "base_state", "innovation_variance"),
+    _own("base_state", "covariance"),
+    _own("base_state", "innovation"),
+    _own("base_state", "innovation_variance"),
     _status("joint_acceleration"),
     _estimate("joint/acceleration", "joint_acceleration", "joint_acceleration", "rad/s^2", ("n",)),
-    _estimate("joint_acceleration/innovation", "joint_acceleration", "innovation"),
-    _estimate("joint_acceleration/innovation_variance", "joint_acceleration", "innovation_variance"),
+    _own("joint_acceleration", "innovation"),
+    _own("joint_acceleration", "innovation_variance"),
     _status("link_torque"),
     _estimate("joint/link_torque", "link_torque", "link_torque", "Nm", ("n",)),
     _estimate("joint/residual_torque", "link_torque", "residual", "Nm", ("n",)),
     _status("friction"),
     _estimate("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
-    _estimate("friction/parameters", "friction", "parameters", shape=("n", "m")),
-    _estimate("friction/parameter_variance", "friction", "parameter_variance", shape=("n", "m")),
-    _estimate("friction/innovation", "friction", "innovation"),
-    _estimate("friction/innovation_variance", "friction", "innovation_variance"),
+    _own("friction", "parameters", shape=("n", "m")),
+    _own("friction", "parameter_variance", shape=("n", "m")),
+    _own("friction", "innovation"),
+    _own("friction", "innovation_variance"),
     # What is computed from the above, planned, or comes with recordings of other robots.
     Signal(r"(truth|reference|estimate)/joint/position", "rad", ("n",)),
     Signal(r"(truth|reference|estimate)/joint/velocity", "rad/s", ("n",)),
@@ -175,7 +195,7 @@ def channel_kind(channel: str) -> tuple[str, Shape]:
     for row in _TABLE:
         if re.fullmatch(row.channel, channel):
             return row.unit, row.shape
-    raise InputError(f"channel {channel}: not a channel of a log (see fbse_drake.log.Log)")
+    raise InputError(f"channel {channel}: not a channel of a log (see fbse_drake.signals)")
 
 
 def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndarray]:
@@ -201,7 +221,7 @@ def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndar
 
 
 def port_values(port: str, log: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """What a port would have told when a log was recorded, (N, size); None where the log lacks it."""
+    """What a port told when a log was recorded, (N, size); None where the log lacks it."""
     names = [row.channel for row in signals_of(port) if row.channel]
     if not names or any(name not in log for name in names):
         return None

@@ -15,12 +15,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, VectorLogSink
 
+from fbse_drake import signals
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
-from fbse_drake.signals import channels_of, ports
 from fbse_drake.station import Station, build_station
 from fbse_drake.walking.reference import Reference
 
@@ -149,10 +149,15 @@ def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_h
 
 def _recorded(station: Station) -> list[str]:
     """Output ports of the station that are recorded."""
-    return [name for name in ports(recorded=True) if station.HasOutputPort(name)]
+    return [name for name in signals.ports(recorded=True) if station.HasOutputPort(name)]
 
 
-def add_record(builder: DiagramBuilder, station: Station, names: Sequence[str], period: float) -> VectorLogSink:
+def add_record(
+    builder: DiagramBuilder,
+    station: Station,
+    names: Sequence[str],
+    period: float,
+) -> VectorLogSink:
     """Adds what records output ports of a station with a period [s], one after the other in a row.
 
     One sink for all: every sink has an event of its own, which costs more than its data.
@@ -203,16 +208,19 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 
 
-def _port_channels(sensors: SensorsConfig, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Channels that recorded ports, (N, size) each, become: a sensor's as it says, others as the table of
-    signals says."""
-    channels, left = {}, dict(recorded)
+def _port_channels(
+    sensors: SensorsConfig,
+    robot: Robot,
+    recorded: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Channels that recorded ports, (N, size) each, become: those of a sensor as it says itself."""
+    channels, of_sensors = {}, set()
     for sensor in sensors.by_name.values():
         channels |= sensor.channels(robot, recorded)
-        for port in sensor.ports():
-            del left[port]
-    for port, values in left.items():
-        channels |= channels_of(port, values, len(robot.joint_names))
+        of_sensors.update(sensor.ports())
+    others = {port: values for port, values in recorded.items() if port not in of_sensors}
+    for port, values in others.items():
+        channels |= signals.channels_of(port, values, len(robot.joint_names))
     return channels
 
 

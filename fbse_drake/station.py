@@ -1,8 +1,9 @@
-"""The closed loop as a Drake diagram: robot, sensors, reference, controller, estimator, compensation.
+"""The closed loop as a Drake diagram.
 
-A station is a list of steps. Each adds its systems to the builder, takes the ports that it needs by name
-and returns the ports that it gives by name; a part that a scenario does not have gives none. What the
-names mean is in the table of signals (`fbse_drake.signals`).
+A station is a list of steps: robot, sensors, reference, controller, estimator, compensation. Each
+adds its systems to the builder, takes the ports that it needs by name and returns the ports that
+it gives by name; a part that a scenario does not have gives none. What the names mean is in the
+table of signals (`fbse_drake.signals`).
 """
 
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import Demultiplexer, MatrixGain, PassThrough
 
+from fbse_drake import signals
 from fbse_drake.control.compensation import FrictionCompensation
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.contact import contact_with_effects
@@ -25,7 +27,6 @@ from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
 from fbse_drake.sensors.sensor import Run
-from fbse_drake.signals import ports as signal_ports
 from fbse_drake.walking.reference import RecordedReference, Reference
 from fbse_drake.wiring import connect_by_name, outputs_by_name
 
@@ -52,12 +53,13 @@ class Station(Diagram):
         - true_pad_force
         - torque_loss
 
-    Sensor and controller ports come first, what a real robot would not tell (plant state, acceleration,
-    ideal pad forces, torque loss of the effects) comes last. `friction_estimate` (n,) [Nm] is added to the
-    command and may be left unconnected; a station that compensates its own estimate does not have it. A
-    station with an estimator also has a port for each of `estimator.channels`, see `EstimatorDiagram`; one
-    with joint torque sensors has `measured_torque`, one with further sensors their ports. A recorded
-    reference has a `feedforward_torque` where its log has one.
+    Sensor and controller ports come first, what a real robot would not tell (plant state,
+    acceleration, ideal pad forces, torque loss of the effects) comes last. `friction_estimate`
+    (n,) [Nm] is added to the command and may be left unconnected; a station that compensates its
+    own estimate does not have it. A station with an estimator also has a port for each of
+    `estimator.channels`, see `EstimatorDiagram`; one with joint torque sensors has
+    `measured_torque`, one with further sensors their ports. A recorded reference has a
+    `feedforward_torque` where its log has one.
     """
 
     robot: Robot
@@ -80,7 +82,8 @@ class Station(Diagram):
         simulated = add_robot(builder, scenario, self.reference)
         self.robot = simulated.robot
         if self.model.joint_names != self.robot.joint_names:
-            raise InputError(f"model: expected the robot's joints {self.robot.joint_names}, found {self.model.joint_names}")
+            expected, found = self.robot.joint_names, self.model.joint_names
+            raise InputError(f"model: expected the robot's joints {expected}, found {found}")
         ports = dict(simulated.ports)
         ports |= add_sensors(builder, scenario, self.robot, ports)
         ports |= add_sensor_effects(builder, scenario, self.robot, ports)
@@ -109,11 +112,12 @@ def build_station(
 
     Args:
         meshcat: also draws the robot there.
-        recorded: what the robot is asked for, in the place of the scenario's reference; the robot then
-            starts where its context is set to, by default at zero.
+        recorded: what the robot is asked for, in the place of the scenario's reference; its joints
+            then start at zero unless the context says otherwise.
 
     Raises:
-        InputError: a part of the scenario that does not fit the robot, or a motion that it cannot make.
+        InputError: a part of the scenario that does not fit the robot, or a motion that it cannot
+            make.
     """
     return Station(scenario, meshcat, recorded)
 
@@ -127,20 +131,26 @@ class SimulatedRobot(NamedTuple):
     ports: dict[str, OutputPort]
 
 
-def add_robot(builder: DiagramBuilder, scenario: Scenario, reference: Reference | RecordedReference) -> SimulatedRobot:
+def add_robot(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    reference: Reference | RecordedReference,
+) -> SimulatedRobot:
     """Adds the robot on its ground, with its physical effects, at the start of the reference.
 
     Returns:
-        With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and `torque_loss` of the
-        effects (n,) [Nm], `plant_state`, `generalized_acceleration` and those of the plant that sensors
-        need: `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.
+        With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
+        `torque_loss` of the effects (n,) [Nm], `plant_state`, `generalized_acceleration` and those
+        of the plant that sensors need: `body_poses`, `body_spatial_velocities`,
+        `body_spatial_accelerations`, `reaction_forces`.
 
     Raises:
         InputError: effects or parts that the robot does not have.
     """
-    config, settings = scenario.robot, scenario.plant
+    config = scenario.robot
+    contact = (scenario.ground, scenario.plant, config.description)
     with located("robot: "):
-        ground, settings = contact_with_effects(config.effects.values(), scenario.ground, settings, config.description)
+        ground, settings = contact_with_effects(config.effects.values(), *contact)
         robot = build_robot(config, builder=builder, plant=settings, ground=ground)
     reference.set_start(robot, ground)
     plant, n = robot.plant, len(robot.joint_names)
@@ -177,7 +187,12 @@ def add_robot(builder: DiagramBuilder, scenario: Scenario, reference: Reference 
     return SimulatedRobot(robot, command.get_input_port(), ports)
 
 
-def add_sensors(builder: DiagramBuilder, scenario: Scenario, robot: Robot, ports: Ports) -> dict[str, OutputPort]:
+def add_sensors(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    robot: Robot,
+    ports: Ports,
+) -> dict[str, OutputPort]:
     """Adds the sensors to a robot with these ports; returns what they give."""
     run, given = Run(scenario.plant.time_step, scenario.seed, scenario.duration), {}
     for name, sensor in scenario.sensors.by_name.items():
@@ -185,8 +200,13 @@ def add_sensors(builder: DiagramBuilder, scenario: Scenario, robot: Robot, ports
     return given
 
 
-def add_sensor_effects(builder: DiagramBuilder, scenario: Scenario, robot: Robot, ports: Ports) -> dict[str, OutputPort]:
-    """Adds the robot's effects in its sensors; returns, in their place, what the sensors then give."""
+def add_sensor_effects(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    robot: Robot,
+    ports: Ports,
+) -> dict[str, OutputPort]:
+    """Adds the robot's effects in its sensors; returns what these sensors give then instead."""
     resolved = scenario.robot.effects_of(SensorEffect, robot.description, key="robot")
     if not resolved:
         return {}
@@ -201,25 +221,41 @@ def add_sensor_effects(builder: DiagramBuilder, scenario: Scenario, robot: Robot
     return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(sizes)}
 
 
-def add_reference(builder: DiagramBuilder, reference: Reference | RecordedReference, time_step: float) -> dict[str, OutputPort]:
+def add_reference(
+    builder: DiagramBuilder,
+    reference: Reference | RecordedReference,
+    time_step: float,
+) -> dict[str, OutputPort]:
     """Adds what the robot is asked for; returns `desired_state` and what comes with it."""
     return outputs_by_name(builder.AddNamedSystem("reference", reference.source(time_step)))
 
 
-def add_controller(builder: DiagramBuilder, scenario: Scenario, robot: SimulatedRobot, ports: Ports) -> PositionLoop:
-    """Adds the position loop, which commands the robot; its input `friction_estimate` stays open."""
+def add_controller(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    robot: SimulatedRobot,
+    ports: Ports,
+) -> PositionLoop:
+    """Adds the position loop, which commands the robot; its `friction_estimate` stays open."""
     config, names = scenario.control, robot.robot.description
     system = PositionLoop(config, names, scenario.plant.time_step)
     controller = builder.AddNamedSystem("controller", system)
     builder.Connect(ports["measured_joint_state"], controller.GetInputPort("estimated_state"))
-    wanted = {"desired_state", "enabled"} | ({"feedforward_torque"} if config.feedforward else set())
-    asked = {name: port for name, port in ports.items() if name in wanted}
-    connect_by_name(builder, asked, controller)
+    wanted = ["desired_state", "enabled"]
+    if config.feedforward:
+        wanted.append("feedforward_torque")
+    for name in wanted:
+        if name in ports:
+            builder.Connect(ports[name], controller.GetInputPort(name))
     builder.Connect(controller.get_output_port(), robot.torque_command)
     return controller
 
 
-def add_estimator(builder: DiagramBuilder, estimator: EstimatorDiagram | None, ports: Ports) -> dict[str, OutputPort]:
+def add_estimator(
+    builder: DiagramBuilder,
+    estimator: EstimatorDiagram | None,
+    ports: Ports,
+) -> dict[str, OutputPort]:
     """Adds the friction estimator; returns its estimates."""
     if estimator is None:
         return {}
@@ -235,7 +271,7 @@ def add_compensation(
     controller: PositionLoop,
     ports: Ports,
 ) -> None:
-    """Adds what the controller makes of the estimate; without it, an input port of the station's."""
+    """Adds what the controller makes of the estimate; without it, an input of the station."""
     target = controller.GetInputPort("friction_estimate")
     if not scenario.compensation.uses_estimate:
         builder.ExportInput(target, "friction_estimate")
@@ -260,6 +296,6 @@ def add_meshcat(builder: DiagramBuilder, meshcat: Meshcat | None) -> None:
 
 def export(builder: DiagramBuilder, ports: Ports) -> None:
     """Makes those of the ports that are in the table of signals output ports of the station."""
-    for name in signal_ports():
+    for name in signals.ports():
         if name in ports:
             builder.ExportOutput(ports[name], name)

@@ -4,13 +4,26 @@ from collections.abc import Mapping
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
+from fbse_drake.errors import InputError
 
-def connect_by_name(builder: DiagramBuilder, ports: Mapping[str, OutputPort], system: System) -> None:
-    """Connects each input of a system to the port of its name; others stay open."""
+
+def connect_by_name(
+    builder: DiagramBuilder,
+    ports: Mapping[str, OutputPort],
+    system: System,
+) -> None:
+    """Connects every input of a system to the port of its name.
+
+    Raises:
+        InputError: there is no port of this name.
+    """
     for i in range(system.num_input_ports()):
         port = system.get_input_port(i)
-        if port.get_name() in ports:
-            builder.Connect(ports[port.get_name()], port)
+        name = port.get_name()
+        if name not in ports:
+            known = ", ".join(ports)
+            raise InputError(f"input {name}: there is no port of this name (there are: {known})")
+        builder.Connect(ports[name], port)
 
 
 def outputs_by_name(system: System) -> dict[str, OutputPort]:

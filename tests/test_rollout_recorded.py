@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import yaml
 
-from fbse_drake import InputError, Log, Scenario, simulate
+from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
+from fbse_drake.control.compensation import FeedforwardCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.rollout import RolloutError, rollout
 from fbse_drake.effects.actuation import DcMotor
 from fbse_drake.effects.effect import Effect
-from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
+from fbse_drake.estimators.reference_methods import FixedFriction
 from fbse_drake.scenario import RobotConfig
 from fbse_drake.walking.reference import JointSines, Recorded
 
@@ -160,3 +162,37 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
     assert worst(error) < 2e-3 * angle[-1]
     assert error.velocity["servo"] < 2e-3 * no_load
     assert error.torque_command["servo"] < 1e-12
+
+
+def test_what_compensates_friction_moves_the_model_too():
+    """The robot's friction was fed forward: the true model does the same, one that is not compensated does not."""
+    law = CoulombViscousFriction(coulomb={"all": 0.08}, viscous={"all": 0.0}, transition={"all": 0.02})
+    friction = {"friction": law}
+    compensated = dataclasses.replace(
+        pendulum({}, friction), estimator=FixedFriction(law), compensation=FeedforwardCompensation(cutoff=50.0)
+    )
+    log = simulate(compensated).log
+    model = dataclasses.replace(compensated, model=RobotConfig("pendulum", effects=friction), reference=Recorded())
+    assert worst(rollout(model, log)) < 1e-9
+    only_watched = dataclasses.replace(model, compensation=NoCompensation())
+    assert worst(rollout(only_watched, log)) > 1e-3
+
+
+def test_an_estimate_that_is_only_watched_is_left_out_of_a_rollout(log: Log, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("fbse_drake.estimators.estimator.EstimatorDiagram", None)
+    watched = dataclasses.replace(pendulum(TRUE), estimator=FixedFriction(CoulombViscousFriction(transition={"all": 0.02})))
+    assert worst(rollout(watched, log)) < 1e-9
+
+
+def test_a_walk_is_simulated_with_its_estimator_and_compensation():
+    """The estimator of a rollout believes what it believed when the log was made: frictionless joints."""
+    walk = load_scenario("hrp2_walk_fbse", overrides=("duration=0.3",))
+    log = simulate(walk).log
+    model = dataclasses.replace(walk, model=walk.robot)
+    error = rollout(model, log, planned_with=walk.believed)
+    uncompensated = dataclasses.replace(model, compensation=NoCompensation())
+    other = rollout(uncompensated, log, planned_with=walk.believed)
+    assert error.failure is None
+    assert error.time == pytest.approx(0.3)
+    assert error.mean_torque_command < 0.5 * other.mean_torque_command
+    assert error.mean_position < other.mean_position

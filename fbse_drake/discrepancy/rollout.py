@@ -61,13 +61,17 @@ def rollout(
 ) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
-    Reference and controller are the scenario's, and so are estimator and compensation, where the estimate is compensated: it moves the robot.
-    Sensor noise is drawn anew, three times, and the median of the errors is returned. A `!Recorded` reference is that of the log: the model starts where each stretch of the log starts, and its position loop gets what the
-    robot's got. Played open loop, a recorded torque would say little: its errors add up, and what is not stable in itself falls.
+    Reference and controller are the scenario's, and so are estimator and compensation where there
+    is one: what is compensated moves the robot. Sensor noise is drawn anew, three times, and the
+    median of the errors is returned. A `!Recorded` reference is that of the log: the model starts
+    where each stretch of the log starts, its sensors are exact, and its position loop gets what the
+    robot's got. Played open loop, a recorded torque would say little: its errors add up, and what
+    is not stable in itself falls.
 
     Args:
-        planned_with: the model that reference and feed-forward were planned with, and that the estimator believed, when the log was made,
-            which did not know what has been added since; by default the scenario's.
+        planned_with: the model that reference and feed-forward were planned with, and that the
+            estimator believed, when the log was made, which did not know what has been added since;
+            by default the scenario's.
 
     Returns:
         None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
@@ -81,12 +85,13 @@ def rollout(
             return None
         return _recorded_rollout(believed, scenario.reference, log, progress)
     believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
-    draws = [_simulated_error(replace(believed, seed=scenario.seed + 1 + k), log, progress) for k in range(_DRAWS)]
+    seeds = range(scenario.seed + 1, scenario.seed + 1 + _DRAWS)
+    draws = [_simulated_error(replace(believed, seed=seed), log, progress) for seed in seeds]
     return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[_DRAWS // 2]
 
 
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
-    """The scenario with its model in the place of the robot, and what controller and estimator believed.
+    """The scenario with its model in the robot's place; the rest believes what it believed.
 
     An estimate that nobody uses does not move the robot, and takes its time.
     """
@@ -148,11 +153,11 @@ def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress
 
 
 def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
-    """The scenario's robot, which here is the model, in the log's place, from the log's first state on;
-    its sensors measure exactly.
+    """The scenario's robot, which here is the model, in the log's place, from its first state on.
 
     Returns:
-        What it did at the log's sample times, by channel; and why these are fewer than the log's, or None.
+        What it did at the log's sample times, by channel; and why these are fewer than the log's,
+        or None.
     """
     time_step, start = scenario.plant.time_step, float(log.time[0])
     duration = float(log.time[-1]) - start + time_step
@@ -187,7 +192,12 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     return channels | channels_of("torque_command", command, n), failure
 
 
-def _first_state(robot: Robot, effects: list[ResolvedEffect], log: Log, period: float) -> tuple[np.ndarray, np.ndarray]:
+def _first_state(
+    robot: Robot,
+    effects: list[ResolvedEffect],
+    log: Log,
+    period: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
     few = slice(0, _STARTING_SAMPLES)
     q = log["joint/position"][0]

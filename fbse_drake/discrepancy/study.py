@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,8 @@ def study(
             say("simulating the model against the log")
             rolled = rollout(scenario, log, planned_with=planned_with)
             if isinstance(scenario.reference, Recorded):
-                candidates = ((name, rollout(scenario, other)) for name, other in (tests or {}).items())
+                played = partial(rollout, scenario, planned_with=planned_with)
+                candidates = ((name, played(other)) for name, other in (tests or {}).items())
                 test_rolled = {name: error for name, error in candidates if error is not None}
         return StudyStep(tuple(added), held_out_rmse, train_rmse, rolled, errors, test_rolled)
 

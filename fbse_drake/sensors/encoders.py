@@ -23,6 +23,7 @@ _DIFFERENTIATION_TIME = 0.004
 class EncoderConfig(Sensor):
     """Angles are read as `resolution * round((angle + noise) / resolution)`."""
 
+    has_own_key: ClassVar[bool] = True
     signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_joint_state")
     whole_steps: ClassVar[tuple[str, ...]] = ("period",)
 

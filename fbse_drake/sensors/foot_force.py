@@ -25,6 +25,7 @@ from fbse_drake.signals import Signal, signals_of
 class FootForceConfig(Sensor):
     """Errors of each axis of each pad, or of a six-axis sensor; the defaults measure exactly."""
 
+    has_own_key: ClassVar[bool] = True
     signals: ClassVar[tuple[Signal, ...]] = (
         *signals_of("measured_pad_force"),
         *signals_of("true_pad_force"),
@@ -51,7 +52,7 @@ class FootForceConfig(Sensor):
         return FootForceSensors(self, robot, *run) if robot.description.legs else NoFeet()
 
     def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The forces on the pads of each foot, or the wrench on its sole; of the true forces both."""
+        """Forces on the pads of each foot, or the wrench on its sole; of the true ones both."""
         forces, wrenches = _by_foot(robot, recorded["measured_pad_force"])
         pads = {side: force for side, force in forces.items() if side not in wrenches}
         true_forces, true_wrenches = _by_foot(robot, recorded["true_pad_force"])
@@ -70,8 +71,14 @@ class FootForceConfig(Sensor):
 
 
 def _by_foot(robot: Robot, pad_force: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Forces at each foot's pads or corners, (N, points, 3), and the wrench on each foot with a six-axis
-    sensor, (N, 6)."""
+    """Forces at each foot's pads or corners, and the wrench on each six-axis sensor.
+
+    Args:
+        pad_force: three components pad by pad, (N, size) [N].
+
+    Returns:
+        By side, (N, points, 3) [N] and (N, 6) [Nm, N].
+    """
     pad_force = pad_force.reshape(len(pad_force), -1, 3)
     forces = dict(zip(robot.description.sides, FootPads(robot).split(pad_force), strict=True))
     wrenches = {

@@ -23,6 +23,7 @@ from fbse_drake.signals import Signal, signals_of
 class ImuConfig(Sensor):
     """Errors of the IMU; all 0 measures exactly."""
 
+    has_own_key: ClassVar[bool] = True
     signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_imu")
 
     # Standard deviation of white noise per axis and sample [m/s^2], [rad/s].

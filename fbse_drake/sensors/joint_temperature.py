@@ -1,17 +1,19 @@
 """Temperature of the joints' motor windings.
 
-A winding is one heat capacity C behind one thermal resistance R to its surroundings (the first-order
-model of motor data sheets),
+A winding is one heat capacity C behind one thermal resistance R to its surroundings (the
+first-order model of motor data sheets),
 
     C dT/dt = P - (T - T_ambient) / R,    P = copper_loss * tau^2 + friction_share * max(u v, 0)
 
 with the commanded torque tau (copper loss goes with the current squared, and the current with the
-torque), the torque loss u of the joint and its velocity v. Under constant power it warms up from T_0 as
+torque), the torque loss u of the joint and its velocity v. Under constant power it warms up from
+T_0 as
 
     T(t) = T_ambient + R P + (T_0 - T_ambient - R P) exp(-t / (R C))
 
-What is heated by friction is the gear; a share of it reaches the winding. A torque loss that gives power
-back to the joint (a spring, a motor's gain) is no friction and counts as none while it does so.
+What is heated by friction is the gear; a share of it reaches the winding. A torque loss that gives
+power back to the joint (a spring, a motor's gain) is no friction and counts as none while it does
+so.
 """
 
 from dataclasses import dataclass, field
@@ -39,10 +41,10 @@ from fbse_drake.signals import Signal, signals_of
 @in_library
 @dataclass(frozen=True)
 class JointTemperature(Sensor):
-    """Thermometers in the windings, and the windings' heat; by joint, see `RobotDescription.per_joint`.
+    """Thermometers in the windings, and the windings' heat; values are by joint.
 
-    Read as `resolution * round((temperature + noise) / resolution)`. The defaults are a motor of some
-    100 W in a robot's leg.
+    Read as `resolution * round((temperature + noise) / resolution)`. The defaults are a motor of
+    some 100 W in a robot's leg.
     """
 
     signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_temperature")
@@ -123,9 +125,10 @@ class WindingThermometers(LeafSystem):
         output_ports:
         - measured_temperature
 
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; torques (n,) [Nm], of the step that
-    begins; `error` (n,) [K] is added before the reading is rounded; `measured_temperature` (n,) [degC].
-    Discrete state: the temperatures, updated with the power at each tick.
+    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; torques (n,) [Nm], of the
+    step that begins; `error` (n,) [K] is added before the reading is rounded;
+    `measured_temperature` (n,) [degC]. Discrete state: the temperatures, updated with the power at
+    each tick.
     """
 
     def __init__(self, config: JointTemperature, heat: WindingHeat):

@@ -18,6 +18,7 @@ from fbse_drake.signals import Signal, signals_of
 class JointTorqueConfig(Sensor):
     """Errors of every sensor."""
 
+    has_own_key: ClassVar[bool] = True
     signals: ClassVar[tuple[Signal, ...]] = signals_of("measured_torque")
 
     # Standard deviation of white noise [Nm].

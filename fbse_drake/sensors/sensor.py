@@ -1,8 +1,9 @@
 """What a sensor is, and the library of all of them.
 
-A sensor is one class in one file: a frozen dataclass that says how it errs (what a scenario file says
-of it), the signals that it gives, and the Drake system that measures. Behind `@in_library` its signals
-are in the table of all signals (`fbse_drake.signals`), and a scenario file can name it:
+A sensor is one class in one file: a frozen dataclass that says how it errs (what a scenario file
+says of it), the signals that it gives, and the Drake system that measures. Behind `@in_library`
+its signals are in the table of all signals (`fbse_drake.signals`), and a scenario file can name
+it:
 
     sensors: {more: {winding: !JointTemperature {noise: 0.5}}}
 
@@ -38,17 +39,19 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensor(ABC):
-    """Base of the sensors: a frozen dataclass whose fields say how the sensor errs, by default not at all."""
+    """Base of the sensors: a frozen dataclass whose fields say how the sensor errs."""
 
     # What it gives: rows of the table of signals.
     signals: ClassVar[tuple[Signal, ...]]
     # Fields [s] that must be whole multiples of the plant's step, or 0.
     whole_steps: ClassVar[tuple[str, ...]] = ()
+    # Has it a key of its own under `sensors`? Then it does not stand under `sensors.more`.
+    has_own_key: ClassVar[bool] = False
 
     @staticmethod
     def alternatives() -> tuple[type["Sensor"], ...]:
         """What can stand under `sensors.more` in a scenario file (see `fbse_drake.schema`)."""
-        return tuple(_LIBRARY.values())
+        return tuple(sensor for sensor in _LIBRARY.values() if not sensor.has_own_key)
 
     @classmethod
     def ports(cls) -> list[str]:
@@ -59,10 +62,11 @@ class Sensor(ABC):
     def system(self, robot: Robot, run: Run) -> System:
         """The system that measures.
 
-        Its output ports are those of its signals. Its input ports are named like the robot's ports, of
-        which it takes what it needs: `joint_state` [q, v], `torque_command` and `torque_loss` (of the
-        step that begins), `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations` and
-        `reaction_forces` (of the step that ends), see `fbse_drake.station.add_robot`.
+        Its output ports are those of its signals. Its input ports are named like the robot's
+        ports, of which it takes what it needs: `joint_state` [q, v], `torque_command` and
+        `torque_loss` (of the step that begins), `body_poses`, `body_spatial_velocities`,
+        `body_spatial_accelerations` and `reaction_forces` (of the step that ends), see
+        `fbse_drake.station.add_robot`.
         """
 
     def add(
@@ -77,10 +81,19 @@ class Sensor(ABC):
 
         Returns:
             Its output ports by name.
+
+        Raises:
+            InputError: the system has an input that the robot has no port for, or other outputs
+                than its signals.
         """
         system = builder.AddNamedSystem(name, self.system(robot, run))
-        connect_by_name(builder, ports, system)
-        return outputs_by_name(system)
+        with located(f"sensor {name}: "):
+            connect_by_name(builder, ports, system)
+            given = outputs_by_name(system)
+            if set(given) != set(self.ports()):
+                expected, found = ", ".join(self.ports()), ", ".join(given) or "none"
+                raise InputError(f"expected the output ports {expected}, found {found}")
+        return given
 
     def check(self, names: RobotDescription) -> None:  # noqa: B027
         """Raises InputError for values of joints that a robot has not."""
@@ -88,7 +101,8 @@ class Sensor(ABC):
     def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Log channels, (N, ...) each, that its recorded ports, (N, size) each, become."""
         n = len(robot.joint_names)
-        parts = (channels_of(port, recorded[port], n) for port in self.ports())
+        ports = [port for port in self.ports() if port in recorded]
+        parts = (channels_of(port, recorded[port], n) for port in ports)
         return {name: values for part in parts for name, values in part.items()}
 
     def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:  # noqa: ARG002
@@ -107,12 +121,11 @@ T = TypeVar("T", bound=type[Sensor])
 
 
 def in_library(sensor: T) -> T:
-    """Class decorator: puts a sensor into the library, under its class name, and its signals into the
-    table.
+    """Class decorator: puts a sensor into the library and its signals into the table.
 
     Raises:
-        InputError: it lacks its signals or its system, or there is another sensor, port or channel of
-            one of its names.
+        InputError: it lacks its signals or its system, or there is another sensor, port or channel
+            of one of its names.
     """
     if not getattr(sensor, "signals", ()):
         raise InputError(f"sensor {sensor.__name__}: the class variable signals is missing")
@@ -121,7 +134,8 @@ def in_library(sensor: T) -> T:
         raise InputError(f"sensor {sensor.__name__}: the method {missing} is missing")
     known = _LIBRARY.get(sensor.__name__)
     if known is not None and _place(known) != _place(sensor):
-        raise InputError(f"sensor {sensor.__name__}: there is another one of this name, in {known.__module__}")
+        other = known.__module__
+        raise InputError(f"sensor {sensor.__name__}: there is another of this name, in {other}")
     with located(f"sensor {sensor.__name__}: "):
         register(*sensor.signals)
     _LIBRARY[sensor.__name__] = sensor

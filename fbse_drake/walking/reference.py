@@ -77,7 +77,7 @@ class Reference:
         return ReferenceSource(self)
 
     def set_start(self, robot: Robot, ground: Ground) -> None:
-        """Makes its start the default positions of a robot, standing where the ground carries the weight."""
+        """Makes its start a robot's default positions, as deep as the ground carries the weight."""
         plant = robot.plant
         context = plant.CreateDefaultContext()
         if robot.has_floating_base:
@@ -106,9 +106,10 @@ class RecordedReference:
         return RecordedSource(self.log, time_step)
 
     def set_start(self, robot: Robot, ground: Ground) -> None:  # noqa: ARG002
-        """Raises InputError for a robot with a floating base, whose start no log tells well enough."""
+        """Raises InputError for a robot with a floating base, whose start no log tells."""
         if robot.has_floating_base:
-            raise InputError("reference: a recorded motion is only simulated for a robot with a fixed base")
+            allowed = "a robot with a fixed base"
+            raise InputError(f"reference: a recorded motion is only simulated for {allowed}")
 
 
 def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> Reference:
@@ -357,9 +358,9 @@ class RecordedSource(Diagram):
         - feedforward_torque
         - enabled
 
-    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s], at rest where the log
-    has no velocities; `feedforward_torque` (n,) [Nm] and `enabled` (n,) (0 for a drive that is switched
-    off) are there where the log has them.
+    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s], at rest where
+    the log has no velocities; `feedforward_torque` (n,) [Nm] and `enabled` (n,) (0 for a drive that
+    is switched off) are there where the log has them.
     """
 
     def __init__(self, log: Log, time_step: float):
