@@ -41,8 +41,7 @@ def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] 
 
 
 def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:
-    """What the ports of a station told when the log was recorded, as far as the log says it; each
-    (N, size)."""
+    """What a station's ports told when the log was recorded, (N, size) each, if the log says it."""
     if log.joints != robot.joint_names:
         raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
     values = {port: port_values(port, log) for port in ("torque_command", "torque_loss")}

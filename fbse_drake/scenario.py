@@ -15,7 +15,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake import resources, schema
-from fbse_drake.control.compensation import CompensationConfig, IntegralCompensation, NoCompensation
+from fbse_drake.control.compensation import CompensationConfig, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import inertia_changes
@@ -101,8 +101,7 @@ class SensorsConfig:
 
     @property
     def without_errors(self) -> "SensorsConfig":
-        """The same sensors, where the controller and the estimators see them, as they would measure
-        exactly."""
+        """The same with exact sensors where controller and estimators see them."""
         return replace(
             self,
             encoders=EncoderConfig(period=self.encoders.period),
@@ -359,8 +358,8 @@ def check_joints(scenario: Scenario) -> None:
         names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
     for key in ("torque_noise", "torque_noise_share", "least_speed"):
         names.per_joint(getattr(scenario.recording, key), key=f"recording.{key}", default=0.0)
-    if isinstance(scenario.compensation, IntegralCompensation):
-        names.per_joint(scenario.compensation.gain, key="compensation.gain")
+    if scenario.compensation.uses_estimate:
+        scenario.compensation.low_pass(names)
     if isinstance(scenario.estimator, FixedFriction):
         scenario.estimator.model.resolve(names, key="estimator.model")
     if isinstance(scenario.estimator, Fbse):

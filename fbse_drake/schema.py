@@ -158,8 +158,8 @@ def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, 
         if value is None:
             return None
         options = tuple(option for option in options if option is not type(None))
-    if len(options) == 1:
-        return _build(options[0], value, default, file, key)
+        if len(options) == 1:
+            return _build(options[0], value, default, file, key)
     names = {option.__name__: option for option in options}
     tag = value.get("_tag") if isinstance(value, dict) else None
     if tag is None and type(default) in options:

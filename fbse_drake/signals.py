@@ -195,7 +195,8 @@ def channel_kind(channel: str) -> tuple[str, Shape]:
     for row in _TABLE:
         if re.fullmatch(row.channel, channel):
             return row.unit, row.shape
-    raise InputError(f"channel {channel}: not a channel of a log (see fbse_drake.signals)")
+    hint = "see fbse_drake.signals; that of a sensor of your own is one once its module is imported"
+    raise InputError(f"channel {channel}: not a channel of a log ({hint})")
 
 
 def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndarray]:
