@@ -249,7 +249,11 @@ def renamed(log: Log, path: Path) -> None:
         ("paper_walk_fbse", single_array, "log.npz: truncated or not a log file (npz)"),
         ("paper_walk_fbse", texts, "log.npz: channel joint/velocity: expected numbers"),
         ("paper_walk_fbse", renamed, "are not the model's"),
-        ("paper_walk_fbse", lambda log, path: without_estimates(log, "foot/").save(path), "measured_pad_force (foot/<side>/pad_force, foot/<side>/wrench)"),
+        (
+            "paper_walk_fbse",
+            lambda log, path: without_estimates(log, "foot/").save(path),
+            "measured_pad_force (foot/<side>/pad_force, foot/<side>/wrench)",
+        ),
         ("paper_walk_fbse", lambda log, path: without_estimates(log, "imu/").save(path), "measured_imu (imu/linear_acceleration"),
         ("squat", Log.save, "squat over"),
         ("squid", Log.save, "squid: no such file"),
