@@ -24,6 +24,7 @@ from fbse_drake.errors import InputError, located, require_not_negative, require
 from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import RobotDescription, load_description
+from fbse_drake.robot.implicit import ImplicitTorque
 from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
@@ -268,11 +269,12 @@ def build_robot(
     builder: DiagramBuilder | None = None,
     plant: MultibodyPlantConfig | None = None,
     ground: Ground | None = None,
+    implicit: ImplicitTorque | None = None,
 ) -> Robot:
     """A robot's plant, with the inertia effects that the robot has.
 
     Args:
-        builder, plant, ground: see `make_robot`.
+        builder, plant, ground, implicit: see `make_robot`.
 
     Raises:
         InputError: see `make_robot`; also a joint or body of an effect that the robot has not.
@@ -288,6 +290,7 @@ def build_robot(
         builder=builder,
         config=plant,
         ground=ground,
+        implicit=implicit,
     )
     return robot
 

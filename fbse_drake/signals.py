@@ -33,6 +33,8 @@ class Signal:
     port: str = ""
     # Does a simulation record the port?
     recorded: bool = True
+    # Does the port tell at a tick what the channel has of the step that ended then?
+    late: bool = False
     # Of an estimate: the estimator of the chain and the field of its posterior.
     estimator: str = ""
     field: str = ""
@@ -104,7 +106,7 @@ _TABLE: list[Signal] = [
     Signal("", port="generalized_acceleration"),
     Signal(r"truth/foot/\w+/pad_force", "N", ("m", 3), "true_pad_force"),
     Signal(r"truth/foot/\w+/wrench", "Nm, N", (6,), "true_pad_force"),
-    Signal("truth/joint/friction_torque", "Nm", ("n",), "torque_loss"),
+    Signal("truth/joint/friction_torque", "Nm", ("n",), "torque_loss", late=True),
     # Estimates.
     _estimate("sensors/status", "sensor_monitor", "trust", "1"),
     _estimate("support", "sensor_monitor", "support", "1"),
@@ -181,6 +183,11 @@ def signals_of(port: str) -> tuple[Signal, ...]:
     return tuple(row for row in _TABLE if row.port == port)
 
 
+def is_late(port: str) -> bool:
+    """Does the port tell of the step that ended what its channels have in the row where it began?"""
+    return any(row.late for row in signals_of(port))
+
+
 def estimates() -> list[Signal]:
     """The rows of the estimators' posteriors."""
     return [row for row in _TABLE if row.estimator]
@@ -223,7 +230,8 @@ def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndar
 
 def port_values(port: str, log: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """What a port told when a log was recorded, (N, size); None where the log lacks it."""
-    names = [row.channel for row in signals_of(port) if row.channel]
-    if not names or any(name not in log for name in names):
+    rows = [row for row in signals_of(port) if row.channel]
+    if not rows or any(row.channel not in log for row in rows):
         return None
-    return np.hstack([log[name].reshape(len(log[name]), -1) for name in names])
+    values = np.hstack([log[row.channel].reshape(len(log[row.channel]), -1) for row in rows])
+    return np.vstack([np.zeros_like(values[:1]), values[:-1]]) if is_late(port) else values

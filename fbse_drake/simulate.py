@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, VectorLogSink
 
 from fbse_drake import signals
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
@@ -86,7 +87,7 @@ def _simulate(
 ) -> SimulationResult:
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
-    sink = add_record(builder, station, _recorded(station), scenario.log.period)
+    sink = add_record(builder, station, _recorded(station), scenario.plant.time_step)
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
@@ -111,6 +112,9 @@ def _simulate(
                 progress(context.get_time())
             if interrupted.is_set():
                 raise KeyboardInterrupt
+        else:
+            # What acts in the step that begins with the last row is known when that has ended.
+            simulator.AdvanceTo(scenario.duration + scenario.plant.time_step)
     except KeyboardInterrupt:
         failure = "interrupted"
     except RuntimeError as error:
@@ -174,19 +178,23 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
 
 
 def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
-    robot = station.robot
+    robot, time_step = station.robot, scenario.plant.time_step
     names = _recorded(station)
     ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
     # A run that diverges may end in rows that are not numbers.
-    rows = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
-    raw = dict(zip(names, np.split(record.data().T[rows], ends, axis=1), strict=True))
-    # The recorded times are sums of periods; the ticks they stand for are exact.
-    time = np.round(record.sample_times()[rows] / scenario.log.period) * scenario.log.period
+    finite = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
+    ticks = dict(zip(names, np.split(record.data().T[finite], ends, axis=1), strict=True))
+    # Of the plant steps those that ended are known.
+    steps = max(int(finite.sum()) - 1, 1)
+    rows = np.arange(0, steps, round(scenario.log.period / time_step))
+    raw = {port: values[np.minimum(rows + signals.is_late(port), len(values) - 1)] for port, values in ticks.items()}
+    time = rows * time_step
     channels = {
         "time": time,
         **_port_channels(scenario.sensors, robot, raw),
         **_reference_channels(station.reference, time),
         **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
+        "truth/joint/friction_law_torque": _law(scenario, robot, ticks)[np.minimum(rows, steps - 1)],
     }
     meta = {
         "joints": robot.joint_names,
@@ -206,6 +214,28 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "outcome": {"finished": failure is None, "fell": fell, "reason": failure or "finished", "time": float(time[-1])},
     }
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
+
+
+def _law(scenario: Scenario, robot: Robot, ticks: Mapping[str, np.ndarray]) -> np.ndarray:
+    """What the joints' effects are by their laws, of the velocity that came out, in every plant
+    step, (N - 1, n) [Nm]; of a run of one tick what it is there.
+
+    Args:
+        ticks: of every port at every plant tick, (N, size).
+    """
+    effects = scenario.robot.effects_of(JointTorqueEffect, robot.description, key="robot")
+    state, command, loss = (ticks[name] for name in ("plant_state", "torque_command", "torque_loss"))
+    velocity = state[:, robot.plant.num_positions() + robot.velocity_index]
+    count, time_step = max(len(state) - 1, 1), scenario.plant.time_step
+    motion = JointMotion(
+        velocity=velocity[-count:],
+        position=state[:count, robot.position_index],
+        command=command[:count],
+        time=np.arange(count)[:, None] * time_step,
+        time_step=time_step,
+        load=np.vstack([command[:1], command[: count - 1] - loss[1:count]]),
+    )
+    return law_over_time(effects, motion)
 
 
 def _port_channels(

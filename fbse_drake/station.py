@@ -9,21 +9,23 @@ table of signals (`fbse_drake.signals`).
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import Demultiplexer, MatrixGain, PassThrough
+from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, MatrixGain, PassThrough
 
 from fbse_drake import signals
 from fbse_drake.control.compensation import FrictionCompensation
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.contact import contact_with_effects
-from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.implicit import ImplicitLaw, implicit_law
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.sensor import SensorEffect, SensorEffects
-from fbse_drake.effects.system import JointTorqueEffects, conservative_inertia
+from fbse_drake.effects.system import JointTorqueEffects
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
-from fbse_drake.robot.description import RobotDescription
+from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
 from fbse_drake.sensors.sensor import Run
@@ -140,51 +142,85 @@ def add_robot(
 
     Returns:
         With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
-        `torque_loss` of the effects (n,) [Nm], `plant_state`, `generalized_acceleration` and those
-        of the plant that sensors need: `body_poses`, `body_spatial_velocities`,
-        `body_spatial_accelerations`, `reaction_forces`.
+        `torque_loss` of the effects in the step that ended (n,) [Nm], `plant_state`,
+        `generalized_acceleration` and those of the plant that sensors need: `body_poses`,
+        `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.
 
     Raises:
         InputError: effects or parts that the robot does not have.
     """
-    config = scenario.robot
+    config, time_step = scenario.robot, scenario.plant.time_step
     contact = (scenario.ground, scenario.plant, config.description)
+    names, _ = load_description(config.description)
+    torque_effects = config.effects_of(JointTorqueEffect, names, key="robot")
+    law = implicit_law(torque_effects, _planned_motion(reference, time_step))
     with located("robot: "):
         ground, settings = contact_with_effects(config.effects.values(), *contact)
-        robot = build_robot(config, builder=builder, plant=settings, ground=ground)
+        robot = build_robot(config, builder=builder, plant=settings, ground=ground, implicit=law.torque)
     reference.set_start(robot, ground)
-    plant, n = robot.plant, len(robot.joint_names)
+    plant = robot.plant
     joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
-    command = builder.AddNamedSystem("torque_command", PassThrough(n))
-    actuation = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
-    torque_effects = config.effects_of(JointTorqueEffect, robot.description, key="robot")
-    inertia = conservative_inertia(robot.joint_compliance(plant.CreateDefaultContext()))
-    system = JointTorqueEffects(torque_effects, inertia, scenario.plant.time_step)
-    effects = builder.AddNamedSystem("effects", system)
-    loss_to_force = MatrixGain(-robot.joint_force_selector)
-    loss_to_force = builder.AddNamedSystem("torque_loss_to_force", loss_to_force)
-    force = plant.get_applied_generalized_force_input_port()
-    for source, target in (
-        (plant.get_state_output_port(), joint_state.get_input_port()),
-        (joint_state.get_output_port(), effects.GetInputPort("joint_state")),
-        (command.get_output_port(), effects.GetInputPort("torque_command")),
-        (command.get_output_port(), actuation.get_input_port()),
-        (actuation.get_output_port(), plant.get_actuation_input_port()),
-        (effects.get_output_port(), loss_to_force.get_input_port()),
-        (loss_to_force.get_output_port(), force),
-    ):
-        builder.Connect(source, target)
+    builder.Connect(plant.get_state_output_port(), joint_state.get_input_port())
+    command = builder.AddNamedSystem("torque_command", PassThrough(len(names.joint_names)))
     ports = {
         "joint_state": joint_state.get_output_port(),
         "torque_command": command.get_output_port(),
-        "torque_loss": effects.get_output_port(),
         "plant_state": plant.get_state_output_port(),
         "generalized_acceleration": plant.get_generalized_acceleration_output_port(),
         "reaction_forces": plant.get_reaction_forces_output_port(),
     }
     for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
         ports[name] = plant.GetOutputPort(name)
+    ports |= add_joint_torques(builder, robot, law, time_step, ports)
     return SimulatedRobot(robot, command.get_input_port(), ports)
+
+
+def _planned_motion(reference: Reference | RecordedReference, time_step: float) -> JointMotion:
+    """The motion of the joints that a run is planned to have."""
+    return JointMotion(
+        velocity=reference.joint_velocity,
+        position=reference.joint_position,
+        time=reference.time[:, None],
+        time_step=time_step,
+        load=reference.feedforward_torque,
+    )
+
+
+def add_joint_torques(
+    builder: DiagramBuilder,
+    robot: Robot,
+    law: ImplicitLaw,
+    time_step: float,
+    ports: Ports,
+) -> dict[str, OutputPort]:
+    """Adds what moves a robot's joints: commanded torque, and the losses of its effects.
+
+    Returns:
+        `torque_loss`.
+    """
+    plant, instance = robot.plant, robot.base.model_instance()
+    effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step))
+    net_actuation = plant.get_net_actuation_output_port()
+    connect_by_name(builder, {**ports, "net_actuation": net_actuation}, effects)
+    force = plant.get_applied_generalized_force_input_port()
+    builder.Connect(effects.GetOutputPort("explicit_force"), force)
+
+    # The clamps are controllers that want their joints to stand still.
+    wanted = plant.get_desired_state_input_port(instance)
+    still = builder.AddNamedSystem("stillness", ConstantVectorSource(np.zeros(wanted.size())))
+    builder.Connect(still.get_output_port(), wanted)
+    actuation = builder.AddNamedSystem("torque_to_actuation", MatrixGain(robot.actuation_selector))
+    builder.Connect(ports["torque_command"], actuation.get_input_port())
+    torque = actuation.get_output_port()
+    if effects.HasOutputPort("clamp_offset"):
+        offset = builder.AddNamedSystem("offset_to_actuation", MatrixGain(robot.clamp_selector))
+        both = builder.AddNamedSystem("actuation", Adder(2, plant.num_actuators()))
+        builder.Connect(effects.GetOutputPort("clamp_offset"), offset.get_input_port())
+        builder.Connect(torque, both.get_input_port(0))
+        builder.Connect(offset.get_output_port(), both.get_input_port(1))
+        torque = both.get_output_port()
+    builder.Connect(torque, plant.get_actuation_input_port())
+    return {"torque_loss": effects.GetOutputPort("torque_loss")}
 
 
 def add_sensors(

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, affine_recursion
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise, affine_recursion
 
 
 @in_library
@@ -199,3 +199,8 @@ class DcMotor(JointTorqueEffect):
         kt, resistance = nonlinear
         damping = kt * kt / resistance * (np.asarray(motion.command) != 0)
         return (damping * motion.velocity,), (damping,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        kt, resistance = nonlinear
+        return Rise(damping=kt * kt / resistance)

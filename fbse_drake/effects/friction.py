@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
 
 _COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
 _VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
@@ -33,6 +33,7 @@ class CoulombFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction of constant size against the motion."
     signature: ClassVar[str] = "Torque jumps when the velocity changes sign and is constant otherwise."
     experiment: ClassVar[str] = "Move each joint to and fro."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "transition": _TRANSITION}
 
     coulomb: dict[str, float] = field(default_factory=dict)
@@ -43,6 +44,10 @@ class CoulombFriction(JointTorqueEffect):
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign,), (slope,)
 
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(speeds=(nonlinear[0],))
+
 
 @in_library
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class ViscousFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction in proportion to speed, as of grease and of the motor's own damping."
     signature: ClassVar[str] = "Torque rises linearly with the velocity, without a jump at rest."
     experiment: ClassVar[str] = "Move each joint at several constant speeds."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {"viscous": _VISCOUS}
 
     viscous: dict[str, float] = field(default_factory=dict)
@@ -59,6 +65,10 @@ class ViscousFriction(JointTorqueEffect):
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:  # noqa: ARG004
         return (motion.velocity,), (1.0,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(damping=linear[0])
 
 
 @in_library
@@ -72,6 +82,7 @@ class StribeckFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction that is largest just after the joint starts to move, then falls, then grows with speed."
     signature: ClassVar[str] = "Torque changes sign with the velocity and peaks at a few hundredths of a rad/s."
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds, some below 0.05 rad/s."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "gamma1": Parameter("Nm", linear=True, plausible=(0.0, 20.0)),
         "gamma2": Parameter("s/rad", linear=False, plausible=(50.0, 500.0)),
@@ -96,6 +107,11 @@ class StribeckFriction(JointTorqueEffect):
         slope = nonlinear * (1.0 - tanh * tanh)
         return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
 
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        with np.errstate(divide="ignore"):
+            return Rise(linear[2], (1.0 / nonlinear[0], 1.0 / nonlinear[2]))
+
 
 @in_library
 @dataclass(frozen=True)
@@ -105,6 +121,7 @@ class CoulombViscousFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction of constant size against the motion, plus a part that grows with speed."
     signature: ClassVar[str] = "Torque jumps when the velocity changes sign and rises linearly with it."
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "viscous": _VISCOUS, "transition": _TRANSITION}
     composite: ClassVar[bool] = True
 
@@ -116,6 +133,10 @@ class CoulombViscousFriction(JointTorqueEffect):
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign, motion.velocity), (slope, 1.0)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(linear[1], (nonlinear[0],))
 
 
 @in_library
@@ -129,6 +150,7 @@ class DirectionalFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction is larger in one direction of motion than in the other."
     signature: ClassVar[str] = "Torque of the same sign in both directions, none at rest."
     experiment: ClassVar[str] = "Move each joint to and fro, with stops between."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "asymmetry": Parameter("Nm", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
         "transition": _TRANSITION,
@@ -142,6 +164,10 @@ class DirectionalFriction(JointTorqueEffect):
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign * sign,), (2.0 * sign * slope,)
 
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(speeds=(nonlinear[0],))
+
 
 @in_library
 @dataclass(frozen=True)
@@ -154,6 +180,7 @@ class DirectionalViscousFriction(JointTorqueEffect):
     description: ClassVar[str] = "Friction grows faster with speed in one direction of motion than in the other."
     signature: ClassVar[str] = "Torque of the same sign in both directions that rises with the speed."
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "asymmetry": Parameter("Nm s/rad", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
     }
@@ -191,6 +218,10 @@ class LoadDependentFriction(JointTorqueEffect):
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (load * sign,), (load * slope,)
 
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(speeds=(nonlinear[0],))
+
 
 @in_library
 @dataclass(frozen=True)
@@ -200,6 +231,7 @@ class QuadraticDrag(JointTorqueEffect):
     description: ClassVar[str] = "Drag that grows with the square of the speed."
     signature: ClassVar[str] = "Torque against the motion that only shows at high speed."
     experiment: ClassVar[str] = "Move each joint slowly and as fast as it can."
+    of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {"drag": Parameter("Nm s^2/rad^2", linear=True, plausible=(0.0, 10.0))}
 
     drag: dict[str, float] = field(default_factory=dict)
@@ -208,6 +240,10 @@ class QuadraticDrag(JointTorqueEffect):
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:  # noqa: ARG004
         speed = np.abs(motion.velocity)
         return (motion.velocity * speed,), (2.0 * speed,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(damping=linear[0] * typical.velocity)
 
 
 @in_library
@@ -235,6 +271,10 @@ class ThermalDrift(JointTorqueEffect):
         warmth = -np.expm1(-motion.time / warm_up)
         sign, slope = smooth_sign(motion.velocity, transition)
         return (warmth * sign,), (warmth * slope,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(speeds=(nonlinear[1],))
 
 
 # The friction laws that an estimator can adopt: those that depend on the velocity alone, with all that friction has at least.

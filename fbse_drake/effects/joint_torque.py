@@ -41,14 +41,29 @@ class JointMotion(NamedTuple):
     load: np.ndarray | float = 0.0
 
 
+class Rise(NamedTuple):
+    """How a torque loss of n joints rises with their velocities."""
+
+    # Part damping * velocity, (n,) or a number [Nm s/rad].
+    damping: np.ndarray | float = 0.0
+    # Speeds at which other parts level off, as tanh(v / speed) does, (n,) each [rad/s].
+    speeds: tuple[np.ndarray, ...] = ()
+
+
 @dataclass(frozen=True)
 class JointTorqueEffect(Effect):
     """Base of the joint torque effects.
 
-    A subclass gives the class variables of `Effect` and the basis; one with memory also `has_memory`, `start` and `advance`.
+    A subclass gives the class variables of `Effect` and the basis; one with memory also
+    `has_memory`, `start` and `advance`. How it is simulated, it says by `rise` (and `lean`): the
+    part that rises with the velocity is solved by Drake's contact solver together with contact, at
+    any slope. What is left of the law is taken at the velocity that is expected at the end of the
+    step, so it must not be steep.
     """
 
     has_memory: ClassVar[bool] = False
+    # Does the torque depend on nothing but the velocity? (Then it is simulated faster.)
+    of_velocity_alone: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod
@@ -61,6 +76,21 @@ class JointTorqueEffect(Effect):
         Returns:
             Two sequences in the order of the linear parameters (one item if there are none), items that broadcast to (..., n).
         """
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        """How it rises with the velocity; by default it does not.
+
+        Args:
+            linear, nonlinear: values of the parameters, shape (parameters, n).
+            typical: speed, load and time in the run that is to be simulated, and the plant's step.
+        """
+        return Rise()
+
+    @staticmethod
+    def lean(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | float:  # noqa: ARG004
+        """Where in its range, from -1 to 1, the torque of a memory stands at velocity zero, (n,)."""
+        return 0.0
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -145,6 +175,19 @@ def basis_over_time(effect: type[JointTorqueEffect], motion: JointMotion, nonlin
         result.append([np.broadcast_to(b, (*sets, n)) for b in basis])
         memory = effect.advance(now, nonlinear)
     return np.moveaxis(np.array(result), 0, -2)
+
+
+def law_over_time(effects: Sequence[ResolvedJointTorque], motion: JointMotion) -> np.ndarray:
+    """Torque loss of some effects over N steps that follow each other, memory included, (N, n) [Nm].
+
+    Args:
+        motion: arrays that broadcast to (N, n); the memory is made here.
+    """
+    total = np.zeros(motion.velocity.shape)
+    for effect in effects:
+        basis = basis_over_time(effect.effect, motion, effect.nonlinear)
+        total += np.einsum("pn,pNn->Nn", effect.linear, basis)
+    return total
 
 
 def affine_recursion(start: np.ndarray | float, keep: np.ndarray, add: np.ndarray) -> np.ndarray:

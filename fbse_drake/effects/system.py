@@ -1,206 +1,312 @@
-"""Joint torque effects in a diagram, stable at any slope."""
+"""Joint torque effects in a diagram."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State, ValueProducer
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    State,
+)
+from pydrake.systems.primitives import Demultiplexer
 
+from fbse_drake.effects.implicit import ImplicitLaw
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
+from fbse_drake.robot.implicit import implicit_loss
+from fbse_drake.robot.plant import Robot
 
-# Newton's method stops at a step of this size [rad/s]; its last step is still taken. A plant step changes velocities by far more.
-_LAST_STEP = 3e-4
-_MAX_ITERATIONS = 60
-# The left side's derivative is taken to be at least this.
-_LEAST_GROWTH = 0.05
-# Rows of the state before those of the effects' memories, see `JointTorqueEffects`.
-_POSITION, _VELOCITY, _COMMAND, _TORQUE, _FREE, _END, _GAIN, _ROWS = range(8)
+# Share of the last step's change of velocity that is expected of the next: smooth motion would go on
+# with all of it, a joint that is stopped by a contact with none.
+_CARRIED_ON = 0.5
+# Rows of (n,) of what a tick remembers: explicit torque, velocity, position and command of the step
+# that begins; then offsets of clamps and memories of effects.
+_EXPLICIT, _VELOCITY, _POSITION, _COMMAND, _ROWS = range(5)
 
 
-class ImplicitStep(NamedTuple):
-    """Solution of `solve_implicit_step`, arrays of shape (n,)."""
+class LawTable(NamedTuple):
+    """Torque loss of each of n joints over its velocity, with cubic pieces between 2 K + 1 velocities
+    unit * sinh(k * rate), k = -K ... K, that lie densely about zero; straight beyond."""
 
-    # Velocity at the end of the step [rad/s] and the torque loss of that velocity [Nm].
+    # Shape (n,) [rad/s], [1].
+    unit: np.ndarray
+    rate: np.ndarray
+    # Shape (2 K + 1, n) [rad/s], [Nm], [Nm s/rad].
     velocity: np.ndarray
     torque: np.ndarray
-    # Derivative of the velocity with respect to the free velocity [1].
-    gain: np.ndarray
+    slope: np.ndarray
 
 
-def solve_implicit_step(
-    torque_and_slope: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    free_velocity: np.ndarray,
-    mobility: np.ndarray,
-    guess: np.ndarray,
-) -> ImplicitStep:
-    """Solves v + mobility * u(v) = free_velocity, for each joint by itself.
+# Pieces of a table on either side, and its largest velocity [rad/s].
+_PIECES, _FASTEST = 600, 100.0
+# The velocity about which it begins to spread is this share of the smallest speed at which a law
+# levels off, or of that speed where none does [rad/s].
+_DENSE, _NO_SPEED = 0.5, 1.0
 
-    This is one step of implicit Euler: v is the velocity at the end of the step, `free_velocity` what it would be without the effects,
-    `mobility` the step over the joint's inertia. The left side grows with v, unless a negative (Stribeck) slope times the mobility exceeds
-    1; then there may be several solutions, and it is one of them. Newton's method; where it leaves the bracket seen so far or its steps do
-    not halve, bisection.
 
-    Args:
-        torque_and_slope: u(v) [Nm] and its derivative [Nm s/rad], each (n,), for v (n,).
-        free_velocity, mobility, guess: shape (n,) [rad/s, rad/(Nm s), rad/s].
-    """
-    work = np.empty((6, len(guess)))
-    v = work[0]
-    v[:], work[3], work[4:] = guess, -math.inf, math.inf
-    for _ in range(_MAX_ITERATIONS):
-        torque, slope = torque_and_slope(v)
-        if _newton_step(work, torque, slope, free_velocity, mobility):
-            break
-    return ImplicitStep(v, work[1], work[2])
+def law_table(effects: Sequence[ResolvedJointTorque], joints: int) -> LawTable:
+    """The sum of effects that depend on the velocity alone."""
+    typical = JointMotion(np.zeros(joints))
+    rises = [effect.effect.rise(effect.linear, effect.nonlinear, typical) for effect in effects]
+    speeds = [np.broadcast_to(speed, joints) for rise in rises for speed in rise.speeds]
+    unit = _DENSE * np.min([*speeds, np.full(joints, _NO_SPEED)], axis=0)
+    rate = np.arcsinh(_FASTEST / unit) / _PIECES
+    velocity = unit * np.sinh(np.arange(-_PIECES, _PIECES + 1)[:, None] * rate)
+    torque, slope = np.zeros_like(velocity), np.zeros_like(velocity)
+    for effect in effects:
+        more = effect.torque_and_slope(JointMotion(velocity))
+        torque, slope = torque + more[0], slope + more[1]
+    return LawTable(unit, rate, velocity, torque, slope)
 
 
 @njit(cache=True)
-def _newton_step(work: np.ndarray, torque: np.ndarray, slope: np.ndarray, free_velocity: np.ndarray, mobility: np.ndarray) -> bool:
-    """One iteration of `solve_implicit_step` in place; says whether it was the last.
+def look_up(table: LawTable, at: np.ndarray) -> np.ndarray:
+    """Torque loss at velocities (n,) [rad/s], shape (n,) [Nm]."""
+    result = np.empty_like(at)
+    last = len(table.velocity) - 2
+    for j in range(len(at)):
+        k = last // 2 + 1 + math.floor(math.asinh(at[j] / table.unit[j]) / table.rate[j])
+        k = min(max(k, 0), last)
+        h = table.velocity[k + 1, j] - table.velocity[k, j]
+        x = (at[j] - table.velocity[k, j]) / h
+        # A chord, and what its ends' slopes differ from it by; straight where x is beyond them.
+        rise = table.torque[k + 1, j] - table.torque[k, j]
+        a, b = h * table.slope[k, j] - rise, h * table.slope[k + 1, j] - rise
+        bend = x * (1 - x) * ((1 - x) * a - x * b)
+        if x < 0:
+            bend = a * x
+        elif x > 1:
+            bend = b * (x - 1)
+        result[j] = table.torque[k, j] + x * rise + bend
+    return result
 
-    Args:
-        work: rows of (n,): the three of `ImplicitStep`, lower and upper end of the bracket, last step.
-    """
-    v, end_torque, gain, low, high, last_step = work[0], work[1], work[2], work[3], work[4], work[5]
-    # Where the left side falls, Newton's step would lead away from the solution.
-    gain[:] = 1.0 / np.maximum(1.0 + mobility * slope, _LEAST_GROWTH)
-    excess = v + mobility * torque - free_velocity
-    step = excess * gain
-    end_torque[:] = torque - slope * step
-    newton = v - step
-    if (step * step).sum() < _LAST_STEP**2:
-        v[:] = newton
-        return True
-    for i in range(len(v)):
-        if excess[i] > 0:
-            high[i] = v[i]
-        else:
-            low[i] = v[i]
-        middle = (low[i] + high[i]) / 2
-        astray = newton[i] < low[i] or newton[i] > high[i] or abs(step[i]) > 0.5 * abs(last_step[i])
-        v[i] = middle if astray and math.isfinite(middle) else newton[i]
-        last_step[i] = step[i]
-    return False
+
+class Tick(NamedTuple):
+    """Parts of what a tick makes, views of one vector."""
+
+    # Loss in the step that ended, (n,) [Nm].
+    loss: np.ndarray
+    # Generalized force in the step that begins, (velocities,) [Nm], [N].
+    force: np.ndarray
+    # What is remembered, in the rows named above, (rows, n).
+    memory: np.ndarray
+
+
+class _Solver(NamedTuple):
+    """What the plant's solver takes, see `ImplicitTorque`, and where it is found."""
+
+    damping: np.ndarray
+    slope: np.ndarray
+    limit: np.ndarray
+    # Place of the loss in each joint's clamps in the net actuation, or -1; of each joint in the
+    # velocities; (n,).
+    clamp: np.ndarray
+    velocity: np.ndarray
 
 
 @njit(cache=True)
-def _begin_step(state: np.ndarray, last: np.ndarray, joint_state: np.ndarray, command: np.ndarray, mobility: np.ndarray) -> None:
-    """Fills rows of the next state: what is known when a step begins, and a guess of the velocity at its end."""
-    n = len(command)
-    for i in range(n):
-        v = joint_state[n + i]
-        free_velocity = v + (v - last[_VELOCITY, i]) + mobility[i] * last[_TORQUE, i]
-        state[_POSITION, i], state[_VELOCITY, i], state[_COMMAND, i], state[_FREE, i] = joint_state[i], v, command[i], free_velocity
-        state[_END, i] = last[_END, i] + last[_GAIN, i] * (free_velocity - last[_FREE, i])
+def _parts(vector: np.ndarray, joints: int, velocities: int) -> Tick:
+    middle = joints + velocities
+    return Tick(vector[:joints], vector[joints:middle], vector[middle:].reshape(-1, joints))
 
 
-class JointTorqueEffects(LeafSystem):
-    """Applies joint torque effects to a plant with steps of `time_step`, semi-implicitly.
+@njit(cache=True)
+def _begin(
+    tick: Tick,
+    last: Tick,
+    joint_state: np.ndarray,
+    net_actuation: np.ndarray,
+    solver: _Solver,
+) -> np.ndarray:
+    """Fills the loss, velocities and positions of a tick; returns the velocities that are expected
+    at the next one, (n,) [rad/s]."""
+    n = len(tick.loss)
+    expected = joint_state[n:].copy()
+    tick.memory[_POSITION], tick.memory[_VELOCITY] = joint_state[:n], expected
+    tick.loss[:] = 0.0
+    if not math.isnan(last.memory[_VELOCITY, 0]):
+        for j in range(n):
+            expected[j] += _CARRIED_ON * (expected[j] - last.memory[_VELOCITY, j])
+            tick.loss[j] = last.memory[_EXPLICIT, j] + solver.damping[j] * joint_state[n + j]
+            if solver.clamp[j] >= 0:
+                tick.loss[j] -= net_actuation[solver.clamp[j]]
+    return expected
 
-    Friction is stiff: its slope at rest times the step is often larger than the joint's inertia, where an explicit torque rings.
-    Each tick solves, joint by joint, one step of implicit Euler for the effects' torque. What the joint would do without them is
-    taken from its last step: with inertia I and step h, the velocity without effects is
 
-        v[k+1] = v[k] + (v[k] - v[k-1]) + h/I u[k-1]
+@njit(cache=True)
+def _finish(
+    tick: Tick,
+    expected: np.ndarray,
+    torque: np.ndarray,
+    offset: np.ndarray,
+    solver: _Solver,
+) -> None:
+    """Fills the force of a tick: law (n,) [Nm] less what the solver takes at the same velocities."""
+    solved = implicit_loss(expected, solver.damping, solver.slope, solver.limit, offset)
+    tick.memory[_EXPLICIT] = torque - solved
+    tick.force[:] = 0.0
+    tick.force[solver.velocity] = solved - torque
 
-    and u[k] = u(v_hat[k+1]) with v_hat + h/I u(v_hat) equal to that. Where I is the joint's inertia this is implicit Euler exactly;
-    linear analysis for an inertia wrong by the factor r gives poles inside the unit circle for every slope if 0 < r < 4/3, so I is
-    chosen on the small side (`conservative_inertia`). In the limit of small steps u[k] = u(v[k]). A sudden change of the motor's torque is
-    felt one tick late by what depends on the velocity.
+
+@njit(cache=True)
+def _calc_steady(
+    tick: np.ndarray,
+    last: np.ndarray,
+    joint_state: np.ndarray,
+    net_actuation: np.ndarray,
+    offset: np.ndarray,
+    table: LawTable,
+    solver: _Solver,
+    velocities: int,
+) -> None:
+    """A tick of effects that depend on the velocity alone."""
+    n = len(joint_state) // 2
+    parts = _parts(tick, n, velocities)
+    parts.memory[_ROWS : _ROWS + len(offset)] = offset
+    expected = _begin(parts, _parts(last, n, velocities), joint_state, net_actuation, solver)
+    _finish(parts, expected, look_up(table, expected), offset, solver)
+
+
+class ExplicitTorque(LeafSystem):
+    """What Drake's solver does not take of joint torque effects, and their loss as a whole.
+
+    .. pydrake_system::
+
+        name: ExplicitTorque
+        input_ports:
+        - joint_state
+        - net_actuation
+        - torque_command
+        output_ports:
+        - tick
+
+    The explicit torque of a step is the law less what the solver takes of it, both at the velocity
+    that is expected at its end. So its error is the slope of this difference, which is small, times
+    what the expectation is wrong by.
+
+    `joint_state` is [positions, velocities], (2n,) [rad, rad/s]; `net_actuation` is the plant's
+    [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins. `tick` has
+    the parts of `Tick`. Discrete state: the last tick.
+    """
+
+    def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
+        super().__init__()
+        n, torque = len(robot.joint_names), law.torque
+        self._law, self._time_step, self._joints = law, time_step, n
+        self._velocities = robot.plant.num_velocities()
+        places = (robot.clamp_index, robot.velocity_index)
+        self._solver = _Solver(torque.damping, torque.slope, torque.limit, *places)
+        steady = [effect for effect in law.effects if effect.effect.of_velocity_alone]
+        self._table = law_table(steady, n)
+        # The other effects, with the rows of their memories.
+        self._others: list[tuple[int, ResolvedJointTorque, slice]] = []
+        self._offsets = slice(_ROWS, _ROWS + len(torque.offset))
+        rows, still = self._offsets.stop, JointMotion(np.zeros(n), time_step=time_step)
+        for k, effect in enumerate(law.effects):
+            if effect.effect.of_velocity_alone:
+                continue
+            start = rows
+            if effect.effect.has_memory:
+                rows += len(effect.effect.start(still, effect.nonlinear))
+            self._others.append((k, effect, slice(start, rows)))
+        self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
+        actuators = robot.plant.num_actuators()
+        self._net_actuation = self.DeclareVectorInputPort("net_actuation", actuators)
+        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
+        size = n + self._velocities + rows * n
+        self._last = self.DeclareDiscreteState(np.full(size, math.nan))
+        sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
+        self._tick = self.DeclareVectorOutputPort("tick", size, self._calc, sources)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
+        inputs = (self._joint_state.Eval(context), self._net_actuation.Eval(context))
+        if not self._others:
+            offset = self._law.torque.offset
+            table, solver = self._table, self._solver
+            _calc_steady(*vectors, *inputs, offset, table, solver, self._velocities)
+            return
+        tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
+        expected = _begin(tick, last, *inputs, self._solver)
+        motion = self._motion(context, tick, last, expected)
+        torque = look_up(self._table, expected)
+        for _, effect, rows in self._others:
+            at = motion._replace(memory=tick.memory[rows])
+            torque += effect.torque_and_slope(at)[0]
+        _finish(tick, expected, torque, tick.memory[self._offsets], self._solver)
+
+    def _motion(
+        self,
+        context: Context,
+        tick: Tick,
+        last: Tick,
+        expected: np.ndarray,
+    ) -> JointMotion:
+        """The step that begins, as effects see it; fills its command, memories and offsets."""
+        now, before, time_step = tick.memory, last.memory, self._time_step
+        first, time = math.isnan(before[_VELOCITY, 0]), context.get_time()
+        command = now[_COMMAND] = self._torque_command.Eval(context)
+        load = command if first else before[_COMMAND] - tick.loss
+        motion = JointMotion(expected, now[_POSITION], command, time, time_step, load=load)
+        now[self._offsets] = self._law.torque.offset
+        moving = {clamps.effect: clamps for clamps in self._law.moving}
+        for k, effect, rows in self._others:
+            if effect.effect.has_memory and first:
+                at_start = motion._replace(velocity=now[_VELOCITY])
+                now[rows] = effect.effect.start(at_start, effect.nonlinear)
+            elif effect.effect.has_memory:
+                ended = (before[_POSITION], before[_COMMAND], time - time_step, time_step)
+                step = JointMotion(now[_VELOCITY], *ended, before[rows])
+                now[rows] = effect.effect.advance(step, effect.nonlinear)
+            if k in moving:
+                offset = moving[k].offset(effect, motion._replace(memory=now[rows]))
+                now[self._offsets][moving[k].rows] = offset
+        return motion
+
+    def _remember(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state().set_value(0, self._tick.Eval(context))
+
+
+class JointTorqueEffects(Diagram):
+    """Joint torque effects beside a plant whose solver takes a part of them.
 
     .. pydrake_system::
 
         name: JointTorqueEffects
         input_ports:
         - joint_state
+        - net_actuation
         - torque_command
         output_ports:
         - torque_loss
+        - explicit_force
+        - clamp_offset
 
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `torque_command` and `torque_loss` u have shape (n,) [Nm] and act
-    from the tick on. Discrete state, rows of (n,): position, velocity, command, torque loss, free and final velocity and gain of the last
-    tick's step, and the memories of the effects at its start.
-
-    Memories follow the joint's true velocity, but where the slope exceeds I/h they follow more and more the final velocity that was solved
-    for: a bristle must not be stiffer than a step can follow, or an inertia that is chosen too small lets it ring.
+    Inputs are those of `ExplicitTorque`. `torque_loss` (n,) [Nm] is that of the plant step that
+    ended (zero before the first). `explicit_force` goes to the plant's applied generalized force;
+    `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm]; without clamps it is not there.
     """
 
-    def __init__(self, effects: Sequence[ResolvedJointTorque], inertia: np.ndarray, time_step: float):
-        """Declares ports, state and updates.
-
-        Args:
-            effects: what acts.
-            inertia: effective inertia of each joint, or less, shape (n,) [kg m^2].
-            time_step: the plant's step [s].
-        """
+    def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
         super().__init__()
-        n = len(inertia)
-        self._n, self._time_step, self._mobility, self._nothing = n, time_step, time_step / inertia, np.zeros(n)
-        self._effects, rows = [], _ROWS
-        for effect in effects:
-            start = rows
-            if effect.effect.has_memory:
-                rows += len(effect.effect.start(JointMotion(np.zeros(n), time_step=time_step), effect.nonlinear))
-            self._effects.append((effect, slice(start, rows)))
-        self._remembering = [(effect, rows) for effect, rows in self._effects if effect.effect.has_memory]
-        self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
-        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self._state = self.DeclareDiscreteState(np.full(rows * n, math.nan))
-        sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
-        step = ValueProducer(allocate=lambda: Value[object](), calc=self._calc_step)
-        self._step = self.DeclareCacheEntry("step", step, sources)
-        self.DeclareVectorOutputPort("torque_loss", n, self._calc_torque, {self._step.ticket()})
-        if effects:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
-
-    def _calc_step(self, context: Context, output: Value) -> None:
-        """The next state."""
-        n, mobility, time, time_step = self._n, self._mobility, context.get_time(), self._time_step
-        joint_state, command = self._joint_state.Eval(context), self._torque_command.Eval(context)
-        last = context.get_discrete_state(self._state).value().reshape(-1, n)
-        state = np.empty_like(last)
-        _begin_step(state, last, joint_state, command, mobility)
-        position, v = state[_POSITION], state[_VELOCITY]
-        first = math.isnan(last[_VELOCITY, 0])
-        load = command if first else last[_COMMAND] - last[_TORQUE]
-        for effect, rows in self._remembering:
-            if first:
-                now = JointMotion(v, position, command, time, time_step)
-                state[rows] = effect.effect.start(now, effect.nonlinear)
-            else:
-                velocity = last[_END] + np.clip(2.0 * last[_GAIN], 0.0, 1.0) * (v - last[_END])
-                step = JointMotion(velocity, last[_POSITION], last[_COMMAND], time - time_step, time_step, last[rows])
-                state[rows] = effect.effect.advance(step, effect.nonlinear)
-
-        def torque_and_slope(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            torque = slope = self._nothing
-            for effect, rows in self._effects:
-                more = effect.torque_and_slope(JointMotion(velocity, position, command, time, time_step, state[rows], load))
-                torque, slope = torque + more[0], slope + more[1]
-            return torque, slope
-
-        if first:
-            # As if the joint had been moving on like this.
-            state[_FREE], state[_END] = v + mobility * torque_and_slope(v)[0], v
-        state[_END], state[_TORQUE], state[_GAIN] = solve_implicit_step(torque_and_slope, state[_FREE], mobility, state[_END])
-        output.set_value(state)
-
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step.Eval(context)[_TORQUE])
-
-    def _remember(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._state).set_value(self._step.Eval(context).ravel())
-
-
-def conservative_inertia(compliance: np.ndarray) -> np.ndarray:
-    """Inertia per joint that keeps `JointTorqueEffects` stable for coupled joints, shape (n,) [kg m^2].
-
-    The inertia of each joint alone, 1 / W[j, j], scaled by one factor so that the eigenvalues of diag(inertia) W stay below 0.75 for the
-    compliance W, shape (n, n), see `Robot.joint_compliance`; what is left to 4/3 is for other postures.
-    """
-    alone = 1.0 / np.diag(compliance)
-    correlation = compliance * np.sqrt(np.outer(alone, alone))
-    return 0.75 * alone / np.linalg.eigvalsh(correlation)[-1]
+        builder = DiagramBuilder()
+        explicit = builder.AddNamedSystem("explicit", ExplicitTorque(law, robot, time_step))
+        n, tick = len(robot.joint_names), explicit.get_output_port()
+        sizes = [n, robot.plant.num_velocities(), _ROWS * n, law.torque.offset.size]
+        sizes.append(tick.size() - sum(sizes))
+        parts = Demultiplexer([size for size in sizes if size > 0])
+        split = builder.AddNamedSystem("parts", parts)
+        builder.Connect(tick, split.get_input_port())
+        for name in ("joint_state", "net_actuation", "torque_command"):
+            builder.ExportInput(explicit.GetInputPort(name), name)
+        builder.ExportOutput(split.get_output_port(0), "torque_loss")
+        builder.ExportOutput(split.get_output_port(1), "explicit_force")
+        if law.moves_clamps:
+            builder.ExportOutput(split.get_output_port(3), "clamp_offset")
+        builder.BuildInto(self)

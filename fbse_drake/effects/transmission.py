@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, affine_recursion
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise, affine_recursion
 
 
 @in_library
@@ -91,6 +91,14 @@ class PreslidingHysteresis(JointTorqueEffect):
         sign = np.sign(motion.velocity)
         bent = (z - sign) * np.exp(-np.abs(motion.velocity) * rate)
         return (sign + bent,), (-bent * sign * rate + (sign == 0) * rate,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(speeds=(nonlinear[0] / typical.time_step,))
+
+    @staticmethod
+    def lean(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
+        return memory[0]
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004

@@ -64,21 +64,16 @@ class TrueFrictionSource(RecursiveEstimator):
         output_ports:
         - posterior
 
-    `torque_loss` (n,) [Nm] acts from this tick on; field `friction` (n,) is that of the tick that ends now.
+    `torque_loss` (n,) [Nm] and field `friction` (n,) are those of the step that ends now.
     """
 
     def __init__(self, joints: int, clock: Clock):
         super().__init__({"status": 1, "friction": joints}, clock)
         self._torque_loss = self.DeclareVectorInputPort("torque_loss", joints)
-        self._last_loss = self.DeclareDiscreteState(joints)
-        self._declare_posterior()
+        self._declare_posterior("torque_loss")
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
-        posterior[STATUS], posterior[STATUS + 1 :] = 0.0, context.get_discrete_state(self._last_loss).value()
-
-    def _remember(self, context: Context, state: State) -> None:
-        super()._remember(context, state)
-        state.get_mutable_discrete_state(self._last_loss).set_value(self._torque_loss.Eval(context))
+        posterior[STATUS], posterior[STATUS + 1 :] = 0.0, self._torque_loss.Eval(context)
 
 
 class TorqueSensorEstimator(RecursiveEstimator):

@@ -14,12 +14,23 @@ from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, Scene
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, Joint, PrismaticJoint, RevoluteJoint, RigidBody, SpatialInertia, UnitInertia, WeldJoint
+from pydrake.multibody.tree import (
+    Frame,
+    Joint,
+    JointActuator,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+    WeldJoint,
+)
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.robot.description import Leg, RobotDescription, load_description
+from fbse_drake.robot.implicit import ImplicitTorque, add_implicit_torque, clamp_name
 
 # Between a body's name and the number in the names of the bodies that carry its point masses.
 _POINT_MASS = "_point_mass_"
@@ -69,6 +80,8 @@ class Robot:
 
     plant: MultibodyPlant
     description: RobotDescription
+    # What its solver takes of the joints' losses.
+    implicit: ImplicitTorque
 
     @property
     def joint_names(self) -> list[str]:
@@ -156,7 +169,37 @@ class Robot:
     @cached_property
     def actuation_selector(self) -> np.ndarray:
         """Matrix that takes joint torques to the plant's actuation vector, shape (actuators, n)."""
-        return self.plant.MakeActuationMatrix().T @ self.joint_force_selector
+        selector = np.zeros((self.plant.num_actuators(), len(self.joint_names)))
+        for j, motor in enumerate(_motors(self.plant, self.joint_names).values()):
+            selector[motor.input_start(), j] = 1.0
+        return selector
+
+    @cached_property
+    def clamp_selector(self) -> np.ndarray:
+        """Matrix that takes the offsets of all clamps, row by row, to the actuation vector, shape (actuators, m n)."""
+        selector = np.zeros((self.plant.num_actuators(), self.implicit.limit.size))
+        for k, clamp in self._clamps:
+            selector[clamp.input_start(), k] = -1.0
+        return selector
+
+    @cached_property
+    def clamp_index(self) -> np.ndarray:
+        """Place of each joint's clamps in the plant's net actuation, or -1 for a joint without, shape (n,).
+
+        Drake reports the torque of all clamps of a joint together, at each of them.
+        """
+        index = np.full(len(self.joint_names), -1)
+        for k, clamp in self._clamps:
+            index[k % len(index)] = clamp.input_start()
+        return index
+
+    @property
+    def _clamps(self) -> list[tuple[int, JointActuator]]:
+        """Clamps with their places in the rows of `implicit`."""
+        rows, columns = np.nonzero(self.implicit.has_clamp)
+        names = [clamp_name(self.joint_names[j], row) for row, j in zip(rows, columns, strict=True)]
+        places = (rows * len(self.joint_names) + columns).tolist()
+        return [(k, self.plant.GetJointActuatorByName(name)) for k, name in zip(places, names, strict=True)]
 
     def base_pose_positions(self, X_WB: RigidTransform) -> np.ndarray:
         """Default positions of the plant with the base at X_WB, shape (positions,)."""
@@ -224,6 +267,7 @@ def make_robot(
     builder: DiagramBuilder | None = None,
     config: MultibodyPlantConfig | None = None,
     ground: Ground | None = None,
+    implicit: ImplicitTorque | None = None,
 ) -> tuple[Robot, SceneGraph]:
     """Loads a robot's model into a plant.
 
@@ -236,6 +280,7 @@ def make_robot(
             model needs that is only computed with.
         config: Drake's plant settings.
         ground: ground at z = 0; without it there is none.
+        implicit: losses of the joints that the plant's solver takes; by default none.
 
     Raises:
         InputError: unknown file, joint, frame, body or pad; point masses that leave a body with an impossible inertia.
@@ -248,6 +293,8 @@ def make_robot(
         _hold_other_joints(plant, names)
     inertia = names.per_joint(rotor_inertia or {}, key="rotor_inertia", default=0.0)
     _add_actuators(plant, dict(zip(names.joint_names, inertia, strict=True)))
+    implicit = implicit or ImplicitTorque.none(len(names.joint_names))
+    add_implicit_torque(plant, names.joint_names, _motors(plant, names.joint_names), implicit)
     _add_point_masses(plant, names, point_masses)
     if gantry_height is None and names.fixed_base:
         gantry_height = 0.0
@@ -261,7 +308,7 @@ def make_robot(
             gravity = plant.mutable_gravity_field()
             gravity.set_gravity_vector(Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector()))
     plant.Finalize()
-    robot = Robot(plant, names)
+    robot = Robot(plant, names, implicit)
     for side in names.sides:
         for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
             if not X_FP.rotation().IsNearlyIdentity(1e-9):
@@ -361,7 +408,7 @@ def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) ->
 
     Damping and limits of torque that the model file has are dropped: friction is an effect, and torque is limited by the controller.
     """
-    actuators = {plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()}
+    actuators = _actuators(plant)
     for name, inertia in rotor_inertia.items():
         joint = plant.GetJointByName(name)
         actuator = actuators[name] if name in actuators else plant.AddJointActuator(name, joint)
@@ -369,6 +416,18 @@ def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) ->
         actuator.set_default_gear_ratio(1.0)
         actuator.set_effort_limit(np.inf)
         joint.set_default_damping(0.0)
+
+
+def _actuators(plant: MultibodyPlant) -> dict[str, JointActuator]:
+    """The first actuator of each joint that has any, by joint."""
+    found = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    return {actuator.joint().name(): actuator for actuator in reversed(found)}
+
+
+def _motors(plant: MultibodyPlant, joint_names: Sequence[str]) -> dict[str, JointActuator]:
+    """The actuators that take commands, by joint: a joint's clamps come after."""
+    actuators = _actuators(plant)
+    return {name: actuators[name] for name in joint_names}
 
 
 def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]) -> None:

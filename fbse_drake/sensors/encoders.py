@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
@@ -80,6 +81,15 @@ def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:
     return angle if resolution == 0 else resolution * np.rint(angle / resolution)
 
 
+@njit(cache=True)
+def _read(measured: np.ndarray, joint_state: np.ndarray, resolution: float) -> None:
+    """Fills what is measured, with whole counts of the angles."""
+    measured[:] = joint_state
+    if resolution > 0:
+        for j in range(len(measured) // 2):
+            measured[j] = resolution * np.rint(measured[j] / resolution)
+
+
 class EncoderReadings(LeafSystem):
     """Counts of the encoders and the velocities had from them.
 
@@ -107,13 +117,11 @@ class EncoderReadings(LeafSystem):
             self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._remember)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        config, n = self._config, self._n
-        state, measured = self._joint_state.Eval(context), output.get_mutable_value()
-        position, velocity = quantize(state[:n], config.resolution), state[n:]
+        config, n, measured = self._config, self._n, output.get_mutable_value()
+        _read(measured, self._joint_state.Eval(context), config.resolution)
         if config.velocity == "differenced":
             last = context.get_discrete_state(self._last).value()
-            velocity = np.zeros(n) if np.isnan(last[0]) else (position - last) / config.period
-        measured[:n], measured[n:] = position, velocity
+            measured[n:] = 0.0 if np.isnan(last[0]) else (measured[:n] - last) / config.period
 
     def _remember(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._last).set_value(self.measured_joint_state.Eval(context)[: self._n])

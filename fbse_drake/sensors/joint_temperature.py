@@ -125,8 +125,8 @@ class WindingThermometers(LeafSystem):
         output_ports:
         - measured_temperature
 
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; torques (n,) [Nm], of the
-    step that begins; `error` (n,) [K] is added before the reading is rounded;
+    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; torques (n,) [Nm], the
+    loss of the step that ended; `error` (n,) [K] is added before the reading is rounded;
     `measured_temperature` (n,) [degC]. Discrete state: the temperatures, updated with the power at
     each tick.
     """

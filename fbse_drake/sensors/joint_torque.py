@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
 from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import require_not_negative, require_positive
@@ -35,7 +35,7 @@ class JointTorqueConfig(Sensor):
 
 
 class TransmittedTorque(LeafSystem):
-    """What reached the links in the last plant step: command minus torque loss.
+    """What reached the links in the plant step that ended: command minus torque loss.
 
     .. pydrake_system::
 
@@ -46,20 +46,26 @@ class TransmittedTorque(LeafSystem):
         output_ports:
         - link_torque
 
-    All (n,) [Nm]. Discrete state: the link torque of the step that is under way.
+    All (n,) [Nm]; the command is of the step that begins, the loss of the one that ended. Discrete
+    state: the command of the last tick.
     """
 
     def __init__(self, joints: int, time_step: float):
         super().__init__()
         self._torque_command = self.DeclareVectorInputPort("torque_command", joints)
         self._torque_loss = self.DeclareVectorInputPort("torque_loss", joints)
-        self._torque = self.DeclareDiscreteState(joints)
-        self.DeclareStateOutputPort("link_torque", self._torque)
+        self._last = self.DeclareDiscreteState(joints)
+        sources = {self.input_port_ticket(self._torque_loss.get_index()), self.xd_ticket()}
+        self.DeclareVectorOutputPort("link_torque", joints, self._calc, sources)
         self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
 
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        command = context.get_discrete_state(self._last).value()
+        output.SetFromVector(command - self._torque_loss.Eval(context))
+
     def _remember(self, context: Context, state: State) -> None:
-        torque = self._torque_command.Eval(context) - self._torque_loss.Eval(context)
-        state.get_mutable_discrete_state(self._torque).set_value(torque)
+        command = self._torque_command.Eval(context)
+        state.get_mutable_discrete_state(self._last).set_value(command)
 
 
 class JointTorqueSensors(Diagram):

@@ -101,6 +101,28 @@ class RecordedReference:
     # Nobody knows what the motion was planned from.
     plan: None = None
 
+    @property
+    def time(self) -> np.ndarray:
+        """Of the log's samples, (N,) [s]."""
+        return self.log.time - self.log.time[0]
+
+    @property
+    def joint_position(self) -> np.ndarray:
+        """Where the joints were, (N, n) [rad]."""
+        return self.log["joint/position"]
+
+    @property
+    def joint_velocity(self) -> np.ndarray:
+        """How the joints moved, (N, n) [rad/s]."""
+        if "joint/velocity" in self.log or len(self.log.time) < 2:
+            return self.log.get("joint/velocity", np.zeros_like(self.log["joint/position"]))
+        return np.gradient(self.log["joint/position"], self.log.time, axis=0)
+
+    @property
+    def feedforward_torque(self) -> np.ndarray:
+        """What moved them, as far as the log tells, (N, n) [Nm]."""
+        return self.log.get("joint/torque_command", np.zeros_like(self.log["joint/position"]))
+
     def source(self, time_step: float) -> System:
         """What plays it on a plant with this step [s], see `RecordedSource`."""
         return RecordedSource(self.log, time_step)

@@ -1,0 +1,253 @@
+"""What of the joint torque effects Drake's contact solver takes itself.
+
+As far as the loss in a joint rises with its velocity v, it is replaced by damping and by straight
+pieces between corners, concave in |v|. What the pieces leave over is small, and is added explicitly
+(`fbse_drake.effects.system`). An effect whose law is not the same in every step has clamps of its
+own, which are moved along the velocity: with its memory, or in and out of reach with its size.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque, Rise
+from fbse_drake.robot.implicit import ImplicitTorque
+
+# By the number of straight pieces that come closest to tanh(x) for x > 0: their largest deviation,
+# which returns at every corner but the last, and the corners x.
+_CORNERS = {
+    1: (0.1121, (1.4119,)),
+    2: (0.0348, (0.8265, 2.0176)),
+    3: (0.0167, (0.6217, 1.2541, 2.3879)),
+    4: (0.0098, (0.5108, 0.9683, 1.5423, 2.6565)),
+    5: (0.0064, (0.4394, 0.8079, 1.2116, 1.7625, 2.8676)),
+    6: (0.0046, (0.3888, 0.7022, 1.0217, 1.4025, 1.9416, 3.0417)),
+}
+# The deviation may be this share of the torque's rms over the planned motion.
+_DEVIATION = 0.07
+# Pieces for one direction alone are left out below this share of those for both.
+_ONE_SIDED = 0.01
+# Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
+# add up to its present size.
+_PARTS = np.array([1 / 2, 1 / 4, 1 / 4])
+# Clamps are out of reach when they are moved so far [rad/s].
+_OUT_OF_REACH = 100.0
+# At so many times the speed at which a law levels off, it shows its size.
+_LEVEL = 4.0
+
+# A law of n joints: torques [Nm] at velocities [rad/s], (N, n) each.
+Law = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class MovingClamps(ABC):
+    """Clamps of one effect whose offsets are not the same in every step."""
+
+    # Place of the effect among all.
+    effect: int
+    # Their rows among all clamps, and their slopes and limits, (rows, n) [Nm s/rad], [Nm].
+    rows: slice
+    slope: np.ndarray
+    limit: np.ndarray
+
+    @abstractmethod
+    def offset(self, effect: ResolvedJointTorque, motion: JointMotion) -> np.ndarray:
+        """Offsets in a step, (rows, n) [Nm].
+
+        Args:
+            motion: what is known of the step when it begins.
+        """
+
+
+class LeaningClamps(MovingClamps):
+    """Those of an effect with a memory: at velocity zero its torque has a part of its size."""
+
+    def offset(self, effect: ResolvedJointTorque, motion: JointMotion) -> np.ndarray:
+        return effect.effect.lean(motion.memory, effect.nonlinear) * self.limit
+
+
+@dataclass(frozen=True)
+class PartialClamps(MovingClamps):
+    """Those of an effect that changes its size: parts, in and out of reach of the velocity."""
+
+    # Which part each row belongs to.
+    part: np.ndarray
+    # Where the effect shows its size, (n,) [rad/s], and its largest there, (n,) [Nm].
+    speed: np.ndarray
+    largest: np.ndarray
+
+    def offset(self, effect: ResolvedJointTorque, motion: JointMotion) -> np.ndarray:
+        torque = effect.torque_and_slope(motion._replace(velocity=self.speed))[0]
+        size = np.divide(torque, self.largest, out=np.zeros_like(torque), where=self.largest > 0)
+        left, out = size + 0.5 * _PARTS.min(), np.empty((len(_PARTS), len(size)), dtype=bool)
+        for k, part in enumerate(_PARTS):
+            out[k] = left < part
+            left = left - np.where(out[k], 0.0, part)
+        return np.where(out[self.part], self.limit + _OUT_OF_REACH * self.slope, 0.0)
+
+
+@dataclass(frozen=True)
+class ImplicitLaw:
+    """Joint torque effects with what Drake's solver takes of them."""
+
+    effects: tuple[ResolvedJointTorque, ...]
+    torque: ImplicitTorque
+    moving: tuple[MovingClamps, ...] = ()
+
+    @property
+    def moves_clamps(self) -> bool:
+        """Has any clamp an offset?"""
+        return bool(self.moving) or bool(np.any(self.torque.offset))
+
+
+def implicit_law(effects: Sequence[ResolvedJointTorque], planned: JointMotion) -> ImplicitLaw:
+    """What Drake's solver takes of the effects in n joints.
+
+    Args:
+        planned: the motion as planned, which decides how finely laws are resolved and how large
+            they get: velocity, position and load (N, n), time (N, 1), the plant's step.
+    """
+    n = planned.velocity.shape[1]
+    typical = JointMotion(np.sqrt(np.mean(planned.velocity**2, axis=0)), time_step=planned.time_step)
+    rises = [effect.effect.rise(effect.linear, effect.nonlinear, typical) for effect in effects]
+    damping = sum((rise.damping for rise in rises), np.zeros(n))
+    steady = [k for k, effect in enumerate(effects) if effect.effect.of_velocity_alone]
+
+    def law(velocity: np.ndarray) -> np.ndarray:
+        torques = (effects[k].torque_and_slope(JointMotion(velocity))[0] for k in steady)
+        return sum(torques, np.zeros_like(velocity))
+
+    speeds = [speed for k in steady for speed in rises[k].speeds]
+    clamps = [_clamps(lambda v: law(v) - damping * v, speeds, law(planned.velocity))]
+    moving: list[MovingClamps] = []
+    for k, (effect, rise) in enumerate(zip(effects, rises, strict=True)):
+        if k in steady or not rise.speeds:
+            continue
+        make = _leaning if effect.effect.has_memory else _partial
+        own, make_moving = make(effect, rise, planned)
+        start = sum(part.shape[1] for part in clamps)
+        clamps.append(own)
+        moving.append(make_moving(k, slice(start, start + own.shape[1]), *own[:2]))
+    torque = ImplicitTorque(damping, *np.concatenate(clamps, axis=1))
+    return ImplicitLaw(tuple(effects), torque, tuple(moving))
+
+
+def _leaning(
+    effect: ResolvedJointTorque,
+    rise: Rise,
+    planned: JointMotion,
+) -> tuple[np.ndarray, Callable[..., MovingClamps]]:
+    """Clamps of an effect with a memory, (3, m, n), and what makes them move."""
+    still = JointMotion(np.zeros(planned.velocity.shape[1]), time_step=planned.time_step)
+    motion = still._replace(memory=effect.effect.start(still, effect.nonlinear))
+    law = _law(effect, motion)
+    return _clamps(law, rise.speeds, law(planned.velocity)), LeaningClamps
+
+
+def _partial(
+    effect: ResolvedJointTorque,
+    rise: Rise,
+    planned: JointMotion,
+) -> tuple[np.ndarray, Callable[..., MovingClamps]]:
+    """Clamps of an effect that changes its size, (3, m, n), and what makes them move."""
+    speed = _LEVEL * np.max(rise.speeds, axis=0)
+    at_speed = planned._replace(velocity=np.broadcast_to(speed, planned.velocity.shape))
+    torque = effect.torque_and_slope(at_speed)[0]
+    strongest = (torque.argmax(axis=0), np.arange(torque.shape[1]))
+    fields = {name: np.broadcast_to(getattr(planned, name), torque.shape)[strongest] for name in ("position", "time", "load")}
+    law, over_motion = _law(effect, planned._replace(**fields)), effect.torque_and_slope(planned)[0]
+    whole = _clamps(law, rise.speeds, over_motion)
+    moving = partial(
+        PartialClamps,
+        part=np.repeat(np.arange(len(_PARTS)), whole.shape[1]),
+        speed=speed,
+        largest=torque[strongest],
+    )
+    return np.concatenate([part * whole for part in _PARTS], axis=1), moving
+
+
+def _law(effect: ResolvedJointTorque, motion: JointMotion) -> Law:
+    """The law of one effect in a motion of one step, (n,), but for its velocity."""
+    return lambda velocity: effect.torque_and_slope(motion._replace(velocity=velocity))[0]
+
+
+def _clamps(
+    law: Law,
+    speeds: Sequence[np.ndarray],
+    planned: np.ndarray,
+) -> np.ndarray:
+    """Slopes, limits and offsets of clamps that follow a law, (3, m, n).
+
+    Args:
+        law: of n joints, without damping.
+        speeds: at which parts of it level off, as tanh(v / speed) does, (n,) each.
+        planned: torques over the planned motion, (N, n) [Nm].
+    """
+    n, deviation = planned.shape[1], _DEVIATION * np.sqrt(np.mean(planned**2, axis=0))
+    columns = []
+    for j in range(n):
+
+        def of_joint(velocity: np.ndarray, j: int = j) -> np.ndarray:
+            return law(np.broadcast_to(velocity[:, None], (len(velocity), n)))[:, j]
+
+        columns.append(_joint_clamps(of_joint, np.array([speed[j] for speed in speeds]), deviation[j]))
+    clamps = np.zeros((3, max(map(len, columns)), n))
+    for j, column in enumerate(columns):
+        clamps[:, : len(column), j] = np.reshape(column, (-1, 3)).T
+    return clamps
+
+
+def _joint_clamps(
+    law: Callable[[np.ndarray], np.ndarray],
+    speeds: np.ndarray,
+    deviation: float,
+) -> list[tuple[float, float, float]]:
+    """Slope, limit and offset of each clamp of one joint, whose law takes and gives (N,).
+
+    As few as let it deviate by no more than wanted [Nm], if there are enough corners.
+    """
+    speeds = speeds[np.isfinite(speeds)]
+    for share, corners in _CORNERS.values():
+        # The straight pieces pass the law by the deviation, so that they are off to either side.
+        raised = 1.0 + share / np.tanh(corners)
+        raised[-1] = 1.0 / np.tanh(corners[-1])
+        corner = np.multiply.outer(speeds, corners)
+        order = np.argsort(corner, axis=None)
+        raised = np.broadcast_to(raised, corner.shape).ravel()[order]
+        corner = corner.ravel()[order]
+        forwards, backwards = raised * law(corner), -raised * law(-corner)
+        if share * np.max([forwards, backwards], initial=0.0) <= deviation:
+            break
+    both = _pieces(corner, np.minimum(forwards, backwards))
+    clamps = [(slope, limit, 0.0) for slope, limit in both]
+    shared = sum((np.minimum(slope * corner, limit) for slope, limit in both), np.zeros_like(corner))
+    least = _ONE_SIDED * np.max(shared, initial=0.0)
+    for sign, side in ((1.0, forwards - shared), (-1.0, backwards - shared)):
+        if np.max(side, initial=0.0) > least:
+            # From zero to twice the limit, in one direction.
+            pieces = _pieces(corner, side)
+            clamps += [(slope, limit / 2, -sign * limit / 2) for slope, limit in pieces]
+    return clamps
+
+
+def _pieces(corner: np.ndarray, torque: np.ndarray) -> list[tuple[float, float]]:
+    """Slopes and limits of the terms min(slope v, limit) whose sum is the upper concave hull of the
+    origin and points (v, torque), as far as it rises."""
+    hull = [(0.0, 0.0)]
+    for point in zip(corner.tolist(), torque.tolist(), strict=True):
+        if point[0] <= hull[-1][0] or point[1] <= hull[-1][1]:
+            continue
+        while len(hull) > 1 and _slope(hull[-1], point) >= _slope(hull[-2], hull[-1]):
+            hull.pop()
+        hull.append(point)
+    slopes = [*(_slope(start, end) for start, end in pairwise(hull)), 0.0]
+    bends = [before - after for before, after in pairwise(slopes)]
+    return [(bend, bend * v) for bend, (v, _) in zip(bends, hull[1:], strict=True)]
+
+
+def _slope(start: tuple[float, float], end: tuple[float, float]) -> float:
+    return (end[1] - start[1]) / (end[0] - start[0])
