@@ -8,10 +8,11 @@ import numpy as np
 
 from fbse_drake.effects.effect import Parameter
 from fbse_drake.effects.friction import smooth_sign
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
 
 # Velocity over which friction changes its sign [rad/s].
 _TRANSITION = 0.01
+_SHARP = Rise(speeds=(np.array(_TRANSITION),))
 # Frequencies of the two waves that make dropouts look random [Hz]; their ratio is that of the golden section.
 _DROPOUT_FREQUENCIES = (1.9, 1.9 * (1 + 5**0.5) / 2)
 # The torque drops while the sum of the two waves is above this.
@@ -77,6 +78,10 @@ class UnevenFriction(JointTorqueEffect):
         sign, slope = smooth_sign(motion.velocity, _TRANSITION)
         return (size * sign,), (size * slope,)
 
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return _SHARP
+
 
 @dataclass(frozen=True)
 class TorqueDropouts(JointTorqueEffect):
@@ -118,6 +123,10 @@ class RoughSpot(JointTorqueEffect):
         bump = np.exp(-(((motion.position - angle) / width) ** 2))
         sign, slope = smooth_sign(motion.velocity, _TRANSITION)
         return (bump * sign,), (bump * slope,)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return _SHARP
 
 
 STRANGERS: dict[str, type[JointTorqueEffect]] = {

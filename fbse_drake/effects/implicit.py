@@ -121,11 +121,15 @@ def implicit_law(effects: Sequence[ResolvedJointTorque], planned: JointMotion) -
         torques = (effects[k].torque_and_slope(JointMotion(velocity))[0] for k in steady)
         return sum(torques, np.zeros_like(velocity))
 
-    speeds = [speed for k in steady for speed in rises[k].speeds]
-    clamps = [_clamps(lambda v: law(v) - damping * v, speeds, law(planned.velocity))]
+    rise = Rise(
+        damping,
+        tuple(speed for k in steady for speed in rises[k].speeds),
+        tuple(corner for k in steady for corner in rises[k].corners),
+    )
+    clamps = [_clamps(lambda v: law(v) - damping * v, rise, law(planned.velocity))]
     moving: list[MovingClamps] = []
     for k, (effect, rise) in enumerate(zip(effects, rises, strict=True)):
-        if k in steady or not rise.speeds:
+        if k in steady or not (rise.speeds or rise.corners):
             continue
         make = _leaning if effect.effect.has_memory else _partial
         own, make_moving = make(effect, rise, planned)
@@ -145,7 +149,7 @@ def _leaning(
     still = JointMotion(np.zeros(planned.velocity.shape[1]), time_step=planned.time_step)
     motion = still._replace(memory=effect.effect.start(still, effect.nonlinear))
     law = _law(effect, motion)
-    return _clamps(law, rise.speeds, law(planned.velocity)), LeaningClamps
+    return _clamps(law, rise, law(planned.velocity)), LeaningClamps
 
 
 def _partial(
@@ -154,13 +158,14 @@ def _partial(
     planned: JointMotion,
 ) -> tuple[np.ndarray, Callable[..., MovingClamps]]:
     """Clamps of an effect that changes its size, (3, m, n), and what makes them move."""
-    speed = _LEVEL * np.max(rise.speeds, axis=0)
+    level = np.max([*rise.speeds, *rise.corners], axis=0)
+    speed = np.broadcast_to(_LEVEL * level, planned.velocity.shape[1])
     at_speed = planned._replace(velocity=np.broadcast_to(speed, planned.velocity.shape))
     torque = effect.torque_and_slope(at_speed)[0]
     strongest = (torque.argmax(axis=0), np.arange(torque.shape[1]))
     fields = {name: np.broadcast_to(getattr(planned, name), torque.shape)[strongest] for name in ("position", "time", "load")}
     law, over_motion = _law(effect, planned._replace(**fields)), effect.torque_and_slope(planned)[0]
-    whole = _clamps(law, rise.speeds, over_motion)
+    whole = _clamps(law, rise, over_motion)
     moving = partial(
         PartialClamps,
         part=np.repeat(np.arange(len(_PARTS)), whole.shape[1]),
@@ -175,17 +180,13 @@ def _law(effect: ResolvedJointTorque, motion: JointMotion) -> Law:
     return lambda velocity: effect.torque_and_slope(motion._replace(velocity=velocity))[0]
 
 
-def _clamps(
-    law: Law,
-    speeds: Sequence[np.ndarray],
-    planned: np.ndarray,
-) -> np.ndarray:
+def _clamps(law: Law, rise: Rise, planned: np.ndarray) -> np.ndarray:
     """Slopes, limits and offsets of clamps that follow a law, (3, m, n).
 
     Args:
         law: of n joints, without damping.
-        speeds: at which parts of it level off, as tanh(v / speed) does, (n,) each.
-        planned: torques over the planned motion, (N, n) [Nm].
+        rise: where it levels off.
+        planned: its torques over the planned motion, (N, n) [Nm].
     """
     n, deviation = planned.shape[1], _DEVIATION * np.sqrt(np.mean(planned**2, axis=0))
     columns = []
@@ -194,7 +195,8 @@ def _clamps(
         def of_joint(velocity: np.ndarray, j: int = j) -> np.ndarray:
             return law(np.broadcast_to(velocity[:, None], (len(velocity), n)))[:, j]
 
-        columns.append(_joint_clamps(of_joint, np.array([speed[j] for speed in speeds]), deviation[j]))
+        speeds, sharp = (np.array([np.broadcast_to(values, n)[j] for values in kind]) for kind in (rise.speeds, rise.corners))
+        columns.append(_joint_clamps(of_joint, speeds, sharp, deviation[j]))
     clamps = np.zeros((3, max(map(len, columns)), n))
     for j, column in enumerate(columns):
         clamps[:, : len(column), j] = np.reshape(column, (-1, 3)).T
@@ -204,6 +206,7 @@ def _clamps(
 def _joint_clamps(
     law: Callable[[np.ndarray], np.ndarray],
     speeds: np.ndarray,
+    sharp: np.ndarray,
     deviation: float,
 ) -> list[tuple[float, float, float]]:
     """Slope, limit and offset of each clamp of one joint, whose law takes and gives (N,).
@@ -211,16 +214,16 @@ def _joint_clamps(
     As few as let it deviate by no more than wanted [Nm], if there are enough corners.
     """
     speeds = speeds[np.isfinite(speeds)]
-    for share, corners in _CORNERS.values():
-        # The straight pieces pass the law by the deviation, so that they are off to either side.
-        raised = 1.0 + share / np.tanh(corners)
-        raised[-1] = 1.0 / np.tanh(corners[-1])
-        corner = np.multiply.outer(speeds, corners)
-        order = np.argsort(corner, axis=None)
-        raised = np.broadcast_to(raised, corner.shape).ravel()[order]
-        corner = corner.ravel()[order]
+    for share, at in _CORNERS.values():
+        # Straight pieces pass a curve by the deviation, so that they are off to either side.
+        raised = 1.0 + share / np.tanh(at)
+        raised[-1] = 1.0 / np.tanh(at[-1])
+        corner = np.concatenate([sharp, np.multiply.outer(speeds, at).ravel()])
+        raised = np.concatenate([np.ones(len(sharp)), np.tile(raised, len(speeds))])
+        order = np.argsort(corner)
+        corner, raised = corner[order], raised[order]
         forwards, backwards = raised * law(corner), -raised * law(-corner)
-        if share * np.max([forwards, backwards], initial=0.0) <= deviation:
+        if share * np.max([forwards, backwards], initial=0.0) <= deviation or len(speeds) == 0:
             break
     both = _pieces(corner, np.minimum(forwards, backwards))
     clamps = [(slope, limit, 0.0) for slope, limit in both]

@@ -48,6 +48,8 @@ class Rise(NamedTuple):
     damping: np.ndarray | float = 0.0
     # Speeds at which other parts level off, as tanh(v / speed) does, (n,) each [rad/s].
     speeds: tuple[np.ndarray, ...] = ()
+    # Speeds between which a law is straight; one that has no other speeds is solved exactly.
+    corners: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,14 @@ from fbse_drake.robot.plant import Robot
 # Share of the last step's change of velocity that is expected of the next: smooth motion would go on
 # with all of it, a joint that is stopped by a contact with none.
 _CARRIED_ON = 0.5
-# Rows of (n,) of what a tick remembers: explicit torque, velocity, position and command of the step
-# that begins; then offsets of clamps and memories of effects.
-_EXPLICIT, _VELOCITY, _POSITION, _COMMAND, _ROWS = range(5)
+# A velocity that goes to and fro is followed by this share: what is left to be explicit of a law
+# that is steep for the step would else ring.
+_FOLLOWED = 0.2
+# A law that the solver takes but for this share of it is solved exactly.
+_ROUNDING = 1e-12
+# Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, its change
+# in the last step, and what is expected at the end; position and command of the step that begins; then offsets of clamps and memories of effects.
+_EXPLICIT, _VELOCITY, _CHANGE, _EXPECTED, _POSITION, _COMMAND, _ROWS = range(7)
 
 
 class LawTable(NamedTuple):
@@ -125,17 +130,21 @@ def _begin(
 ) -> np.ndarray:
     """Fills the loss, velocities and positions of a tick; returns the velocities that are expected
     at the next one, (n,) [rad/s]."""
-    n = len(tick.loss)
-    expected = joint_state[n:].copy()
-    tick.memory[_POSITION], tick.memory[_VELOCITY] = joint_state[:n], expected
-    tick.loss[:] = 0.0
-    if not math.isnan(last.memory[_VELOCITY, 0]):
+    n, now, before = len(tick.loss), tick.memory, last.memory
+    now[_POSITION], now[_VELOCITY], now[_EXPECTED] = joint_state[:n], joint_state[n:], joint_state[n:]
+    now[_CHANGE], tick.loss[:] = 0.0, 0.0
+    if not math.isnan(before[_VELOCITY, 0]):
         for j in range(n):
-            expected[j] += _CARRIED_ON * (expected[j] - last.memory[_VELOCITY, j])
-            tick.loss[j] = last.memory[_EXPLICIT, j] + solver.damping[j] * joint_state[n + j]
+            v = joint_state[n + j]
+            now[_CHANGE, j] = v - before[_VELOCITY, j]
+            if now[_CHANGE, j] * before[_CHANGE, j] < 0:
+                now[_EXPECTED, j] = before[_EXPECTED, j] + _FOLLOWED * (v - before[_EXPECTED, j])
+            else:
+                now[_EXPECTED, j] = v + _CARRIED_ON * now[_CHANGE, j]
+            tick.loss[j] = before[_EXPLICIT, j] + solver.damping[j] * v
             if solver.clamp[j] >= 0:
                 tick.loss[j] -= net_actuation[solver.clamp[j]]
-    return expected
+    return now[_EXPECTED]
 
 
 @njit(cache=True)
@@ -163,13 +172,17 @@ def _calc_steady(
     table: LawTable,
     solver: _Solver,
     velocities: int,
+    is_solved: bool,
 ) -> None:
-    """A tick of effects that depend on the velocity alone."""
+    """A tick of effects that depend on the velocity alone, which the solver may take as a whole."""
     n = len(joint_state) // 2
     parts = _parts(tick, n, velocities)
     parts.memory[_ROWS : _ROWS + len(offset)] = offset
     expected = _begin(parts, _parts(last, n, velocities), joint_state, net_actuation, solver)
     _finish(parts, expected, look_up(table, expected), offset, solver)
+    if is_solved:
+        parts.memory[_EXPLICIT] = 0.0
+        parts.force[:] = 0.0
 
 
 class ExplicitTorque(LeafSystem):
@@ -203,6 +216,9 @@ class ExplicitTorque(LeafSystem):
         self._solver = _Solver(torque.damping, torque.slope, torque.limit, *places)
         steady = [effect for effect in law.effects if effect.effect.of_velocity_alone]
         self._table = law_table(steady, n)
+        solved = np.array([torque.torque(v, torque.offset) for v in self._table.velocity])
+        left = np.abs(self._table.torque - solved).max()
+        self._is_solved = left <= _ROUNDING * np.abs(solved).max()
         # The other effects, with the rows of their memories.
         self._others: list[tuple[int, ResolvedJointTorque, slice]] = []
         self._offsets = slice(_ROWS, _ROWS + len(torque.offset))
@@ -230,7 +246,8 @@ class ExplicitTorque(LeafSystem):
         if not self._others:
             offset = self._law.torque.offset
             table, solver = self._table, self._solver
-            _calc_steady(*vectors, *inputs, offset, table, solver, self._velocities)
+            sizes = (self._velocities, self._is_solved)
+            _calc_steady(*vectors, *inputs, offset, table, solver, *sizes)
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
         expected = _begin(tick, last, *inputs, self._solver)

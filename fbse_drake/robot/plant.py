@@ -162,11 +162,6 @@ class Robot:
         return np.eye(self.plant.num_multibody_states())[columns]
 
     @cached_property
-    def joint_force_selector(self) -> np.ndarray:
-        """Matrix that takes joint torques to generalized forces, shape (velocities, n)."""
-        return np.eye(self.plant.num_velocities())[:, self.velocity_index]
-
-    @cached_property
     def actuation_selector(self) -> np.ndarray:
         """Matrix that takes joint torques to the plant's actuation vector, shape (actuators, n)."""
         selector = np.zeros((self.plant.num_actuators(), len(self.joint_names)))
@@ -236,12 +231,6 @@ class Robot:
             velocities[start : start + 6] = 0.0 if V_WB is None else V_WB
         self.set_joint_positions(context, q)
         self.plant.SetVelocities(context, velocities)
-
-    def joint_compliance(self, context: Context) -> np.ndarray:
-        """Joint accelerations per joint torque of the free robot: the joints' block of the inverse mass matrix,
-        shape (n, n) [1/(kg m^2)]. Contact with the ground can only make it smaller."""
-        index = self.velocity_index
-        return np.linalg.inv(self.plant.CalcMassMatrix(context))[np.ix_(index, index)]
 
 
 def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
