@@ -17,18 +17,20 @@ import numpy as np
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque, Rise
 from fbse_drake.robot.implicit import ImplicitTorque
 
-# By the number of straight pieces that come closest to tanh(x) for x > 0: their largest deviation,
-# which returns at every corner but the last, and the corners x.
+# By the number of straight pieces that come closest to tanh(x) for x > 0: by what share of it they
+# are off at most, and their corners x. They are as much above it at every corner but the last, where
+# they reach 1.
 _CORNERS = {
-    1: (0.1121, (1.4119,)),
-    2: (0.0348, (0.8265, 2.0176)),
-    3: (0.0167, (0.6217, 1.2541, 2.3879)),
-    4: (0.0098, (0.5108, 0.9683, 1.5423, 2.6565)),
-    5: (0.0064, (0.4394, 0.8079, 1.2116, 1.7625, 2.8676)),
-    6: (0.0046, (0.3888, 0.7022, 1.0217, 1.4025, 1.9416, 3.0417)),
+    1: (0.1869, (1.2299,)),
+    2: (0.0582, (0.6163, 1.7832)),
+    3: (0.0281, (0.4193, 1.0119, 2.1387)),
+    4: (0.0166, (0.3191, 0.7305, 1.2897, 2.4007)),
+    5: (0.0109, (0.2579, 0.5767, 0.9617, 1.5050, 2.6082)),
+    6: (0.0077, (0.2165, 0.4781, 0.7761, 1.1468, 1.6812, 2.7800)),
+    7: (0.0058, (0.1866, 0.4090, 0.6539, 0.9394, 1.3015, 1.8305, 2.9266)),
 }
-# The deviation may be this share of the torque's rms over the planned motion.
-_DEVIATION = 0.07
+# They may be off by this share of the torque's rms over the planned motion.
+_DEVIATION = 0.1
 # Pieces for one direction alone are left out below this share of those for both.
 _ONE_SIDED = 0.01
 # Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
@@ -215,9 +217,7 @@ def _joint_clamps(
     """
     speeds = speeds[np.isfinite(speeds)]
     for share, at in _CORNERS.values():
-        # Straight pieces pass a curve by the deviation, so that they are off to either side.
-        raised = 1.0 + share / np.tanh(at)
-        raised[-1] = 1.0 / np.tanh(at[-1])
+        raised = np.append(np.full(len(at) - 1, 1.0 + share), 1.0 / np.tanh(at[-1]))
         corner = np.concatenate([sharp, np.multiply.outer(speeds, at).ravel()])
         raised = np.concatenate([np.ones(len(sharp)), np.tile(raised, len(speeds))])
         order = np.argsort(corner)
