@@ -45,7 +45,7 @@ from fbse_drake.report.discrepancy import (
     write_study_report,
 )
 from fbse_drake.report.discrepancy_figures import by_effect, spaced, targets_text
-from fbse_drake.report.html import number
+from fbse_drake.report.html import number, percent
 from fbse_drake.report.identification import (
     BASE_HEADER,
     ERROR_HEADER,
@@ -54,8 +54,8 @@ from fbse_drake.report.identification import (
     identification_outcome,
     write_identification_report,
 )
-from fbse_drake.report.metrics import run_metrics, write_json
-from fbse_drake.report.run import write_run_report
+from fbse_drake.report.metrics import run_metrics, worst_joint, write_json
+from fbse_drake.report.run import law_sentence, write_run_report
 from fbse_drake.scenario import Scenario, dump_scenario, read_scenario
 from fbse_drake.simulate import simulate
 
@@ -490,6 +490,8 @@ def _write_results(console: Console, out: Path, name: str, scenario: Scenario, l
         write_text(out / "scenario.yaml", dump_scenario(scenario, name))
         write_run_report(out / "report.html", log, metrics, name=name)
     console.print(_summary(name, metrics))
+    if sentence := law_sentence(metrics["friction_law_error"]):
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
 
 
@@ -532,10 +534,12 @@ def _summary(name: str, metrics: dict[str, Any]) -> Group:
     table.add_row("length", f"{metrics['simulated_time']:.2f} s")
     table.add_row("real time factor", f"{metrics['real_time_factor']:.2f}")
     tracking, creep, tick = (metrics[key] for key in ("joint_tracking_rms", "stance_creep_max", "tick_us"))
-    worst = max(tracking, key=tracking.get)
+    law = metrics["friction_law_error"]
+    worst, farthest = worst_joint(tracking), worst_joint(law)
     largest = max((value for value in creep.values() if not np.isnan(value)), default=np.nan)
     for label, values, text in (
         ("joint tracking rms, worst", tracking, f"{1e3 * tracking[worst]:.2f} mrad ({worst})"),
+        ("torque less its law, worst", law, f"{percent(law[farthest])} ({farthest})"),
         ("CoM error, mean", metrics["com_rse_mean"], _by_name(metrics["com_rse_mean"], "{:.2f} mm", 1e3)),
         ("stance creep, largest", creep, f"{1e3 * largest:.3f} mm"),
         ("attitude error, rms", metrics["attitude_rmse_deg"], _by_name(metrics["attitude_rmse_deg"], "{:.3f} deg")),
@@ -554,16 +558,12 @@ def _friction_summary(metrics: dict[str, Any]) -> list[Table]:
         return []
     table = Table("joint", *nrmse, title="friction error, NRMSE", title_justify="left")
     for joint in metrics["joint_tracking_rms"]:
-        table.add_row(joint, *(_percent(values[joint]) for values in nrmse.values()))
+        table.add_row(joint, *(percent(values[joint]) for values in nrmse.values()))
     return [table]
 
 
 def _by_name(values: Mapping[str, float], text: str, scale: float = 1.0) -> str:
     return ", ".join(f"{name} {text.format(scale * value)}" for name, value in values.items())
-
-
-def _percent(share: float) -> str:
-    return "n/a" if np.isnan(share) else f"{100 * share:.1f} %"
 
 
 def _unknown(values: Mapping[str, float]) -> bool:

@@ -1,7 +1,8 @@
 """Logs: named channels over time, from a simulation or from a robot.
 
 Row k holds what is known at `time[k]`: joint positions and velocities at that time; IMU and foot forces over the plant's step that ends
-then; commanded torque and friction torque of the step that begins then.
+then; commanded torque, friction torque and the law of the friction (at the velocity that comes out
+of the step) of the step that begins then.
 """
 
 import json

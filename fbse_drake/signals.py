@@ -107,6 +107,8 @@ _TABLE: list[Signal] = [
     Signal(r"truth/foot/\w+/pad_force", "N", ("m", 3), "true_pad_force"),
     Signal(r"truth/foot/\w+/wrench", "Nm, N", (6,), "true_pad_force"),
     Signal("truth/joint/friction_torque", "Nm", ("n",), "torque_loss", late=True),
+    # What it is by the effects' laws, at the velocity that came out of the step.
+    Signal("truth/joint/friction_law_torque", "Nm", ("n",)),
     # Estimates.
     _estimate("sensors/status", "sensor_monitor", "trust", "1"),
     _estimate("support", "sensor_monitor", "support", "1"),

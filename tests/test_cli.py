@@ -151,6 +151,60 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_metrics_tell_the_law_error_of_every_joint(tmp_path: Path):
+    options = ["--set", "duration=1", "--out", str(tmp_path), "--quiet"]
+    assert main(["simulate", "paper_walk", *options]) == DONE
+    error = json.loads((tmp_path / "metrics.json").read_text())["friction_law_error"]
+    assert list(error) == Log.load(tmp_path / "log.npz").joints
+    # The hip yaw of the foot that swings hardly moves: it trembles where its law is steepest.
+    trembling = error.pop("right_hip_yaw")
+    assert 0 < trembling < 0.05
+    assert all(0 < value < 0.02 for value in error.values())
+
+
+def test_a_run_that_does_not_follow_a_law_says_so(tmp_path: Path, capsys: pytest.CaptureFixture):
+    reversing = "robot.effects.extra=!DirectionalFriction {asymmetry: {all: 2.0}}"
+    options = ["--set", "duration=1", "--set", reversing, "--out", str(tmp_path)]
+    assert main(["simulate", "paper_walk", *options]) == DONE
+    error = json.loads((tmp_path / "metrics.json").read_text())["friction_law_error"]
+    worst = max(error, key=error.get)
+    assert error[worst] > 0.05
+    share = f"{100 * error[worst]:.1f} %"
+    printed = capsys.readouterr().out
+    assert f"{share} ({worst})" in printed
+    (line,) = (line for line in printed.splitlines() if "differs from its law" in line)
+    for joint, value in error.items():
+        assert (joint.replace("_", " ") in line) == (value > 0.01)
+    said = f"in {worst.replace('_', ' ')} ({share})"
+    assert said in line
+    assert "--set plant.time_step=" in line
+    assert said in (tmp_path / "report.html").read_text()
+
+
+def test_a_run_that_follows_its_laws_says_no_more(tmp_path: Path, capsys: pytest.CaptureFixture):
+    options = ["--set", "duration=1", "--out", str(tmp_path)]
+    assert main(["simulate", "hrp2_friction_walk", *options]) == DONE
+    error = json.loads((tmp_path / "metrics.json").read_text())["friction_law_error"]
+    assert all(0 < value < 0.01 for value in error.values())
+    printed = capsys.readouterr().out
+    assert "torque less its law, worst" in printed
+    for text in (printed, (tmp_path / "report.html").read_text()):
+        assert "differs from its law" not in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_robot_without_effects_has_no_law_error(tmp_path: Path, capsys: pytest.CaptureFixture):
+    options = ["--set", "duration=0.2", "--out", str(tmp_path)]
+    assert main(["simulate", "frictionless_walk", *options]) == DONE
+    error = json.loads((tmp_path / "metrics.json").read_text())["friction_law_error"]
+    assert len(error) == 12
+    assert all(math.isnan(value) for value in error.values())
+    printed = capsys.readouterr().out
+    assert "its law" not in printed
+    assert "nan" not in printed
+
+
 def without_estimates(log: Log, *beginnings: str) -> Log:
     """The log without its estimates and channels with these beginnings."""
     return Log({name: values for name, values in log.items() if not name.startswith(("estimate/", *beginnings))}, log.meta)
@@ -174,6 +228,7 @@ def test_estimate_writes_everything_and_equals_the_live_estimates(walk: Path, tm
     for key in ("friction_rmse", "friction_nrmse"):
         for phase in ("stance", "swing"):
             assert after[key][phase] == pytest.approx(before[key][phase], nan_ok=True)
+    assert after["friction_law_error"] == pytest.approx(before["friction_law_error"])
     assert after["attitude_rmse_deg"] == pytest.approx(before["attitude_rmse_deg"])
     assert 0 < after["tick_us"]["median"] <= after["tick_us"]["p99"]
     assert math.isnan(before["tick_us"]["median"])
@@ -213,6 +268,7 @@ def test_a_recording_of_a_robot_is_enough(walk: Path, tmp_path: Path, monkeypatc
     assert (metrics["fell"], metrics["outcome"]) == (None, "recorded")
     assert math.isnan(metrics["friction_nrmse"]["stance"]["left_knee_pitch"])
     assert metrics["tick_us"]["median"] > 0
+    assert all(math.isnan(value) for value in metrics["friction_law_error"].values())
     assert "A recording of 1.00 s." in (out / "report.html").read_text()
     printed = capsys.readouterr().out
     assert "estimator tick" in printed

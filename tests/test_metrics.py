@@ -11,8 +11,10 @@ from fbse_drake.report.metrics import (
     attitude_error_deg,
     attitude_rmse_deg,
     base_velocity_rmse,
+    broken_laws,
     consistency,
     friction_error,
+    friction_law_error,
     friction_nrmse,
     friction_rmse,
     joint_sides,
@@ -20,6 +22,7 @@ from fbse_drake.report.metrics import (
     roll_and_pitch_deg,
     run_metrics,
     stance,
+    worst_joint,
 )
 
 SAMPLES = 2000
@@ -121,6 +124,46 @@ def test_a_robot_without_friction_has_no_normalised_error():
     log = made_log(**{"truth/joint/friction_torque": np.zeros((SAMPLES, 4)), "estimate/joint/friction_torque": np.ones((SAMPLES, 4))})
     assert all(math.isnan(value) for value in every(friction_nrmse(log)))
     assert every(friction_rmse(log)) == [1.0] * 8
+
+
+def log_with_law(torque: np.ndarray, law: np.ndarray) -> Log:
+    channels = {"truth/joint/friction_torque": torque, "truth/joint/friction_law_torque": law}
+    return made_log(**channels)
+
+
+def test_law_error_is_the_difference_over_the_law():
+    law = made_log()["truth/joint/friction_torque"]
+    torque = law * [1.0, 0.9, 1.005, 3.0]
+    log = log_with_law(torque, law)
+    error = friction_law_error(log)
+    assert list(error) == JOINTS
+    assert list(error.values()) == pytest.approx([0.0, 0.1, 0.005, 2.0])
+    assert run_metrics(log, 1.0)["friction_law_error"] == error
+    assert list(broken_laws(error)) == ["right_knee", "left_knee"]
+    # An error that is no multiple of the law: 1 Nm in half of the rows, of a law of 2 Nm.
+    law, torque = np.full((SAMPLES, 4), 2.0), np.full((SAMPLES, 4), 2.0)
+    torque[::2] += 1.0
+    log = log_with_law(torque, law)
+    assert list(friction_law_error(log).values()) == pytest.approx([math.sqrt(0.5) / 2] * 4)
+
+
+def test_a_joint_without_an_effect_and_a_log_without_truth_have_no_law_error():
+    law = made_log()["truth/joint/friction_torque"] * [0.0, 0.0, 1.0, 1.0]
+    log = log_with_law(law * 1.02, law)
+    error = friction_law_error(log)
+    assert list(error.values()) == pytest.approx([math.nan, math.nan, 0.02, 0.02], nan_ok=True)
+    assert list(broken_laws(error)) == ["right_hip", "right_knee"]
+    assert worst_joint(error).startswith("right")
+    for missing in ("truth/joint/friction_torque", "truth/joint/friction_law_torque"):
+        channels = {name: values for name, values in log.items() if name != missing}
+        unknown = friction_law_error(dataclasses.replace(log, channels=channels))
+        assert list(unknown) == JOINTS
+        assert all(math.isnan(value) for value in unknown.values())
+        assert broken_laws(unknown) == {}
+
+
+def test_a_law_is_followed_up_to_one_per_cent():
+    assert broken_laws({"hip": 0.01, "knee": 0.0101, "toe": math.nan}) == {"knee": 0.0101}
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

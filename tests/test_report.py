@@ -158,6 +158,51 @@ def test_report_tells_outcome_and_figures_of_merit(walk_report):
     assert ">n/a<" not in walk_report
 
 
+def log_with_law(*shares: float) -> Log:
+    """`walking_log` whose torque is off its law by these shares, joint by joint."""
+    log = walking_log()
+    law = log["truth/joint/friction_torque"]
+    channels = {"truth/joint/friction_law_torque": law}
+    channels["truth/joint/friction_torque"] = law * (1 + np.array(shares))
+    return Log(log.channels | channels, log.meta)
+
+
+def test_report_says_where_a_law_is_not_followed(tmp_path):
+    log = log_with_law(0.001, 0.25, 0.0, 0.02)
+    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'worst joint (left knee)</td><td class="number">25.0</td><td>% of law</td>' in text
+    assert "in left knee (25.0 %), right knee (2.0 %). A smaller plant step" in text
+    assert "--set plant.time_step=" in text
+    assert "Thin: the law" in text
+
+
+def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_report):
+    log = log_with_law(0.001, 0.009, 0.0, 0.0)
+    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'worst joint (left knee)</td><td class="number">0.900</td><td>% of law</td>' in text
+    for words in ("A smaller plant step", "Thin: the law"):
+        assert words not in text
+    # A log without a law says nothing of it.
+    assert "% of law" not in walk_report
+
+
+def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
+    log = log_with_law(0.0, 0.25, 0.5, 0.02)
+    figure = figures.friction(log)
+    drawn = {
+        axes.get_title(loc="left"): line.get_xydata()[:, 1]
+        for axes in figure.axes
+        for line in axes.get_lines()
+        if line.get_label() == "its law, right hip"
+    }
+    assert list(drawn) == ["right hip"]
+    np.testing.assert_array_equal(drawn["right hip"], log["truth/joint/friction_law_torque"][:, 2])
+    followed = figures.friction(log_with_law(0.0, 0.0, 0.005, 0.0))
+    assert all(len(axes.get_lines()) == 1 for axes in followed.axes)
+
+
 def test_fall_and_scenario_are_escaped_text(tmp_path, monkeypatch):
     monkeypatch.setattr("fbse_drake.report.run.run_figures", lambda *_, **__: {topic: [] for topic in TOPICS})
     log = walking_log(fell=True)

@@ -30,9 +30,11 @@ from fbse_drake.report.html import FigureBlock, number
 from fbse_drake.report.metrics import (
     attitude_error_deg,
     base_velocity_error,
+    broken_laws,
     com_rse,
     ended_step,
     friction_error,
+    friction_law_error,
     has_feet,
     joint_position_channel,
     joint_sides,
@@ -165,7 +167,9 @@ def run_figures(
         (
             "friction",
             "Joint friction",
-            "True friction torque of each joint, positive when it eats positive torque. It changes its sign where the joint turns round.",
+            "True friction torque of each joint, positive when it eats positive torque. "
+            "It changes its sign where the joint turns round."
+            + (" Thin: the law, in the joint farthest from it." if _farthest_from_law(log) else ""),
             friction_known and not friction_estimated,
             lambda: friction(log),
         ),
@@ -426,11 +430,19 @@ def foot_forces(log: Log) -> Figure:
 
 
 def friction(log: Log) -> Figure:
-    """True friction torque, a panel for each joint (as the truth in the paper's Fig. 6)."""
+    """True friction torque, a panel for each joint (as the truth in the paper's Fig. 6).
+
+    Where simulated joints do not follow their laws, also the law of the worst one.
+    """
     figure, panels = _joint_grid(log, "friction torque [Nm]")
     for joint, axes in panels.items():
         values = log["truth/joint/friction_torque"][:, joint]
         _plot(axes, log, values, color=TRUTH, linestyle="--", linewidth=1.0, label="true friction")
+    if joint := _farthest_from_law(log):
+        column = log.joints.index(joint)
+        law = log["truth/joint/friction_law_torque"][:, column]
+        label = f"its law, {joint.replace('_', ' ')}"
+        _plot(panels[column], log, law, color=_TRUE, linewidth=0.5, label=label)
     _widen(panels, _FRICTION_SPAN)
     add_legend(figure)
     return figure
@@ -670,6 +682,11 @@ def _joint_rows(log: Log) -> dict[str, dict[str, int]]:
     for column, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
         rows.setdefault(name if side is None else name.removeprefix(f"{side}_"), {})[side or ""] = column
     return rows
+
+
+def _farthest_from_law(log: Log) -> str | None:
+    """The joint whose simulated torque is farthest from its law; None if all follow theirs."""
+    return next(iter(broken_laws(friction_law_error(log))), None)
 
 
 def _friction_config(log: Log) -> FrictionConfig | None:

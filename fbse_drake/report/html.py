@@ -81,6 +81,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
 
 
+def percent(share: float) -> str:
+    """A share for reading; `n/a` for NaN."""
+    return "n/a" if math.isnan(share) else f"{100 * share:.1f} %"
+
+
 def numeric_table(header: Sequence[str], rows: Sequence[tuple[str | float, ...]]) -> tuple[Table, ...]:
     """The table of these rows without those whose numbers are all NaN; no table at all if none is left."""
     kept = tuple(row for row in rows if not all(math.isnan(cell) for cell in row if not isinstance(cell, str)))

@@ -6,6 +6,7 @@ ends at `time[k]`, row k of the truth to the step that begins then.
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ _STANDING_SHARE = 0.05
 # The beginning of a log that no figure of an estimate counts: the filters start from wide priors and settle [s].
 _SETTLING_TIME = 0.2
 _PHASES = ("stance", "swing")
+# A joint's simulated torque follows its law if it differs by at most this share of the law's rms.
+LAW_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ def run_metrics(log: Log, wall_time: float, tick_time: np.ndarray | None = None)
         "joint_tracking_rms": dict(zip(joints, joint_tracking_rms(log).tolist(), strict=True)),
         "com_rse_mean": com_rse_mean(log),
         "stance_creep_max": {side: max(creep, default=math.nan) for side, creep in stance_creep(log).items()},
+        "friction_law_error": friction_law_error(log),
         "friction_rmse": friction_rmse(log),
         "friction_nrmse": friction_nrmse(log),
         "attitude_rmse_deg": attitude_rmse_deg(log),
@@ -150,6 +154,32 @@ def stance(log: Log) -> dict[str, np.ndarray]:
 def ended_step(values: np.ndarray) -> np.ndarray:
     """What a channel says of steps that begin at its rows' times, (N, ...), moved to the rows where they end; the first row is NaN."""
     return np.concatenate([np.full_like(values[:1], math.nan), values[:-1]])
+
+
+def friction_law_error(log: Log) -> dict[str, float]:
+    """How far the simulated torque loss of each joint is from the laws of its effects [1].
+
+    The root mean square of what acted less the law at the velocity that came out, over that of the
+    law. NaN without truth, and for a joint without an effect.
+    """
+    names = ("truth/joint/friction_torque", "truth/joint/friction_law_torque")
+    if not all(name in log for name in names):
+        return dict.fromkeys(log.joints, math.nan)
+    torque, law = (log[name] for name in names)
+    error, size = _rms(torque - law), _rms(law)
+    share = np.divide(error, size, out=np.full_like(size, math.nan), where=size > 0)
+    return dict(zip(log.joints, share.tolist(), strict=True))
+
+
+def broken_laws(law_error: Mapping[str, float]) -> dict[str, float]:
+    """The joints of a `friction_law_error` that are above `LAW_TOLERANCE`, worst first."""
+    above = {joint: error for joint, error in law_error.items() if error > LAW_TOLERANCE}
+    return dict(sorted(above.items(), key=lambda item: -item[1]))
+
+
+def worst_joint(figures: Mapping[str, float]) -> str:
+    """The joint whose figure is largest; one whose figure is NaN only if there is no other."""
+    return max(figures, key=lambda joint: np.nan_to_num(figures[joint], nan=-math.inf))
 
 
 def friction_error(log: Log) -> np.ndarray:

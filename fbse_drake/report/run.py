@@ -9,8 +9,17 @@ from scipy.spatial import ConvexHull
 
 from fbse_drake.log import Log
 from fbse_drake.report.figures import run_figures
-from fbse_drake.report.html import Details, Report, Section, Table, number, numeric_table, write_report
-from fbse_drake.report.metrics import consistency
+from fbse_drake.report.html import (
+    Details,
+    Report,
+    Section,
+    Table,
+    number,
+    numeric_table,
+    percent,
+    write_report,
+)
+from fbse_drake.report.metrics import LAW_TOLERANCE, broken_laws, consistency, worst_joint
 
 
 def write_run_report(
@@ -35,7 +44,12 @@ def write_run_report(
         Section("Motion", figures=figures["walk"]),
         Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
         Section("Foot forces", figures=figures["forces"]),
-        Section("Friction", tables=_friction_table(metrics), figures=figures["friction"]),
+        Section(
+            "Friction",
+            law_sentence(metrics["friction_law_error"]),
+            tables=_friction_table(metrics),
+            figures=figures["friction"],
+        ),
         Section("Base state", figures=figures["base"]),
         Section("Consistency", _CONSISTENCY, tables=_consistency_table(log), figures=figures["consistency"]),
         Section("Sensors", figures=figures["sensors"]),
@@ -43,6 +57,22 @@ def write_run_report(
     ]
     shown = tuple(section for section in sections if section.tables or section.figures or section.details)
     write_report(path, Report(name, not metrics["fell"], _outcome(metrics), shown))
+
+
+def law_sentence(law_error: Mapping[str, float]) -> str:
+    """In which joints the simulated torque is not its law, and what to do; "" if it is in all.
+
+    Args:
+        law_error: see `friction_law_error`.
+    """
+    if not (broken := broken_laws(law_error)):
+        return ""
+    joints = ", ".join(f"{_words(joint)} ({percent(error)})" for joint, error in broken.items())
+    return (
+        "The simulated joint torque differs from its law by more than "
+        f"{100 * LAW_TOLERANCE:g} % of the law's RMS in {joints}. "
+        "A smaller plant step brings it closer: --set plant.time_step=..."
+    )
 
 
 _CONSISTENCY = (
@@ -61,14 +91,19 @@ def _outcome(metrics: Mapping[str, Any]) -> str:
 
 
 def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
-    tracking = metrics["joint_tracking_rms"]
-    worst = max(tracking, key=tracking.get)
+    tracking, law = metrics["joint_tracking_rms"], metrics["friction_law_error"]
+    worst, farthest = worst_joint(tracking), worst_joint(law)
     rows = [
         ("Length of the run", metrics["simulated_time"], "s"),
         ("Wall time", metrics["wall_time"], "s"),
         ("Length per wall time", metrics["real_time_factor"], "1"),
         ("Joint tracking error, RMS, mean of the joints", 1e3 * float(np.mean(list(tracking.values()))), "mrad"),
         (f"Joint tracking error, RMS, worst joint ({_words(worst)})", 1e3 * tracking[worst], "mrad"),
+        (
+            f"Simulated torque less its law, RMS, worst joint ({_words(farthest)})",
+            round(100 * law[farthest], 2),
+            "% of law",
+        ),
         *((f"CoM error in {axis}, mean", 1e3 * value, "mm") for axis, value in metrics["com_rse_mean"].items()),
         *((f"Creep of the {side} foot in a stance, largest", 1e3 * value, "mm") for side, value in metrics["stance_creep_max"].items()),
         *((f"Estimated {angle}, RMS error", value, "deg") for angle, value in metrics["attitude_rmse_deg"].items()),
