@@ -5,7 +5,7 @@ import signal
 import threading
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,21 +112,22 @@ def _simulate(
                 progress(context.get_time())
             if interrupted.is_set():
                 raise KeyboardInterrupt
-        else:
-            # What acts in the step that begins with the last row is known when that has ended.
-            simulator.AdvanceTo(scenario.duration + scenario.plant.time_step)
     except KeyboardInterrupt:
         failure = "interrupted"
     except RuntimeError as error:
         fell = True
         failure = f"the solver failed: {str(error).splitlines()[0]}"
-    wall_time = clock.perf_counter() - start
+    wall_time, end = clock.perf_counter() - start, context.get_time()
+    # What acts in the step that begins with the last row is known when that has ended. (A tick may
+    # come later than a sum of steps by rounding.)
+    with suppress(RuntimeError):
+        simulator.AdvanceTo(end + 1.001 * scenario.plant.time_step)
     del views
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
     if failure is not None:
-        failure = f"t = {context.get_time():.3f} s: {failure}"
+        failure = f"t = {end:.3f} s: {failure}"
     return SimulationResult(_make_log(scenario, name, station, sink.FindLog(context), failure, fell), failure, wall_time)
 
 

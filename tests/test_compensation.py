@@ -79,9 +79,11 @@ def tracking(run: Run) -> dict[str, np.ndarray]:
 
 
 def test_compensation_tracks_better(tracking: dict[str, np.ndarray]):
-    """Measured: 0.26 mrad with FBSE, 1.73 mrad without, 0.24 mrad on a robot without friction."""
+    """Hip yaws stick: they stay within two counts of an encoder with or without compensation."""
     assert rms(tracking["fbse"]) < rms(tracking["none"]) / 4
-    assert np.all(tracking["fbse"] < tracking["none"] / 2)
+    moved = tracking["none"] > 2 * 4.8e-5
+    assert moved.sum() == 10
+    assert np.all(tracking["fbse"][moved] < tracking["none"][moved] / 2)
     assert rms(tracking["fbse"]) < 1.2 * rms(tracking["frictionless"])
 
 

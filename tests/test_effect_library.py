@@ -244,16 +244,12 @@ def test_every_effect_alone_spares_the_joints_that_are_not_named(kind: type[Join
     ids=lambda effect: type(effect).__name__,
 )
 def test_simulated_torque_follows_the_law_of_the_velocity_that_comes_out(effect: JointTorqueEffect):
-    """The velocity at the end of a step is predicted; what is left is small beside the torque, in averages over 10 ms.
-
-    Not so at the lightest joints: there the change of the command, which is not predicted, moves the joint a lot in one step.
-    """
+    """In all joints of freely swinging legs, some of them light, under a command that is not smooth."""
     log = swinging({"effect": effect}, "duration=1.5")
     loss, predicted = log["truth/joint/friction_torque"][:-1], by_the_law({"effect": effect}, log)
-    loss, error = (values.reshape(-1, 10, 12).mean(axis=1)[50:] for values in (loss, loss - predicted))
-    ratio = np.sqrt((error**2).mean(axis=0) / (loss**2).mean(axis=0))
-    heavy = [name.endswith(("hip_roll", "hip_pitch", "knee_pitch")) for name in NAMES.joint_names]
-    assert np.all(ratio[heavy] < 0.07)
+    np.testing.assert_allclose(predicted, log["truth/joint/friction_law_torque"][:-1], atol=1e-9)
+    error = np.sqrt(((loss - predicted) ** 2).mean(axis=0) / (loss**2).mean(axis=0))
+    assert error.max() < 2e-2
 
 
 def test_links_get_what_is_commanded_less_the_loss():

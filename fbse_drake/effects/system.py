@@ -94,8 +94,6 @@ def look_up(table: LawTable, at: np.ndarray) -> np.ndarray:
 class Tick(NamedTuple):
     """Parts of what a tick makes, views of one vector."""
 
-    # Loss in the step that ended, (n,) [Nm].
-    loss: np.ndarray
     # Generalized force in the step that begins, (velocities,) [Nm], [N].
     force: np.ndarray
     # What is remembered, in the rows named above, (rows, n).
@@ -116,23 +114,36 @@ class _Solver(NamedTuple):
 
 @njit(cache=True)
 def _parts(vector: np.ndarray, joints: int, velocities: int) -> Tick:
-    middle = joints + velocities
-    return Tick(vector[:joints], vector[joints:middle], vector[middle:].reshape(-1, joints))
+    return Tick(vector[:velocities], vector[velocities:].reshape(-1, joints))
 
 
 @njit(cache=True)
-def _begin(
-    tick: Tick,
-    last: Tick,
+def _loss(
+    last: np.ndarray,
     joint_state: np.ndarray,
     net_actuation: np.ndarray,
     solver: _Solver,
+    velocities: int,
 ) -> np.ndarray:
-    """Fills the loss, velocities and positions of a tick; returns the velocities that are expected
-    at the next one, (n,) [rad/s]."""
-    n, now, before = len(tick.loss), tick.memory, last.memory
-    now[_POSITION], now[_VELOCITY], now[_EXPECTED] = joint_state[:n], joint_state[n:], joint_state[n:]
-    now[_CHANGE], tick.loss[:] = 0.0, 0.0
+    """Loss in the step that ended: what was explicit and what the solver took, (n,) [Nm]."""
+    n = len(joint_state) // 2
+    explicit = _parts(last, n, velocities).memory[_EXPLICIT]
+    loss = np.zeros(n)
+    for j in range(n):
+        if not math.isnan(explicit[j]):
+            loss[j] = explicit[j] + solver.damping[j] * joint_state[n + j]
+            if solver.clamp[j] >= 0:
+                loss[j] -= net_actuation[solver.clamp[j]]
+    return loss
+
+
+@njit(cache=True)
+def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
+    """Fills velocities and positions of a tick; returns the velocities that are expected at the next
+    one, (n,) [rad/s]."""
+    n, now, before = len(joint_state) // 2, tick.memory, last.memory
+    now[_POSITION], now[_VELOCITY] = joint_state[:n], joint_state[n:]
+    now[_EXPECTED], now[_CHANGE] = joint_state[n:], 0.0
     if not math.isnan(before[_VELOCITY, 0]):
         for j in range(n):
             v = joint_state[n + j]
@@ -141,9 +152,6 @@ def _begin(
                 now[_EXPECTED, j] = before[_EXPECTED, j] + _FOLLOWED * (v - before[_EXPECTED, j])
             else:
                 now[_EXPECTED, j] = v + _CARRIED_ON * now[_CHANGE, j]
-            tick.loss[j] = before[_EXPLICIT, j] + solver.damping[j] * v
-            if solver.clamp[j] >= 0:
-                tick.loss[j] -= net_actuation[solver.clamp[j]]
     return now[_EXPECTED]
 
 
@@ -167,7 +175,6 @@ def _calc_steady(
     tick: np.ndarray,
     last: np.ndarray,
     joint_state: np.ndarray,
-    net_actuation: np.ndarray,
     offset: np.ndarray,
     table: LawTable,
     solver: _Solver,
@@ -178,7 +185,7 @@ def _calc_steady(
     n = len(joint_state) // 2
     parts = _parts(tick, n, velocities)
     parts.memory[_ROWS : _ROWS + len(offset)] = offset
-    expected = _begin(parts, _parts(last, n, velocities), joint_state, net_actuation, solver)
+    expected = _begin(parts, _parts(last, n, velocities), joint_state)
     _finish(parts, expected, look_up(table, expected), offset, solver)
     if is_solved:
         parts.memory[_EXPLICIT] = 0.0
@@ -196,6 +203,7 @@ class ExplicitTorque(LeafSystem):
         - net_actuation
         - torque_command
         output_ports:
+        - torque_loss
         - tick
 
     The explicit torque of a step is the law less what the solver takes of it, both at the velocity
@@ -203,8 +211,9 @@ class ExplicitTorque(LeafSystem):
     what the expectation is wrong by.
 
     `joint_state` is [positions, velocities], (2n,) [rad, rad/s]; `net_actuation` is the plant's
-    [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins. `tick` has
-    the parts of `Tick`. Discrete state: the last tick.
+    [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins.
+    `torque_loss` (n,) [Nm] is that of the step that ended (zero before the first); `tick` has the
+    parts of `Tick`. Discrete state: the last tick.
     """
 
     def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
@@ -234,23 +243,30 @@ class ExplicitTorque(LeafSystem):
         actuators = robot.plant.num_actuators()
         self._net_actuation = self.DeclareVectorInputPort("net_actuation", actuators)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        size = n + self._velocities + rows * n
+        size = self._velocities + rows * n
         self._last = self.DeclareDiscreteState(np.full(size, math.nan))
+        ended = (self._joint_state, self._net_actuation)
+        sources = {self.xd_ticket(), *(self.input_port_ticket(port.get_index()) for port in ended)}
+        # It depends on no command: what takes it may command.
+        self._torque_loss = self.DeclareVectorOutputPort("torque_loss", n, self._calc_loss, sources)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self._tick = self.DeclareVectorOutputPort("tick", size, self._calc, sources)
         self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
 
+    def _calc_loss(self, context: Context, output: BasicVector) -> None:
+        last = context.get_discrete_state().value(0)
+        ended = (self._joint_state.Eval(context), self._net_actuation.Eval(context))
+        output.SetFromVector(_loss(last, *ended, self._solver, self._velocities))
+
     def _calc(self, context: Context, output: BasicVector) -> None:
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
-        inputs = (self._joint_state.Eval(context), self._net_actuation.Eval(context))
+        joint_state = self._joint_state.Eval(context)
         if not self._others:
-            offset = self._law.torque.offset
-            table, solver = self._table, self._solver
-            sizes = (self._velocities, self._is_solved)
-            _calc_steady(*vectors, *inputs, offset, table, solver, *sizes)
+            laws = (self._law.torque.offset, self._table, self._solver)
+            _calc_steady(*vectors, joint_state, *laws, self._velocities, self._is_solved)
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
-        expected = _begin(tick, last, *inputs, self._solver)
+        expected = _begin(tick, last, joint_state)
         motion = self._motion(context, tick, last, expected)
         torque = look_up(self._table, expected)
         for _, effect, rows in self._others:
@@ -269,7 +285,7 @@ class ExplicitTorque(LeafSystem):
         now, before, time_step = tick.memory, last.memory, self._time_step
         first, time = math.isnan(before[_VELOCITY, 0]), context.get_time()
         command = now[_COMMAND] = self._torque_command.Eval(context)
-        load = command if first else before[_COMMAND] - tick.loss
+        load = command if first else before[_COMMAND] - self._torque_loss.Eval(context)
         motion = JointMotion(expected, now[_POSITION], command, time, time_step, load=load)
         now[self._offsets] = self._law.torque.offset
         moving = {clamps.effect: clamps for clamps in self._law.moving}
@@ -314,16 +330,16 @@ class JointTorqueEffects(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         explicit = builder.AddNamedSystem("explicit", ExplicitTorque(law, robot, time_step))
-        n, tick = len(robot.joint_names), explicit.get_output_port()
-        sizes = [n, robot.plant.num_velocities(), _ROWS * n, law.torque.offset.size]
+        n, tick = len(robot.joint_names), explicit.GetOutputPort("tick")
+        sizes = [robot.plant.num_velocities(), _ROWS * n, law.torque.offset.size]
         sizes.append(tick.size() - sum(sizes))
         parts = Demultiplexer([size for size in sizes if size > 0])
         split = builder.AddNamedSystem("parts", parts)
         builder.Connect(tick, split.get_input_port())
         for name in ("joint_state", "net_actuation", "torque_command"):
             builder.ExportInput(explicit.GetInputPort(name), name)
-        builder.ExportOutput(split.get_output_port(0), "torque_loss")
-        builder.ExportOutput(split.get_output_port(1), "explicit_force")
+        builder.ExportOutput(explicit.GetOutputPort("torque_loss"), "torque_loss")
+        builder.ExportOutput(split.get_output_port(0), "explicit_force")
         if law.moves_clamps:
-            builder.ExportOutput(split.get_output_port(3), "clamp_offset")
+            builder.ExportOutput(split.get_output_port(2), "clamp_offset")
         builder.BuildInto(self)
