@@ -238,7 +238,6 @@ def test_every_effect_alone_spares_the_joints_that_are_not_named(kind: type[Join
         QuadraticDrag(drag={"all": 2.0}),
         ThermalDrift(change={"all": 4.0}, warm_up={"all": 0.3}),
         PreslidingHysteresis(coulomb={"all": 2.0}),
-        DirectionalFriction(asymmetry={"all": 1.0}, transition={"all": 0.05}),
         DirectionalViscousFriction(asymmetry={"all": -2.0}),
     ],
     ids=lambda effect: type(effect).__name__,
