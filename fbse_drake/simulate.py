@@ -22,6 +22,7 @@ from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
+from fbse_drake.sensors.errors import ticks_until
 from fbse_drake.station import Station, build_station
 from fbse_drake.walking.reference import Reference
 
@@ -113,8 +114,10 @@ def _simulate(
             if interrupted.is_set():
                 raise KeyboardInterrupt
         else:
-            # What acts in the step that begins with the last row is known when that has ended.
-            simulator.AdvanceTo(scenario.duration + scenario.plant.time_step)
+            # What acts in the step that begins with the last row is known when that has ended; half
+            # a step more, for ticks are not at exact multiples of the step.
+            ticks = ticks_until(scenario.duration, scenario.plant.time_step)
+            simulator.AdvanceTo((ticks + 0.5) * scenario.plant.time_step)
     except KeyboardInterrupt:
         failure = "interrupted"
     except RuntimeError as error:
