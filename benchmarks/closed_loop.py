@@ -1,14 +1,19 @@
-"""What the closed loop of a scenario costs, against its bare plant: `python -m benchmarks.closed_loop [SCENARIO]`.
+"""What the closed loop of a scenario costs, against its bare plant and at other plant steps:
+`python -m benchmarks.closed_loop [SCENARIO]`.
 
-The bare plant goes through the same motion, with contact and with the recorded torques (command minus friction) from a C++ source, in
-windows that each start from the recorded state; nothing is measured, controlled or recorded. The closed loop is run in two ways: by
-itself (robot, friction, encoders, controller, reference; Drake evaluates only what is read, so the IMU and the foot sensors rest), and
-as `fbse simulate` does it, with every sensor read and recorded at every tick. All are run in turn several times and the fastest counts.
+The bare plant goes through the same motion, with contact and with the recorded torques (command
+minus friction) from a C++ source, in windows that each start from the recorded state; nothing is
+measured, controlled or recorded. The closed loop is run in two ways: by itself (robot, friction,
+encoders, controller, reference; Drake evaluates only what is read, so the IMU and the foot sensors
+rest), and as `fbse simulate` does it, with every sensor read and recorded at every tick. All take
+turns over short windows of the motion, so that whatever else the computer does slows down all
+alike, and the medians over the windows are printed: of times, and of ratios within a window.
 """
 
+import dataclasses
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -20,18 +25,30 @@ from pydrake.systems.primitives import MatrixGain
 from fbse_drake import Log, Scenario, build_station, load_scenario, simulate
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sensors.errors import held_signal
+from fbse_drake.simulate import add_record, recorded_ports
 
-_REPETITIONS = 4
-# Without control a walking robot leaves its path slowly at first; a window is short enough not to notice.
-_WINDOW = 100
+# Of the motion, as much as this [s].
+_DURATION = 6.0
+# Without control a walking robot leaves its path slowly at first; a window is short enough not to
+# notice. A whole number of steps [s].
+_WINDOW = 0.04
+# The plant's [ms]; all is compared with the middle one.
+_STEPS = (0.5, 1.0, 2.0)
+_BASE = 1.0
+# Goes through the window that begins at this time [s]; returns how long that took [s].
+Timer = Callable[[float], float]
 
 
-def bare_plant(scenario: Scenario, log: Log) -> Callable[[], float]:
-    """A function that steps the scenario's plant through a logged motion and returns the time per step [s]."""
+def bare_plant(scenario: Scenario, log: Log) -> Timer:
+    """Times the scenario's plant in a logged motion; setting the state is not counted."""
     builder = DiagramBuilder()
     config = scenario.robot
     robot, _ = make_robot(
-        config.description, rotor_inertia=config.rotor_inertia, builder=builder, config=scenario.plant, ground=scenario.ground
+        config.description,
+        rotor_inertia=config.rotor_inertia,
+        builder=builder,
+        config=scenario.plant,
+        ground=scenario.ground,
     )
     torque = log["joint/torque_command"] - log["truth/joint/friction_torque"]
     source = builder.AddSystem(held_signal(torque, scenario.log.period))
@@ -42,49 +59,73 @@ def bare_plant(scenario: Scenario, log: Log) -> Callable[[], float]:
     context = simulator.get_mutable_context()
     plant_context = robot.plant.GetMyMutableContextFromRoot(context)
 
-    def run() -> float:
-        elapsed, steps = 0.0, 0
-        for row in range(0, len(log.time) - _WINDOW, _WINDOW):
-            X_WB = RigidTransform(Quaternion(log["truth/base/orientation"][row]), log["truth/base/position"][row])
-            V_WB = np.concatenate([log["truth/base/angular_velocity"][row], log["truth/base/velocity"][row]])
-            context.SetTime(log.time[row])
-            robot.set_state(plant_context, log["truth/joint/position"][row], log["truth/joint/velocity"][row], X_WB, V_WB)
-            simulator.Initialize()
-            start = time.perf_counter()
-            simulator.AdvanceTo(log.time[row + _WINDOW])
-            elapsed += time.perf_counter() - start
-            steps += round((log.time[row + _WINDOW] - log.time[row]) / scenario.plant.time_step)
-        return elapsed / steps
+    def run(begin: float) -> float:
+        row = round(begin / scenario.log.period)
+        now = {name: values[row] for name, values in log.channels.items()}
+        orientation = Quaternion(now["truth/base/orientation"])
+        X_WB = RigidTransform(orientation, now["truth/base/position"])
+        V_WB = [now["truth/base/angular_velocity"], now["truth/base/velocity"]]
+        joints = (now["truth/joint/position"], now["truth/joint/velocity"])
+        context.SetTime(begin)
+        robot.set_state(plant_context, *joints, X_WB, np.concatenate(V_WB))
+        simulator.Initialize()
+        return advance(simulator, begin)
 
     return run
 
 
-def closed_loop(scenario: Scenario) -> float:
-    """Time per plant step of the closed loop by itself [s]."""
-    simulator = Simulator(build_station(scenario))
+def closed_loop(scenario: Scenario, *, recorded: bool) -> Timer:
+    """Times the closed loop, by itself or with all that a log has."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(build_station(scenario))
+    if recorded:
+        add_record(builder, station, recorded_ports(station), scenario.plant.time_step)
+    simulator = Simulator(builder.Build())
     simulator.Initialize()
+    return lambda begin: advance(simulator, begin)
+
+
+def advance(simulator: Simulator, begin: float) -> float:
+    """Simulates a window; returns how long that took [s]."""
     start = time.perf_counter()
-    simulator.AdvanceTo(scenario.duration)
-    return (time.perf_counter() - start) * scenario.plant.time_step / scenario.duration
+    simulator.AdvanceTo(begin + _WINDOW)
+    return time.perf_counter() - start
+
+
+def in_turn(timers: Mapping[str, Timer], duration: float) -> dict[str, np.ndarray]:
+    """Times of all timers over the same windows, (windows,) each, per simulated second [1]."""
+    times: dict[str, list[float]] = {what: [] for what in timers}
+    for window in range(int(duration / _WINDOW)):
+        for what, timer in timers.items():
+            times[what].append(timer(window * _WINDOW) / _WINDOW)
+    return {what: np.array(values) for what, values in times.items()}
+
+
+def at_step(name: str, step: float) -> Scenario:
+    """The scenario at a plant step [ms], not longer than is timed."""
+    scenario = load_scenario(name, overrides=[f"plant.time_step={step}e-3"])
+    return dataclasses.replace(scenario, duration=min(scenario.duration, _DURATION))
 
 
 def main() -> None:
-    """Prints the cost per plant step of each, as a multiple of the bare plant's and as a real time factor."""
+    """Prints real time factors and ratios of costs."""
     name = sys.argv[1] if len(sys.argv) > 1 else "paper_walk"
-    scenario = load_scenario(name)
-    step = scenario.plant.time_step
-    first = simulate(scenario, name=name)
-    bare = bare_plant(scenario, first.log)
-    costs: dict[str, list[float]] = {"bare plant": [], "closed loop": [], "closed loop, recorded": []}
-    for _ in range(_REPETITIONS):
-        costs["bare plant"].append(bare())
-        costs["closed loop"].append(closed_loop(scenario))
-        costs["closed loop, recorded"].append(simulate(scenario, name=name).wall_time * step / scenario.duration)
-    alone = min(costs["bare plant"])
-    print(f"{name}, plant step {1e3 * step:g} ms, fastest of {_REPETITIONS} runs of each")
-    for what, values in costs.items():
-        cost = min(values)
-        print(f"{what:22} {1e6 * cost:5.0f} us per step   {cost / alone:5.2f} x bare plant   {step / cost:5.2f} x real time")
+    base = at_step(name, _BASE)
+    timers = {"bare plant": bare_plant(base, simulate(base, name=name).log)}
+    timers["closed loop"] = closed_loop(base, recorded=False)
+    steps = {step: f"closed loop, recorded, at {step:g} ms" for step in _STEPS}
+    for step, what in steps.items():
+        timers[what] = closed_loop(at_step(name, step), recorded=True)
+    times = in_turn(timers, base.duration)
+    windows = len(times["bare plant"])
+    print(f"{name}, plant step {_BASE:g} ms unless said, medians of {windows} windows in turn")
+    for what, values in times.items():
+        ratio = np.median(values / times["bare plant"])
+        speed = np.median(times[steps[_BASE]] / values)
+        print(
+            f"{what:34} {1 / np.median(values):5.2f} x real time   {ratio:5.2f} x bare plant's cost"
+            f"   {speed:5.2f} x speed of recorded at {_BASE:g} ms"
+        )
 
 
 if __name__ == "__main__":

@@ -18,10 +18,11 @@ def located(where: str) -> Iterator[None]:
 
 
 def require_positive(config: object, *names: str) -> None:
-    """Refuses a configuration in which one of these numbers is not > 0."""
+    """Refuses a configuration in which one of these numbers is given (not None) and not > 0."""
     for name in names:
-        if not getattr(config, name) > 0:
-            raise InputError(f"{name}: expected a number > 0, found {getattr(config, name):g}")
+        value = getattr(config, name)
+        if value is not None and not value > 0:
+            raise InputError(f"{name}: expected a number > 0, found {value:g}")
 
 
 def require_not_negative(config: object, *names: str) -> None:

@@ -3,10 +3,11 @@
 A file holds one or more named scenarios. What is left out has the default below; `--set a.b.c=value` goes on top.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
@@ -111,6 +112,12 @@ class SensorsConfig:
             joint_torque=self.joint_torque and JointTorqueConfig(),
         )
 
+    def with_period(self, period: float) -> "SensorsConfig":
+        """The same, with this period [s] for sensors of which none is given."""
+        usual = {name: _with_period(sensor, period) for name, sensor in self._usual.items()}
+        more = {name: _with_period(sensor, period) for name, sensor in self.more.items()}
+        return replace(self, **usual, more=more)
+
 
 @dataclass(frozen=True)
 class FallConfig:
@@ -184,8 +191,8 @@ class IdentifyConfig:
 class LogConfig:
     """What is recorded."""
 
-    # Time between samples [s].
-    period: float = 0.001
+    # Time between samples [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
 
 def _plant_config() -> MultibodyPlantConfig:
@@ -193,9 +200,23 @@ def _plant_config() -> MultibodyPlantConfig:
     return MultibodyPlantConfig(time_step=0.001, contact_model="point", discrete_contact_approximation="lagged")
 
 
+# Control, log and sensors tick at least this far apart, unless they are given a period [s].
+_USUAL_PERIOD = 0.001
+
+T = TypeVar("T")
+
+
+def _with_period(config: T, period: float) -> T:
+    """The same config, with this period [s] if it is to have one and none is given."""
+    return replace(config, period=period) if getattr(config, "period", 0.0) is None else config
+
+
 @dataclass(frozen=True)
 class Scenario:
-    """One experiment. SI units throughout."""
+    """One experiment. SI units throughout.
+
+    Periods that are not given become `usual_period`.
+    """
 
     # One sentence for the reader of the report.
     title: str = ""
@@ -239,6 +260,11 @@ class Scenario:
             raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:
             raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
+        # Frozen from here on: nobody has seen it yet.
+        usual = self.usual_period
+        object.__setattr__(self, "control", _with_period(self.control, usual))
+        object.__setattr__(self, "log", _with_period(self.log, usual))
+        object.__setattr__(self, "sensors", self.sensors.with_period(usual))
         if self.duration < self.control.period:
             raise InputError(f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}")
         if isinstance(self.estimator, NoEstimator) and self.compensation.uses_estimate:
@@ -254,6 +280,12 @@ class Scenario:
             steps = period / self.plant.time_step
             if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:
                 raise InputError(f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}")
+
+    @property
+    def usual_period(self) -> float:
+        """The fewest whole steps of the plant that last a millisecond [s]."""
+        steps = math.ceil(_USUAL_PERIOD / self.plant.time_step - 1e-6)
+        return steps * self.plant.time_step
 
     @property
     def believed(self) -> RobotConfig:

@@ -182,32 +182,34 @@ def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
             close = difflib.get_close_matches(str(name), fields, n=1)
             hint = f", did you mean {close[0]}?" if close else ""
             raise InputError(f"{file}{prefix}{name}: unknown key{hint} (allowed: {', '.join(fields)})")
-    if default is None:
-        default = _default_of(schema, content, file, key)
-    values = {name: _build(fields[name], v, getattr(default, name, None), file, prefix + name) for name, v in content.items()}
+    defaults = _defaults(schema)
+    if default is not None:
+        defaults = {name: getattr(default, name) for name in fields}
+    missing = [name for name in fields if name not in defaults and name not in content]
+    if missing:
+        raise InputError(f"{file}{key or 'top level'}: the key {missing[0]} is missing")
+    values = {}
+    for name, v in content.items():
+        values[name] = _build(fields[name], v, defaults.get(name), file, prefix + name)
     try:
-        if not dataclasses.is_dataclass(schema):
-            drake_config = schema(**{name: getattr(default, name) for name in fields})
-            for name, v in values.items():
-                setattr(drake_config, name, v)
-            return drake_config
-        return schema(**values) if default is _MISSING else dataclasses.replace(default, **values)
+        return schema(**defaults | values)
     except InputError as error:
         raise InputError(f"{file}{prefix}{error}") from None
 
 
-_MISSING = object()
-
-
-def _default_of(schema: Any, content: collections.abc.Mapping, file: str, key: str) -> Any:
-    """An object with the schema's defaults, or _MISSING where some field has none (all of those must then be given)."""
+def _defaults(schema: Any) -> dict[str, Any]:
+    """Values of the fields that have a default, as they are before an object is made of them: it
+    may make others of those that it was not given."""
     if not dataclasses.is_dataclass(schema):
-        return schema()
-    required = [f.name for f in dataclasses.fields(schema) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING]
-    missing = [name for name in required if name not in content]
-    if missing:
-        raise InputError(f"{file}{key or 'top level'}: the key {missing[0]} is missing")
-    return _MISSING if required else schema()
+        usual = schema()
+        return {name: getattr(usual, name) for name in _fields(schema)}
+    defaults = {}
+    for field in dataclasses.fields(schema):
+        if field.default is not dataclasses.MISSING:
+            defaults[field.name] = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            defaults[field.name] = field.default_factory()
+    return defaults
 
 
 def _fields(schema: Any) -> dict[str, Any]:

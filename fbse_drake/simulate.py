@@ -87,7 +87,7 @@ def _simulate(
 ) -> SimulationResult:
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
-    sink = add_record(builder, station, _recorded(station), scenario.plant.time_step)
+    sink = add_record(builder, station, recorded_ports(station), scenario.plant.time_step)
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
@@ -152,7 +152,7 @@ def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_h
     return None
 
 
-def _recorded(station: Station) -> list[str]:
+def recorded_ports(station: Station) -> list[str]:
     """Output ports of the station that are recorded."""
     return [name for name in signals.ports(recorded=True) if station.HasOutputPort(name)]
 
@@ -180,7 +180,7 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
 
 def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
     robot, time_step = station.robot, scenario.plant.time_step
-    names = _recorded(station)
+    names = recorded_ports(station)
     ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
     # A run that diverges may end in rows that are not numbers.
     finite = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))

@@ -201,3 +201,13 @@ def test_com_converges_under_step_halving(run: Run):
     coarse, fine = (run("paper_walk", *changes, noise=False) for changes in ((), ("plant.time_step=0.0005",)))
     np.testing.assert_allclose(fine.time, coarse.time, atol=1e-12)
     assert np.abs(coarse["truth/com/position"] - fine["truth/com/position"]).max() < 1e-3
+
+
+def test_walk_at_a_step_of_two_milliseconds_is_the_same_walk(run: Run):
+    walk = ("paper_walk", "duration=1.5")
+    shorter = run(*walk, noise=False)
+    longer = run(*walk, "plant.time_step=0.002", noise=False)
+    assert not any(log.meta["outcome"]["fell"] for log in (shorter, longer))
+    np.testing.assert_allclose(longer.time, shorter.time[::2], atol=1e-12)
+    change = longer["truth/com/position"] - shorter["truth/com/position"][::2]
+    assert np.abs(change).max() < 1e-3

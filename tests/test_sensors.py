@@ -34,7 +34,11 @@ def test_held_signal_has_each_value_from_its_tick_on(step: float):
 
 
 def test_imu_bias_and_walk():
-    config = ImuConfig(acceleration_bias=[0.1, 0.2, 0.3], angular_velocity_bias_walk=0.01)
+    config = ImuConfig(
+        acceleration_bias=[0.1, 0.2, 0.3],
+        angular_velocity_bias_walk=0.01,
+        period=1e-3,
+    )
     errors = imu_errors(config, 0, 400.0)
     np.testing.assert_array_equal(errors[:, :3], np.tile([0.1, 0.2, 0.3], (len(errors), 1)))
     # A random walk of density s has moved by s sqrt(T) after T.
@@ -52,7 +56,8 @@ def test_quantization():
 
 def test_differenced_velocity_of_a_joint_at_rest_is_zero():
     builder = DiagramBuilder()
-    encoders = builder.AddSystem(Encoders(EncoderConfig(resolution=1e-3, velocity="differenced"), 2, seed=0, duration=1.0))
+    config = EncoderConfig(resolution=1e-3, velocity="differenced", period=1e-3)
+    encoders = builder.AddSystem(Encoders(config, 2, seed=0, duration=1.0))
     source = builder.AddSystem(ConstantVectorSource([0.1234, -0.5, 9.0, 9.0]))
     builder.Connect(source.get_output_port(), encoders.get_input_port())
     builder.ExportOutput(encoders.get_output_port())

@@ -24,8 +24,8 @@ class PositionLoopConfig:
     torque_limit: dict[str, float] = field(default_factory=lambda: {"all": 300.0})
     # Is the reference's feed-forward torque (gravity and inertia) added?
     feedforward: bool = True
-    # Period of the control [s].
-    period: float = 0.001
+    # Period of the control [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "period")

@@ -138,7 +138,7 @@ class LogMap:
     pads: dict[str, list[list[float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_positive(self, "gap", *(["period"] if self.period is not None else []))
+        require_positive(self, "gap", "period")
         if self.end is not None and not self.end > self.start:
             raise InputError(f"end: expected a number > start = {self.start:g}, found {self.end:g}")
         if len(set(self.joints)) != len(self.joints):

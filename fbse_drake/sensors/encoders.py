@@ -36,8 +36,8 @@ class EncoderConfig(Sensor):
     velocity: str = "exact"
     # Standard deviation of an `exact` velocity [rad/s].
     velocity_noise: float = 0.0
-    # Sampling period [s].
-    period: float = 0.001
+    # Sampling period [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_not_negative(self, "resolution", "noise", "velocity_noise")

@@ -41,8 +41,8 @@ class FootForceConfig(Sensor):
     delay: float = 0.0
     # Largest force in either direction [N].
     range: float = 5000.0
-    # Sampling period [s].
-    period: float = 0.001
+    # Sampling period [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_not_negative(self, "noise", "moment_noise", "delay")

@@ -37,8 +37,8 @@ class ImuConfig(Sensor):
     # Random walk of the errors [m/s^2/sqrt(s)], [rad/s/sqrt(s)].
     acceleration_bias_walk: float = 0.0
     angular_velocity_bias_walk: float = 0.0
-    # Sampling period [s].
-    period: float = 0.001
+    # Sampling period [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_not_negative(self, "acceleration_noise", "angular_velocity_noise", "acceleration_bias_walk", "angular_velocity_bias_walk")

@@ -64,8 +64,9 @@ class JointTemperature(Sensor):
     # Standard deviation of white noise [K]; one count [K], 0 reads exactly.
     noise: float = 0.0
     resolution: float = 0.0
-    # Sampling period [s]; power is taken as constant over it.
-    period: float = 0.001
+    # Sampling period [s], over which power is taken as constant; by default
+    # `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_not_negative(self, "noise", "resolution")

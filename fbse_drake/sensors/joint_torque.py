@@ -23,8 +23,8 @@ class JointTorqueConfig(Sensor):
 
     # Standard deviation of white noise [Nm].
     noise: float = 0.0
-    # Sampling period [s].
-    period: float = 0.001
+    # Sampling period [s]; by default `Scenario.usual_period`.
+    period: float | None = None
 
     def __post_init__(self) -> None:
         require_not_negative(self, "noise")

@@ -39,7 +39,10 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensor(ABC):
-    """Base of the sensors: a frozen dataclass whose fields say how the sensor errs."""
+    """Base of the sensors: a frozen dataclass whose fields say how the sensor errs.
+
+    One that samples has a field `period` [s]; if it is None, a scenario gives it its usual one.
+    """
 
     # What it gives: rows of the table of signals.
     signals: ClassVar[tuple[Signal, ...]]
