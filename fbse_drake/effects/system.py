@@ -30,7 +30,8 @@ _FOLLOWED = 0.2
 # A law that the solver takes but for this share of it is solved exactly.
 _ROUNDING = 1e-12
 # Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, its change
-# in the last step, and what is expected at the end; position and command of the step that begins; then offsets of clamps and memories of effects.
+# in the last step, and what is expected at the end; position and command when it begins; then
+# offsets of clamps and memories of effects.
 _EXPLICIT, _VELOCITY, _CHANGE, _EXPECTED, _POSITION, _COMMAND, _ROWS = range(7)
 
 
