@@ -32,7 +32,7 @@ from fbse_drake.effects.joint_torque import (
     basis_over_time,
     law_over_time,
 )
-from fbse_drake.effects.system import LawTable, law_table, look_up
+from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.effects.transmission import Backlash, PreslidingHysteresis
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.plant import make_robot
