@@ -27,6 +27,7 @@ format: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop
+	$(VENV)/bin/python -m benchmarks.effects
 	$(VENV)/bin/python -m benchmarks.estimator_tick
 	$(VENV)/bin/python -m benchmarks.convert
 
