@@ -26,7 +26,12 @@ from fbse_drake.effects.friction import (
 )
 from fbse_drake.effects.inertia import ReflectedInertia
 from fbse_drake.effects.sensor import TransmissionElasticity
-from fbse_drake.effects.transmission import Backlash, JointSpring, PreslidingHysteresis, TorqueRipple
+from fbse_drake.effects.transmission import (
+    Backlash,
+    JointSpring,
+    PreslidingHysteresis,
+    TorqueRipple,
+)
 from fbse_drake.report.metrics import friction_law_error
 
 _WALK, _DURATION = "hrp2_friction_walk", 3.0

@@ -12,7 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, MatrixGain, PassThrough
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantVectorSource,
+    Demultiplexer,
+    MatrixGain,
+    PassThrough,
+)
 
 from fbse_drake import signals
 from fbse_drake.control.compensation import FrictionCompensation
@@ -156,7 +162,8 @@ def add_robot(
     law = implicit_law(torque_effects, _planned_motion(reference, time_step))
     with located("robot: "):
         ground, settings = contact_with_effects(config.effects.values(), *contact)
-        robot = build_robot(config, builder=builder, plant=settings, ground=ground, implicit=law.torque)
+        simulated = {"builder": builder, "plant": settings, "ground": ground}
+        robot = build_robot(config, **simulated, implicit=law.torque)
     reference.set_start(robot, ground)
     plant = robot.plant
     joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))

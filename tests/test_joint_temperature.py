@@ -40,7 +40,8 @@ def temperatures(config: JointTemperature, torque: System, loss: float = 0.0, ve
 
 
 def test_constant_torque_and_friction_warm_a_winding_exponentially():
-    config = JointTemperature(**HEAT, friction_share={"all": 0.5}, ambient=AMBIENT, start=START)
+    around = {"ambient": AMBIENT, "start": START}
+    config = JointTemperature(**HEAT, friction_share={"all": 0.5}, **around, period=0.001)
     read = temperatures(config, ConstantVectorSource([3.0]), loss=2.0, velocity=4.0)
     power = 2.0 * 3.0**2 + 0.5 * 2.0 * 4.0
     final = AMBIENT + 1.5 * power
@@ -49,7 +50,8 @@ def test_constant_torque_and_friction_warm_a_winding_exponentially():
 
 
 def test_power_that_a_spring_gives_back_does_not_cool():
-    config = JointTemperature(**HEAT, friction_share={"all": 1.0}, ambient=AMBIENT, start=AMBIENT)
+    around = {"ambient": AMBIENT, "start": AMBIENT}
+    config = JointTemperature(**HEAT, friction_share={"all": 1.0}, **around, period=0.001)
     read = temperatures(config, ConstantVectorSource([0.0]), loss=2.0, velocity=-4.0)
     np.testing.assert_array_equal(read, AMBIENT)
 
@@ -112,7 +114,8 @@ def test_a_scenario_says_it_and_reads_it_back(tmp_path: Path):
     path = tmp_path / "warm.yaml"
     path.write_text("warm:\n  sensors: {more: {winding: !JointTemperature {ambient: 30, noise: 0.2}}}\n")
     warm = load_scenario(path)
-    assert warm.sensors.more == {"winding": JointTemperature(ambient=30.0, noise=0.2)}
+    expected = JointTemperature(ambient=30.0, noise=0.2, period=warm.usual_period)
+    assert warm.sensors.more == {"winding": expected}
     path.write_text(dump_scenario(warm, "warm"))
     again = load_scenario(path)
     assert again.sensors == warm.sensors

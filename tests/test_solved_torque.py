@@ -1,4 +1,4 @@
-"""What joint torque effects do in a plant: the torque that acts against the law, and against mechanics in closed form."""
+"""What joint torque effects do in a plant: against their laws, and against closed forms."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -41,7 +41,11 @@ from fbse_drake.station import add_joint_torques
 H = 1e-3
 TABLE_1 = StribeckFriction(gamma1={"all": 0.7}, gamma4={"all": 0.6}, gamma6={"all": 0.9})
 # Coulomb 40 Nm with a slope of 5000 Nm s/rad at rest.
-HARMONIC_DRIVE = CoulombViscousFriction(coulomb={"all": 40.0}, viscous={"all": 20.0}, transition={"all": 40.0 / 4980.0})
+HARMONIC_DRIVE = CoulombViscousFriction(
+    coulomb={"all": 40.0},
+    viscous={"all": 20.0},
+    transition={"all": 40.0 / 4980.0},
+)
 _WHEEL = """<robot name="wheel"><link name="bench"/><link name="wheel"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="axis" type="continuous"><parent link="bench"/><child link="wheel"/><axis xyz="0 0 1"/>
@@ -62,12 +66,12 @@ class ClippedFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=lambda: {"all": 0.01})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence, Sequence]:
         x = motion.velocity / nonlinear[0]
         return (np.clip(x, -1.0, 1.0),), ((np.abs(x) < 1.0) / nonlinear[0],)
 
     @staticmethod
-    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+    def rise(linear, nonlinear, typical) -> Rise:  # noqa: ARG004
         return Rise(corners=(nonlinear[0],))
 
 
@@ -124,7 +128,8 @@ class Wheel:
             "torque_command": source.get_output_port(),
         }
         ports |= add_joint_torques(builder, self.robot, self.law, time_step, ports)
-        self.sinks = {name: LogVectorOutput(port, builder, time_step) for name, port in ports.items()}
+        record = [LogVectorOutput(port, builder, time_step) for port in ports.values()]
+        self.sinks = dict(zip(ports, record, strict=True))
         self.diagram = builder.Build()
 
     def run(self, speed: float, duration: float) -> dict[str, np.ndarray]:
@@ -205,7 +210,17 @@ def test_what_the_solver_holds_itself_is_exact_at_any_slope(
         ([QuadraticDrag(drag={"all": 5.0})], 30.0, 2e-2),
         ([ThermalDrift(change={"all": 20.0}, warm_up={"all": 2.0})], 60.0, 2e-2),
     ],
-    ids=["tanh", "stribeck", "load beside", "load", "directional", "soft bristle", "hard bristle", "drag", "warm-up"],
+    ids=[
+        "tanh",
+        "stribeck",
+        "load beside",
+        "load",
+        "directional",
+        "soft bristle",
+        "hard bristle",
+        "drag",
+        "warm-up",
+    ],
 )
 def test_the_torque_that_acts_is_that_of_the_law(
     tmp_path: Path,
@@ -235,7 +250,13 @@ def test_a_law_that_rises_unsaid_rings_and_shows_it(tmp_path: Path):
     assert rms(found["loss"] - found["law"]) > 0.5 * rms(found["law"])
 
 
-def exact_velocity(law: Callable[[np.ndarray], np.ndarray], inertia: float, drive: float, speed: float, duration: float) -> float:
+def exact_velocity(
+    law: Callable[[np.ndarray], np.ndarray],
+    inertia: float,
+    drive: float,
+    speed: float,
+    duration: float,
+) -> float:
     """Final velocity of the wheel from scipy's stiff integrator."""
     solution = solve_ivp(
         lambda _, v: (drive - law(v)) / inertia,
@@ -252,10 +273,18 @@ def exact_velocity(law: Callable[[np.ndarray], np.ndarray], inertia: float, driv
     ("effect", "inertia", "drive", "speed"),
     [(TABLE_1, 0.1, 0.8, 0.5), (HARMONIC_DRIVE, 0.05, 60.0, 3.0)],
 )
-def test_moving_joint_converges_under_step_halving(tmp_path: Path, effect: JointTorqueEffect, inertia: float, drive: float, speed: float):
-    wheels = [Wheel(tmp_path, [effect], drive, inertia=inertia, time_step=h) for h in (H, H / 2, H / 4)]
+def test_moving_joint_converges_under_step_halving(
+    tmp_path: Path,
+    effect: JointTorqueEffect,
+    inertia: float,
+    drive: float,
+    speed: float,
+):
+    steps = (H, H / 2, H / 4)
+    wheels = [Wheel(tmp_path, [effect], drive, inertia=inertia, time_step=h) for h in steps]
     law = wheels[0].law.effects[0]
-    truth = exact_velocity(lambda v: law.torque_and_slope(JointMotion(v))[0], inertia, drive, speed, 0.02)
+    motion = (inertia, drive, speed, 0.02)
+    truth = exact_velocity(lambda v: law.torque_and_slope(JointMotion(v))[0], *motion)
     errors = [abs(wheel.run(speed, 0.02)["velocity"][-2] - truth) for wheel in wheels]
     assert errors[1] < 0.65 * errors[0]
     assert errors[2] < 0.65 * errors[1]
@@ -264,7 +293,7 @@ def test_moving_joint_converges_under_step_halving(tmp_path: Path, effect: Joint
 
 @pytest.mark.parametrize("time_step", [2e-3, 1e-3, 5e-4])
 def test_stiff_joint_comes_to_rest_without_ringing(tmp_path: Path, time_step: float):
-    """Slope times step over inertia is 100 at 1 ms; an explicit torque would throw the joint about."""
+    """Slope times step over inertia is 100 at 1 ms: an explicit torque would throw it about."""
     wheel = Wheel(tmp_path, [HARMONIC_DRIVE], 30.0, time_step=time_step)
     found = wheel.run(2.0, 0.4)
     assert np.ptp(found["velocity"][-20:]) < 1e-6
@@ -280,7 +309,7 @@ def test_stiff_joint_at_rest_stays_at_rest(tmp_path: Path, time_step: float):
 
 
 def test_links_get_what_the_motor_gives_less_the_loss(tmp_path: Path):
-    """Angular momentum, with several clamps and a rotor in one joint: neither the inertia nor the loss is counted twice."""
+    """Angular momentum, with several clamps and a rotor in one joint: nothing is counted twice."""
     wheel = Wheel(tmp_path, [TABLE_1, HARMONIC_DRIVE], swing(60.0), rotor_inertia=0.3)
     assert wheel.law.torque.has_clamp.sum() > 2
     found = wheel.run(0.5, 0.5)
@@ -290,7 +319,11 @@ def test_links_get_what_the_motor_gives_less_the_loss(tmp_path: Path):
 
 @pytest.mark.parametrize("displacement", [2e-4, 5e-3])
 @pytest.mark.parametrize("time_step", [2e-3, 1e-3, 5e-4])
-def test_bristles_hold_a_joint_without_ringing(tmp_path: Path, time_step: float, displacement: float):
+def test_bristles_hold_a_joint_without_ringing(
+    tmp_path: Path,
+    time_step: float,
+    displacement: float,
+):
     """40 Nm over 0.2 mrad is a spring that is stiffer than a plant step can follow."""
     effect = PreslidingHysteresis(coulomb={"all": 40.0}, displacement={"all": displacement})
     ramp = PiecewisePolynomial.FirstOrderHold([0.0, 1.0, 2.0], np.array([[0.0, 30.0, 30.0]]))
@@ -316,7 +349,7 @@ def test_motor_crosses_the_gap_before_the_link_feels_it(tmp_path: Path):
 
 
 def test_directional_friction_alone_stays_bounded(tmp_path: Path):
-    """It drives the joint one way, up to its own size, and the step has more than one solution there."""
+    """It drives the joint one way, up to its own size; a step has more than one solution there."""
     effect = DirectionalFriction(asymmetry={"all": -5.0}, transition={"all": 1e-3})
     found = Wheel(tmp_path, [effect], 1.0).run(0.0, 0.1)
     assert np.abs(found["loss"]).max() < 5.0 + 1e-9
@@ -345,5 +378,7 @@ def test_a_law_over_time_is_the_sum_of_its_effects():
     effects = [PreslidingHysteresis(coulomb={"all": 2.0}).resolve(names), TABLE_1.resolve(names)]
     velocity = np.sin(np.linspace(0, 9, 400))[:, None]
     motion = JointMotion(velocity, time=np.arange(400)[:, None] * H, time_step=H)
-    parts = [np.einsum("pn,pNn->Nn", e.linear, basis_over_time(e.effect, motion, e.nonlinear)) for e in effects]
+    bases = [basis_over_time(effect.effect, motion, effect.nonlinear) for effect in effects]
+    pairs = zip(effects, bases, strict=True)
+    parts = [np.einsum("pn,pNn->Nn", effect.linear, basis) for effect, basis in pairs]
     np.testing.assert_allclose(law_over_time(effects, motion), sum(parts), rtol=1e-12)

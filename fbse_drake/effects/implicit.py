@@ -18,8 +18,8 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque, Ri
 from fbse_drake.robot.implicit import ImplicitTorque
 
 # By the number of straight pieces that come closest to tanh(x) for x > 0: by what share of it they
-# are off at most, and their corners x. They are as much above it at every corner but the last, where
-# they reach 1.
+# are off at most, and their corners x. They are as much above it at every corner but the last,
+# where they reach 1.
 _CORNERS = {
     1: (0.1869, (1.2299,)),
     2: (0.0582, (0.6163, 1.7832)),
@@ -114,7 +114,8 @@ def implicit_law(effects: Sequence[ResolvedJointTorque], planned: JointMotion) -
             they get: velocity, position and load (N, n), time (N, 1), the plant's step.
     """
     n = planned.velocity.shape[1]
-    typical = JointMotion(np.sqrt(np.mean(planned.velocity**2, axis=0)), time_step=planned.time_step)
+    speed = np.sqrt(np.mean(planned.velocity**2, axis=0))
+    typical = JointMotion(speed, time_step=planned.time_step)
     rises = [effect.effect.rise(effect.linear, effect.nonlinear, typical) for effect in effects]
     damping = sum((rise.damping for rise in rises), np.zeros(n))
     steady = [k for k, effect in enumerate(effects) if effect.effect.of_velocity_alone]
@@ -165,7 +166,9 @@ def _partial(
     at_speed = planned._replace(velocity=np.broadcast_to(speed, planned.velocity.shape))
     torque = effect.torque_and_slope(at_speed)[0]
     strongest = (torque.argmax(axis=0), np.arange(torque.shape[1]))
-    fields = {name: np.broadcast_to(getattr(planned, name), torque.shape)[strongest] for name in ("position", "time", "load")}
+    names = ("position", "time", "load")
+    known = (np.broadcast_to(getattr(planned, name), torque.shape) for name in names)
+    fields = {name: values[strongest] for name, values in zip(names, known, strict=True)}
     law, over_motion = _law(effect, planned._replace(**fields)), effect.torque_and_slope(planned)[0]
     whole = _clamps(law, rise, over_motion)
     moving = partial(
@@ -197,7 +200,10 @@ def _clamps(law: Law, rise: Rise, planned: np.ndarray) -> np.ndarray:
         def of_joint(velocity: np.ndarray, j: int = j) -> np.ndarray:
             return law(np.broadcast_to(velocity[:, None], (len(velocity), n)))[:, j]
 
-        speeds, sharp = (np.array([np.broadcast_to(values, n)[j] for values in kind]) for kind in (rise.speeds, rise.corners))
+        def at_joint(values: tuple[np.ndarray, ...], j: int = j) -> np.ndarray:
+            return np.array([np.broadcast_to(value, n)[j] for value in values])
+
+        speeds, sharp = at_joint(rise.speeds), at_joint(rise.corners)
         columns.append(_joint_clamps(of_joint, speeds, sharp, deviation[j]))
     clamps = np.zeros((3, max(map(len, columns)), n))
     for j, column in enumerate(columns):
@@ -227,7 +233,8 @@ def _joint_clamps(
             break
     both = _pieces(corner, np.minimum(forwards, backwards))
     clamps = [(slope, limit, 0.0) for slope, limit in both]
-    shared = sum((np.minimum(slope * corner, limit) for slope, limit in both), np.zeros_like(corner))
+    pieces = (np.minimum(slope * corner, limit) for slope, limit in both)
+    shared = sum(pieces, np.zeros_like(corner))
     least = _ONE_SIDED * np.max(shared, initial=0.0)
     for sign, side in ((1.0, forwards - shared), (-1.0, backwards - shared)):
         if np.max(side, initial=0.0) > least:

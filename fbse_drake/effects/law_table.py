@@ -1,4 +1,4 @@
-"""Laws of the velocity alone as tables: a compiled look-up costs a tick far less than the law itself."""
+"""Laws of the velocity alone as tables: a look-up costs a tick far less than the law itself."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 
 
 class LawTable(NamedTuple):
-    """Torque loss of each of n joints over its velocity, with cubic pieces between 2 K + 1 velocities
+    """Torque loss of each of n joints over its velocity: cubic pieces between 2 K + 1 velocities
     unit * sinh(k * rate), k = -K ... K, that lie densely about zero; straight beyond."""
 
     # Shape (n,) [rad/s], [1].

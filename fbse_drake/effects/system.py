@@ -21,8 +21,8 @@ from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
 
-# Share of the last step's change of velocity that is expected of the next: smooth motion would go on
-# with all of it, a joint that is stopped by a contact with none.
+# Share of the last step's change of velocity that is expected of the next: smooth motion would go
+# on with all of it, a joint that is stopped by a contact with none.
 _CARRIED_ON = 0.5
 # A velocity that goes to and fro is followed by this share: what is left to be explicit of a law
 # that is steep for the step would else ring.
@@ -83,8 +83,8 @@ def _loss(
 
 @njit(cache=True)
 def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
-    """Fills velocities and positions of a tick; returns the velocities that are expected at the next
-    one, (n,) [rad/s]."""
+    """Fills velocities and positions of a tick; returns the velocities that are expected at the
+    next one, (n,) [rad/s]."""
     n, now, before = len(joint_state) // 2, tick.memory, last.memory
     now[_POSITION], now[_VELOCITY] = joint_state[:n], joint_state[n:]
     now[_EXPECTED], now[_CHANGE] = joint_state[n:], 0.0
@@ -107,7 +107,7 @@ def _finish(
     offset: np.ndarray,
     solver: _Solver,
 ) -> None:
-    """Fills the force of a tick: law (n,) [Nm] less what the solver takes at the same velocities."""
+    """Fills the force of a tick: law (n,) [Nm] less what the solver takes at these velocities."""
     solved = implicit_loss(expected, solver.damping, solver.slope, solver.limit, offset)
     tick.memory[_EXPLICIT] = torque - solved
     tick.force[:] = 0.0
@@ -267,7 +267,7 @@ class JointTorqueEffects(Diagram):
 
     Inputs are those of `ExplicitTorque`. `torque_loss` (n,) [Nm] is that of the plant step that
     ended (zero before the first). `explicit_force` goes to the plant's applied generalized force;
-    `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm]; without clamps it is not there.
+    `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm], where any has one.
     """
 
     def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
