@@ -260,6 +260,11 @@ class Scenario:
             raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:
             raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
+        approximation = self.plant.discrete_contact_approximation
+        if approximation == "tamsi":
+            allowed = "sap, similar or lagged, which solve joint friction too"
+            key = "plant.discrete_contact_approximation"
+            raise InputError(f"{key}: expected {allowed}; found {approximation}")
         # Frozen from here on: nobody has seen it yet.
         usual = self.usual_period
         object.__setattr__(self, "control", _with_period(self.control, usual))

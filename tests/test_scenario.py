@@ -177,3 +177,8 @@ def test_plants_step_can_be_chosen_alone(time_step: float):
     assert log.meta["outcome"]["finished"]
     np.testing.assert_allclose(np.diff(log.time), max(time_step, 0.001), rtol=1e-9)
     assert np.isfinite(log["estimate/joint/friction_torque"]).all()
+
+
+def test_a_solver_that_leaves_out_friction_is_refused():
+    with pytest.raises(InputError, match="expected sap, similar or lagged, which solve joint"):
+        load_scenario("squat", overrides=["plant.discrete_contact_approximation=tamsi"])
