@@ -482,7 +482,7 @@ def friction_errors(log: Log) -> Figure:
 def friction_over_velocity(log: Log) -> Figure:
     """Friction torque, estimated and true as far as known, against joint velocity, a panel for the joints that the sides have in common.
 
-    Estimates are those of the step that began with the velocity.
+    The torque of each step against the velocity at its end, on which its law depends.
     """
     rows = _joint_rows(log)
     columns = min(3, len(rows))
@@ -492,9 +492,10 @@ def friction_over_velocity(log: Log) -> Figure:
         axes.set_axis_off()
     velocity = log["truth/joint/velocity" if "truth/joint/velocity" in log else "joint/velocity"]
     truth = log.get("truth/joint/friction_torque")
+    if truth is not None:
+        # No step ends in the first row.
+        truth = np.concatenate([truth[:1], truth[:-1]])
     estimate = log.get("estimate/joint/friction_torque")
-    if estimate is not None:
-        estimate = np.concatenate([estimate[1:], estimate[-1:]])
     for axes, (role, joints) in zip(grid.flat, rows.items(), strict=False):
         decorate(axes)
         axes.locator_params(axis="x", nbins=5)
