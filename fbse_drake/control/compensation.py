@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
+from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.description import RobotDescription
 
@@ -31,11 +32,15 @@ class NoCompensation:
 
 @dataclass(frozen=True)
 class IntegralCompensation:
-    """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor): the estimate through a low-pass of bandwidth k_i."""
+    """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor).
+
+    That is the estimate through a low-pass of bandwidth k_i.
+    """
 
     uses_estimate: ClassVar[bool] = True
 
-    # Integral gain by joint [rad/s]; the paper has 1 in the hip pitch, 4 in the ankle roll and 2 elsewhere.
+    # Integral gain by joint [rad/s]; the paper has 1 in the hip pitch, 4 in the ankle roll and 2
+    # elsewhere.
     gain: dict[str, float] = field(default_factory=lambda: {"all": 2.0})
 
     def __post_init__(self) -> None:
@@ -56,7 +61,8 @@ class FeedforwardCompensation:
 
     # Cut-off of the low-pass of first order [Hz].
     cutoff: float = 20.0
-    # Share of the estimate that is compensated. Friction also damps; all of it is only cancelled where the position loop damps by itself.
+    # Share of the estimate that is compensated. Friction also damps; all of it is only cancelled
+    # where the position loop damps by itself.
     share: float = 1.0
     # Largest torque in either direction [Nm].
     limit: float = 50.0
@@ -76,7 +82,9 @@ CompensationConfig = NoCompensation | IntegralCompensation | FeedforwardCompensa
 
 
 class FrictionCompensation(RecursiveEstimator):
-    """Torque that compensates an estimated friction: the estimate through a low-pass of first order for each joint.
+    """Torque that compensates an estimated friction.
+
+    It is the estimate through a low-pass of first order for each joint.
 
     .. pydrake_system::
 
@@ -85,22 +93,32 @@ class FrictionCompensation(RecursiveEstimator):
         - friction_estimate
         output_ports:
         - posterior
+        - (one for each field)
 
-    `friction_estimate` (n,) [Nm]; field `torque` (n,) [Nm] is what is added to the command. (It has no status.)
+    `friction_estimate` (n,) [Nm]; field `torque` (n,) [Nm] is what is added to the command. (It has
+    no status.)
     """
 
-    def __init__(self, config: IntegralCompensation | FeedforwardCompensation, names: RobotDescription, clock: Clock):
+    def __init__(
+        self,
+        config: IntegralCompensation | FeedforwardCompensation,
+        names: RobotDescription,
+        clock: Clock,
+    ):
         """Raises InputError for an unknown joint, or one without a gain."""
         n = len(names.joint_names)
-        super().__init__({"torque": n}, clock)
+        super().__init__(record_type(time=(), torque=(n,)), clock)
         self._rate, self._share, self._limit = config.low_pass(names)
         self._estimate = self.DeclareVectorInputPort("friction_estimate", n)
         self._declare_posterior("friction_estimate")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
-        posterior[:] = last
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         if math.isnan(elapsed):
+            posterior[...] = last
             return
-        wanted = np.minimum(np.maximum(self._share * self._estimate.Eval(context), -self._limit), self._limit)
+        wanted = np.maximum(self._share * self._estimate.Eval(context), -self._limit)
+        wanted = np.minimum(wanted, self._limit)
         keep = np.exp(-self._rate * elapsed)
-        posterior[1:] = keep * last[1:] + (1 - keep) * wanted
+        posterior["torque"] = keep * last["torque"] + (1 - keep) * wanted

@@ -1,18 +1,21 @@
-"""Base attitude from the IMU: a Kalman filter for gravity feeds an extended Kalman filter on the quaternion (paper Sec. 3, Fig. 2)."""
+"""Base attitude from the IMU (paper Sec. 3, Fig. 2).
+
+A Kalman filter for gravity feeds an extended Kalman filter on the quaternion.
+"""
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, Status, starts
+from fbse_drake.estimators.records import record, record_type
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import (
     Quaternion,
     Vector,
@@ -20,16 +23,17 @@ from fbse_drake.estimators.spatial import (
     cross,
     normalized,
     put,
+    quaternion,
     quaternion_from_gravity,
     quaternion_product,
     rotate,
     rotate_back,
-    rotation_at,
+    rotation,
     rotation_matrix,
     rotation_vector_to_quaternion,
     scale,
     subtract,
-    vector_at,
+    vector,
     yaw_of,
 )
 from fbse_drake.robot.plant import Robot
@@ -57,8 +61,8 @@ class AttitudeConfig:
     standing_time: float = 0.05
     standing_acceleration: float = 0.1
     standing_rate: float = 3.0e-3
-    # How level the sole of a standing foot is (standard deviation [rad]): the legs then tell the tilt as well, on level ground. 0 does not
-    # use them, as the paper.
+    # How level the sole of a standing foot is (standard deviation [rad]): the legs then tell the
+    # tilt as well, on level ground. 0 does not use them, as the paper.
     level_feet: float = 2.0e-3
     # How long a foot keeps its error [s].
     stance_time: float = 0.5
@@ -215,37 +219,36 @@ def stand_still(
 
 
 @njit(cache=True)
-def level_direction(support: np.ndarray, model: np.ndarray, foot_rotation: int) -> tuple[Vector, float]:
-    """Vertical direction in base axes by the soles that stand, of any length, and how many they are.
+def level_direction(support: np.ndarray, foot_rotation: np.ndarray) -> tuple[Vector, float]:
+    """Vertical direction in base axes by the soles that stand, of any length, and their number.
 
     Args:
         support: (feet,).
-        model: posterior of `FloatingBaseModel`; foot_rotation: where in it.
+        foot_rotation: R_BF of each sole, (feet, 3, 3).
     """
     up, standing = (0.0, 0.0, 0.0), 0.0
     for foot in range(len(support)):
-        R = foot_rotation + 9 * foot
-        up = add(up, scale(support[foot], (model[R + 2], model[R + 5], model[R + 8])))
+        R = foot_rotation[foot]
+        up = add(up, scale(support[foot], (R[0, 2], R[1, 2], R[2, 2])))
         standing += support[foot]
     return up, standing
 
 
 @njit(cache=True)
-def _unpack(last: np.ndarray, start: int) -> tuple[GravityEstimate, QuaternionEstimate]:
-    """Both filters' states from a posterior, whose `imu_orientation` starts there."""
-    gravity, q = start + 4, start
-    P = start + 16
+def _filters(last: np.ndarray) -> tuple[GravityEstimate, QuaternionEstimate]:
+    """Both filters' states from the record of a posterior."""
+    g, q = last.covariance.gravity, last.covariance.quaternion
     return GravityEstimate(
-        vector_at(last, gravity),
-        vector_at(last, gravity + 3),
-        vector_at(last, gravity + 6),
-        (last[P], last[P + 1], last[P + 2], last[P + 3], last[P + 4], last[P + 5]),
+        vector(last.gravity),
+        vector(last.acceleration),
+        vector(last.acceleration_bias),
+        (g.gg, g.ga, g.gb, g.aa, g.ab, g.bb),
         (0.0, 0.0, 0.0),
         0.0,
     ), QuaternionEstimate(
-        (last[q], last[q + 1], last[q + 2], last[q + 3]),
-        vector_at(last, gravity + 9),
-        (last[P + 6], last[P + 7], last[P + 8]),
+        quaternion(last.imu_orientation),
+        vector(last.angular_velocity_bias),
+        (q.pp, q.pb, q.bb),
         (0.0, 0.0, 0.0),
         0.0,
     )
@@ -258,105 +261,108 @@ def _estimate_attitude(
     elapsed: float,
     measured: np.ndarray,
     model: np.ndarray,
-    places: np.ndarray,
-    frames: np.ndarray,
-    config: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """One tick of `AttitudeEstimator`; fills the posterior.
 
     Args:
-        places: of what is read, see the first lines.
-        frames: rotation of the IMU, and the quaternion of the base in its axes.
-        config: the values of `AttitudeConfig`.
+        known: record with the values of `AttitudeConfig`, the rotation of the IMU, and the
+            quaternion of the base in its axes.
     """
-    imu_trust, support_start, support_stop, specific_force, angular_velocity, foot_rotation, age_at, filters_at = to_fixed_tuple(places, 8)
-    (
-        acceleration_noise,
-        rate_noise,
-        motion_acceleration,
-        motion_time,
-        acceleration_bias,
-        rate_bias,
-        standing_time,
-        standing_acceleration,
-        standing_rate,
-        level_feet,
-        stance_time,
-    ) = to_fixed_tuple(config, 11)
-    R_BI, q_IB = rotation_at(frames, 0), to_fixed_tuple(frames[9:], 4)
-    first, trust = math.isnan(elapsed), measured[imu_trust]
-    f, w = vector_at(measured, specific_force), vector_at(measured, angular_velocity)
-    age = 0.0 if first else last[age_at] + elapsed
+    if math.isnan(elapsed) and measured[()].trust[1] > 0:
+        posterior[()] = last[()]
+        posterior[()].status = _NOT_FINITE
+        return
+    posterior, last, known = posterior[()], last[()], known[()]
+    measured, model = measured[()], model[()]
+    config, R_BI, q_IB = known.config, rotation(known.R_BI), quaternion(known.q_IB)
+    motion_time, rate_noise = config.motion_time, config.angular_velocity_noise
+    acceleration_noise = config.acceleration_noise
+    first, trust = math.isnan(elapsed), measured.trust[1]
+    f, w = vector(measured.specific_force), vector(measured.angular_velocity)
+    age = 0.0 if first else last.age + elapsed
     feet_innovation, feet_variance = (0.0, 0.0, 0.0), 0.0
     if first:
-        if trust > 0:
-            posterior[:] = last
-            posterior[STATUS] = _NOT_FINITE
-            return
-        gravity = start_gravity(f, standing_acceleration**2, acceleration_bias**2, acceleration_noise**2)
-        q = quaternion_from_gravity(gravity.gravity, 0.0)
+        x = start_gravity(
+            f,
+            config.standing_acceleration**2,
+            config.acceleration_bias**2,
+            acceleration_noise**2,
+        )
+        q = quaternion_from_gravity(x.gravity, 0.0)
         # The base looks ahead, however the IMU sits on it.
-        q = quaternion_product(rotation_vector_to_quaternion((0.0, 0.0, -yaw_of(quaternion_product(q, q_IB)))), q)
-        tilt_variance = gravity.covariance[0] / 9.81**2
-        quaternion = QuaternionEstimate(q, (0.0, 0.0, 0.0), (tilt_variance, 0.0, rate_bias**2), (0.0, 0.0, 0.0), 0.0)
+        yaw = yaw_of(quaternion_product(q, q_IB))
+        q = quaternion_product(rotation_vector_to_quaternion((0.0, 0.0, -yaw)), q)
+        tilt_variance = x.covariance[0] / 9.81**2
+        P = (tilt_variance, 0.0, config.angular_velocity_bias**2)
+        y = QuaternionEstimate(q, (0.0, 0.0, 0.0), P, (0.0, 0.0, 0.0), 0.0)
     else:
-        gravity, quaternion = _unpack(last, filters_at)
+        x, y = _filters(last)
         if trust > 0:
             # Nobody knows how the robot turns: hold, and let the next good readings have their way.
             drift = (_UNKNOWN_RATE * elapsed) ** 2
-            gg, ga, gb, aa, ab, bb = gravity.covariance
-            gravity = GravityEstimate(
-                gravity.gravity, gravity.acceleration, gravity.bias, (gg + 9.81**2 * drift, ga, gb, aa, ab, bb), (0.0, 0.0, 0.0), 0.0
+            gg, ga, gb, aa, ab, bb = x.covariance
+            P_gravity = (gg + 9.81**2 * drift, ga, gb, aa, ab, bb)
+            x = GravityEstimate(
+                x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0
             )
-            pp, pb, bb = quaternion.covariance
-            quaternion = QuaternionEstimate(quaternion.q, quaternion.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
-            w = quaternion.bias
+            pp, pb, bb = y.covariance
+            y = QuaternionEstimate(y.q, y.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
+            w = y.bias
         else:
-            standing = age <= standing_time
+            standing = age <= config.standing_time
             # An unknown gyro bias turns gravity the same way for as long as the filter remembers.
-            rate_variance = rate_noise**2 + quaternion.covariance[2] * 2.0 * motion_time / elapsed
-            motion = standing_acceleration if standing else motion_acceleration
-            gravity = predict_gravity(gravity, subtract(w, quaternion.bias), rate_variance, motion, motion_time, elapsed)
-            gravity = update_gravity(gravity, f, acceleration_noise**2)
-            tilt_variance = gravity.covariance[0] / 9.81**2
-            quaternion = predict_quaternion(quaternion, w, rate_noise**2, elapsed)
-            by_gravity = quaternion_from_gravity(gravity.gravity, yaw_of(quaternion.q))
-            up_B, soles = level_direction(measured[support_start:support_stop], model, foot_rotation)
+            rate_variance = rate_noise**2 + y.covariance[2] * 2.0 * motion_time / elapsed
+            motion = config.standing_acceleration if standing else config.motion_acceleration
+            w_free = subtract(w, y.bias)
+            x = predict_gravity(x, w_free, rate_variance, motion, motion_time, elapsed)
+            x = update_gravity(x, f, acceleration_noise**2)
+            tilt_variance = x.covariance[0] / 9.81**2
+            y = predict_quaternion(y, w, rate_noise**2, elapsed)
+            by_gravity = quaternion_from_gravity(x.gravity, yaw_of(y.q))
+            up_B, soles = level_direction(measured.support, model.foot_rotation)
             up_I = rotate_back(R_BI, up_B)
-            use_feet = level_feet > 0 and soles > 0
-            level_variance = level_feet**2 / max(1.0, soles)
+            use_feet = config.level_feet > 0 and soles > 0
+            level_variance = config.level_feet**2 / max(1.0, soles)
             if standing:
                 measured_q, variance = by_gravity, tilt_variance
                 if use_feet:
-                    measured_q, variance = quaternion_from_gravity(up_I, yaw_of(quaternion.q)), level_variance
-                own_rate_variance = standing_time / elapsed * standing_rate**2
-                quaternion = stand_still(quaternion, measured_q, variance, w, rate_noise**2, own_rate_variance)
+                    measured_q = quaternion_from_gravity(up_I, yaw_of(y.q))
+                    variance = level_variance
+                own_rate_variance = config.standing_time / elapsed * config.standing_rate**2
+                y = stand_still(y, measured_q, variance, w, rate_noise**2, own_rate_variance)
             else:
                 # The gravity filter's error lasts about as long as the trunk's acceleration.
-                quaternion = update_quaternion(quaternion, by_gravity, tilt_variance, 2.0 * motion_time / elapsed)
+                y = update_quaternion(y, by_gravity, tilt_variance, 2.0 * motion_time / elapsed)
                 if use_feet:
-                    by_feet = quaternion_from_gravity(up_I, yaw_of(quaternion.q))
-                    x = update_quaternion(quaternion, by_feet, level_variance, 2.0 * stance_time / elapsed)
-                    feet_innovation, feet_variance = x.innovation, x.innovation_variance
-                    quaternion = QuaternionEstimate(x.q, x.bias, x.covariance, quaternion.innovation, quaternion.innovation_variance)
-    # Field by field in the posterior's order, behind its time.
-    q_WB = quaternion_product(quaternion.q, q_IB)
-    posterior[STATUS] = trust
-    end = put(posterior, STATUS + 1, q_WB)
-    end = put(posterior, end, rotation_matrix(q_WB))
-    end = put(posterior, end, rotate(R_BI, subtract(w, quaternion.bias)))
-    end = put(posterior, end, (age,))
-    end = put(posterior, end, quaternion.q)
-    end = put(posterior, end, gravity.gravity)
-    end = put(posterior, end, gravity.acceleration)
-    end = put(posterior, end, gravity.bias)
-    end = put(posterior, end, quaternion.bias)
-    end = put(posterior, end, gravity.covariance)
-    end = put(posterior, end, quaternion.covariance)
-    end = put(posterior, end, gravity.innovation)
-    end = put(posterior, end, quaternion.innovation)
-    end = put(posterior, end, feet_innovation)
-    put(posterior, end, (gravity.innovation_variance, quaternion.innovation_variance, feet_variance))
+                    by_feet = quaternion_from_gravity(up_I, yaw_of(y.q))
+                    z = update_quaternion(
+                        y, by_feet, level_variance, 2.0 * config.stance_time / elapsed
+                    )
+                    feet_innovation, feet_variance = z.innovation, z.innovation_variance
+                    y = QuaternionEstimate(
+                        z.q, z.bias, z.covariance, y.innovation, y.innovation_variance
+                    )
+    q_WB = quaternion_product(y.q, q_IB)
+    posterior.status = trust
+    put(posterior.orientation, q_WB)
+    put(posterior.rotation, rotation_matrix(q_WB))
+    put(posterior.angular_velocity, rotate(R_BI, subtract(w, y.bias)))
+    posterior.age = age
+    put(posterior.imu_orientation, y.q)
+    put(posterior.gravity, x.gravity)
+    put(posterior.acceleration, x.acceleration)
+    put(posterior.acceleration_bias, x.bias)
+    put(posterior.angular_velocity_bias, y.bias)
+    g, q_P = posterior.covariance.gravity, posterior.covariance.quaternion
+    g.gg, g.ga, g.gb, g.aa, g.ab, g.bb = x.covariance
+    q_P.pp, q_P.pb, q_P.bb = y.covariance
+    put(posterior.innovation.gravity, x.innovation)
+    put(posterior.innovation.quaternion, y.innovation)
+    put(posterior.innovation.feet, feet_innovation)
+    posterior.innovation_variance.gravity = x.innovation_variance
+    posterior.innovation_variance.quaternion = y.innovation_variance
+    posterior.innovation_variance.feet = feet_variance
 
 
 class AttitudeEstimator(RecursiveEstimator):
@@ -370,55 +376,70 @@ class AttitudeEstimator(RecursiveEstimator):
         - model
         output_ports:
         - posterior
+        - (one for each field)
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. Fields of the posterior:
 
-        orientation            (4,)  quaternion [w, x, y, z] of the base in the world (eq. 6); its sign never jumps
-        rotation               (9,)  R_WB, row by row
-        angular_velocity       (3,)  of the base in base axes, free of the estimated gyro bias [rad/s]
-        gravity, acceleration, acceleration_bias, angular_velocity_bias   (3,) each, in IMU axes [m/s^2, rad/s]
-        covariance             (9,)  gravity filter (6) and quaternion filter (3) per axis, see `GravityEstimate`, `QuaternionEstimate`
-        innovation, innovation_variance   of gravity filter, quaternion filter, and quaternion filter from the feet, (9,) and (3,)
+        orientation           (4,)    quaternion [w, x, y, z] of the base in the world (eq. 6); its
+                                      sign never jumps
+        rotation              (3, 3)  R_WB
+        angular_velocity      (3,)    of the base in base axes, free of the estimated gyro bias
+                                      [rad/s]
+        age                   ()      since the first tick [s]
+        imu_orientation       (4,)    quaternion of the IMU in the world
+        gravity, acceleration, acceleration_bias, angular_velocity_bias
+                              (3,)    each, in IMU axes [m/s^2, rad/s]
+        covariance                    `gravity` gg ... bb and `quaternion` pp, pb, bb, per axis, see
+                                      `GravityEstimate`, `QuaternionEstimate`
+        innovation            (3,)    of the filters for `gravity` and `quaternion`, and of the
+        innovation_variance   ()      latter from the `feet`
 
     Yaw is the gyro's alone: the gravity filter borrows it for its measured quaternion.
     """
 
-    def __init__(self, config: AttitudeConfig, robot: Robot, measurements: dict[str, slice], model: dict[str, slice], clock: Clock):
-        super().__init__(
-            {
-                "status": 1,
-                "orientation": 4,
-                "rotation": 9,
-                "angular_velocity": 3,
-                "age": 1,
-                "imu_orientation": 4,
-                "gravity": 3,
-                "acceleration": 3,
-                "acceleration_bias": 3,
-                "angular_velocity_bias": 3,
-                "covariance": 9,
-                "innovation": 9,
-                "innovation_variance": 3,
-            },
-            clock,
+    def __init__(
+        self,
+        config: AttitudeConfig,
+        robot: Robot,
+        measurements: np.dtype,
+        model: np.dtype,
+        clock: Clock,
+    ):
+        """Declares ports and state.
+
+        Args:
+            measurements, model: types of the inputs' posteriors.
+        """
+        gravity, error = ("gg", "ga", "gb", "aa", "ab", "bb"), ("pp", "pb", "bb")
+        posterior_type = record_type(
+            time=(),
+            status=(),
+            orientation=(4,),
+            rotation=(3, 3),
+            angular_velocity=(3,),
+            age=(),
+            imu_orientation=(4,),
+            gravity=(3,),
+            acceleration=(3,),
+            acceleration_bias=(3,),
+            angular_velocity_bias=(3,),
+            covariance=record_type(
+                gravity=record_type(**dict.fromkeys(gravity, ())),
+                quaternion=record_type(**dict.fromkeys(error, ())),
+            ),
+            innovation=record_type(gravity=(3,), quaternion=(3,), feet=(3,)),
+            innovation_variance=record_type(gravity=(), quaternion=(), feet=()),
         )
-        self._places = np.array(
-            [
-                measurements["trust"].start + 1,
-                measurements["support"].start,
-                measurements["support"].stop,
-                *starts(measurements, "specific_force", "angular_velocity"),
-                *starts(model, "foot_rotation"),
-                *starts(self.fields.slices, "age", "imu_orientation"),
-            ]
-        )
+        super().__init__(posterior_type, clock)
         R_BI = ImuMount(robot).R_BI
-        self._frames = np.concatenate([R_BI.ravel(), RotationMatrix(R_BI.T).ToQuaternion().wxyz()])
-        self._config = np.array(astuple(config), dtype=float)
-        self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
-        self._model = self.DeclareVectorInputPort("model", max(part.stop for part in model.values()))
+        q_IB = RotationMatrix(R_BI.T).ToQuaternion().wxyz()
+        self._known = record(config=config, R_BI=R_BI, q_IB=q_IB)
+        self._measurements = self._declare_record_input("measurements", measurements)
+        self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
-        _estimate_attitude(posterior, last, elapsed, measured, model, self._places, self._frames, self._config)
+        _estimate_attitude(posterior, last, elapsed, measured, model, self._known)

@@ -25,6 +25,7 @@ from fbse_drake.estimators.friction import (
 )
 from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
 from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+from fbse_drake.estimators.records import parts
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.reference_methods import (
     DisturbanceObserver,
@@ -41,6 +42,7 @@ from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorCon
 from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal
+from fbse_drake.sensors.foot_pads import FootPads
 from fbse_drake.signals import estimates
 from fbse_drake.walking.plan import TaskPlan
 
@@ -105,7 +107,7 @@ class EstimatorDiagram(Diagram):
             self._feed(friction, "measured_torque", "torque_command")
         elif isinstance(config, FixedFriction):
             self._add_monitor(SensorMonitorConfig(), MeasuredSupport(), robot, clock)
-            friction = self._add("friction", FixedFrictionModel(config, robot, self._parts("sensor_monitor"), clock))
+            friction = self._add("friction", FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock))
             self._join(friction, measurements="sensor_monitor")
         elif isinstance(config, DisturbanceObserver):
             friction = self._add_momentum_observer(config, robot, clock, plan)
@@ -119,7 +121,7 @@ class EstimatorDiagram(Diagram):
 
     def _add_fbse(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
         self._add_base(config, robot, clock, plan)
-        measurements, attitude, model = (self._parts(name) for name in ("sensor_monitor", "attitude", "model"))
+        measurements, attitude, model = (self._type(name) for name in ("sensor_monitor", "attitude", "model"))
         acceleration = self._add(
             "joint_acceleration",
             JointAccelerationEstimator(config.joint_acceleration, robot, measurements, attitude, model, clock),
@@ -127,19 +129,19 @@ class EstimatorDiagram(Diagram):
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
         self._connect_model_at_start(acceleration)
         link_torque = self._add(
-            "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._parts("joint_acceleration"), clock)
+            "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._type("joint_acceleration"), clock)
         )
         self._join(link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration")
         self._connect_model_at_start(link_torque)
         self._feed(link_torque, "torque_command")
         kind = ModelAidedEstimator if isinstance(config.friction, ModelAided) else RecursiveLeastSquaresEstimator
-        friction = self._add("friction", kind(config.friction, robot, measurements, self._parts("link_torque"), clock))
+        friction = self._add("friction", kind(config.friction, robot, measurements, self._type("link_torque"), clock))
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
         return friction
 
     def _add_momentum_observer(self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
         self._add_base(Fbse(), robot, clock, plan)
-        parts = [self._parts(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
+        parts = [self._type(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
         friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
         self._join(friction, measurements="sensor_monitor", attitude="attitude", base_state="base_state", model="model")
         self._connect_model_at_start(friction)
@@ -151,7 +153,7 @@ class EstimatorDiagram(Diagram):
         if not robot.has_floating_base or not robot.description.legs:
             raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
-        measurements = self._parts("sensor_monitor")
+        measurements = self._type("sensor_monitor")
         model = self._add("model", FloatingBaseModel(robot, measurements, clock))
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
@@ -161,10 +163,10 @@ class EstimatorDiagram(Diagram):
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
             source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
             self._builder.Connect(source.get_output_port(), self._systems["sensor_monitor"].GetInputPort("planned_support"))
-        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._parts("model"), clock))
+        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock))
         self._join(attitude, measurements="sensor_monitor", model="model")
         middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
-        shared = (robot, measurements, self._parts("attitude"), self._parts("model"), clock, (float(middle[0]), float(middle[1])))
+        shared = (robot, measurements, self._type("attitude"), self._type("model"), clock, (float(middle[0]), float(middle[1])))
         base_state: BaseStateEstimator
         if isinstance(config.base_state, AdaptiveLipm):
             base_state = AdaptiveLipmEstimator(config.base_state, *shared)
@@ -175,8 +177,12 @@ class EstimatorDiagram(Diagram):
 
     def _add_monitor(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock) -> None:
         monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
-        pad_force = monitor.fields.sizes["pad_force"]
-        sizes = {"measured_joint_state": 2 * len(robot.joint_names), "measured_imu": 6, "measured_pad_force": pad_force}
+        joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
+        sizes = {
+            "measured_joint_state": 2 * joints,
+            "measured_imu": 6,
+            "measured_pad_force": 3 * pads,
+        }
         sensors = self._builder.AddNamedSystem("sensors", Multiplexer(list(sizes.values())))
         self._builder.Connect(sensors.get_output_port(), monitor.GetInputPort("sensors"))
         for i, port in enumerate(sizes):
@@ -186,8 +192,8 @@ class EstimatorDiagram(Diagram):
         self._systems[name] = self._builder.AddNamedSystem(name, system)
         return system
 
-    def _parts(self, name: str) -> dict[str, slice]:
-        return self._systems[name].fields.slices
+    def _type(self, name: str) -> np.dtype:
+        return self._systems[name].posterior_type
 
     def _join(self, system: RecursiveEstimator, **sources: str) -> None:
         """Connects the posteriors of estimators to input ports of these names."""
@@ -204,21 +210,28 @@ class EstimatorDiagram(Diagram):
 
     def _field_port(self, system: str, name: str) -> OutputPort:
         """The output port of one field of a posterior."""
-        # A machine without feet has no field for them.
-        sizes = {field: size for field, size in self._systems[system].fields.sizes.items() if size > 0}
+        sizes = self._sizes(system)
         if system not in self._split:
-            split = self._builder.AddNamedSystem(f"{system}_fields", Demultiplexer(list(sizes.values())))
-            self._builder.Connect(self._systems[system].GetOutputPort("posterior"), split.get_input_port())
-            self._split[system] = split
+            # The estimator has such a port itself, which is Python's and costs more.
+            split = Demultiplexer(list(sizes.values()))
+            self._split[system] = self._builder.AddNamedSystem(f"{system}_fields", split)
+            posterior = self._systems[system].GetOutputPort("posterior")
+            self._builder.Connect(posterior, split.get_input_port())
         return self._split[system].get_output_port(list(sizes).index(name))
+
+    def _sizes(self, system: str) -> dict[str, int]:
+        """How many numbers the fields of a posterior have, if any: of a system that is there."""
+        if system not in self._systems:
+            return {}
+        return {name: part.stop - part.start for name, part in parts(self._type(system)).items()}
 
     def _export(self, n: int) -> None:
         self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
         for row in estimates():
-            system, name = row.estimator, row.field
-            size = self._systems[system].fields.sizes.get(name, 0) if system in self._systems else 0
-            if size > 0:
-                self._builder.ExportOutput(self._field_port(system, name), row.port)
+            size = self._sizes(row.estimator).get(row.field)
+            if size is not None:
+                port = self._field_port(row.estimator, row.field)
+                self._builder.ExportOutput(port, row.port)
                 self.channels[row.channel] = row.sample_shape(n, size)
 
 

@@ -1,22 +1,36 @@
 """The equation of motion of the model, seen from its base.
 
-The base stands at the world's origin, upright and without linear velocity, and gravity enters as the specific force that the IMU
-measures. The joint rows of the equation of motion stay the same: they change neither with the attitude and the place of the whole robot nor
-with a constant velocity added to it (Galilean invariance). So neither an error of the estimated attitude nor one of the estimated base
-velocity can spoil the link torque.
+The base stands at the world's origin, upright and without linear velocity, and gravity enters as
+the specific force that the IMU measures. The joint rows of the equation of motion stay the same:
+they change neither with the attitude and the place of the whole robot nor with a constant velocity
+added to it (Galilean invariance). So neither an error of the estimated attitude nor one of the
+estimated base velocity can spoil the link torque.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numba.np.unsafe.ndarray import to_fixed_tuple
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, ValueProducer
 
-from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
-from fbse_drake.estimators.spatial import Rotation, Vector, add, cross, dot, put, rotate, rotation_at, scale, vector_at
+from fbse_drake.estimators.records import record, record_type
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.spatial import (
+    Rotation,
+    Vector,
+    add,
+    cross,
+    dot,
+    put,
+    rotate,
+    rotation,
+    scale,
+    vector,
+)
 from fbse_drake.robot.plant import Robot
 
 _ORIGIN = np.zeros(3)
@@ -32,7 +46,9 @@ class ImuMount:
 
 
 @njit(cache=True)
-def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector) -> Vector:
+def base_specific_force(
+    specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector
+) -> Vector:
     """Specific force of the base's origin in base axes [m/s^2].
 
     Args:
@@ -46,24 +62,23 @@ def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: 
 
 
 @njit(cache=True)
-def _plant_state(
-    state: np.ndarray, measured: np.ndarray, q_index: np.ndarray, v_index: np.ndarray, places: np.ndarray, R_BI: np.ndarray
-) -> bool:
-    """Puts joint angles and velocities and the base's angular velocity into a plant's state, in place; says whether all are finite.
+def _plant_state(state: np.ndarray, measured: np.ndarray, known: np.ndarray) -> bool:
+    """Puts the measured motion into a plant's state, in place; says whether all of it is finite.
 
     Args:
-        state: [positions, velocities] of the plant.
-        q_index: place of each joint's angle in it, shape (n,).
-        v_index: place of each of our velocities [base angular, base linear, joints] in it, shape (6 + n,).
-        places: of what is read, see the first line.
-        R_BI: rotation of the IMU, shape (9,).
+        state: [positions, velocities] of the plant; joint angles and velocities and the base's
+            angular velocity are written.
+        known: record with `q_index` (n,) and `v_index` (6 + n,), places in the state of each
+            joint's angle and each of our velocities [base angular, base linear, joints], and
+            `mount`, see `ImuMount`.
     """
-    joint_position, joint_velocity, angular_velocity = to_fixed_tuple(places, 3)
-    w = rotate(rotation_at(R_BI, 0), vector_at(measured, angular_velocity))
+    measured, known = measured[()], known[()]
+    w = rotate(rotation(known.mount.R_BI), vector(measured.angular_velocity))
     for i in range(3):
-        state[v_index[i]] = w[i]
-    for i in range(len(q_index)):
-        state[q_index[i]], state[v_index[6 + i]] = measured[joint_position + i], measured[joint_velocity + i]
+        state[known.v_index[i]] = w[i]
+    for i in range(len(known.q_index)):
+        state[known.q_index[i]] = measured.joint_position[i]
+        state[known.v_index[6 + i]] = measured.joint_velocity[i]
     return np.isfinite(state).all()
 
 
@@ -74,9 +89,7 @@ def _put_terms(
     M: np.ndarray,
     bias: np.ndarray,
     feet: tuple[tuple[np.ndarray, np.ndarray], ...],
-    order: np.ndarray,
-    v_index: np.ndarray,
-    places: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """Fills a posterior of `FloatingBaseModel` from what Drake says of the plant.
 
@@ -84,44 +97,53 @@ def _put_terms(
         state: [positions, velocities] of the plant.
         M, bias: mass matrix and bias of the whole plant, in its order of velocities.
         feet: Jacobian (6, velocities of the plant) and bias acceleration (6,) of each sole.
-        order: place of each of our velocities in the plant's, shape (6 + n,); v_index: in its state.
-        places: of the fields, see the first line.
+        known: see `_plant_state`; and `order` (6 + n,), place of each of our velocities in the
+            plant's.
     """
-    mass_matrix, bias_at, com, com_velocity, velocity, foot_jacobian, foot_bias, foot_position, foot_rotation = to_fixed_tuple(places, 9)
-    v, posterior[STATUS] = len(order), 0.0
+    posterior, known = posterior[()], known[()]
+    order, velocity = known.order, posterior.velocity
+    v, posterior.status = len(order), 0.0
     for i in range(v):
-        posterior[velocity + i] = state[v_index[i]]
+        velocity[i] = state[known.v_index[i]]
     for i in range(6, v):
-        row = mass_matrix + (i - 6) * v
         for j in range(v):
-            posterior[row + j] = M[order[i], order[j]]
-        posterior[bias_at + i - 6] = bias[order[i]]
+            posterior.mass_matrix[i - 6, j] = M[order[i], order[j]]
+        posterior.bias[i - 6] = bias[order[i]]
     # The base's block of H is [[I, m [c]x], [-m [c]x, m]], for the base stands upright.
     x, y, z, mass = order[0], order[1], order[2], M[order[3], order[3]]
-    put(posterior, com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
+    put(posterior.com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
     # Its rows of linear velocity give the momentum.
     for i in range(3):
-        posterior[com_velocity + i] = 0.0
+        posterior.com_velocity[i] = 0.0
         for j in range(v):
-            posterior[com_velocity + i] += M[order[3 + i], order[j]] * posterior[velocity + j] / mass
+            posterior.com_velocity[i] += M[order[3 + i], order[j]] * velocity[j] / mass
     for foot in range(len(feet)):
         J, acceleration = feet[foot]
         for i in range(6):
-            row = foot_jacobian + (6 * foot + i) * v
             for j in range(v):
-                posterior[row + j] = J[i, order[j]]
-            posterior[foot_bias + 6 * foot + i] = acceleration[i]
-        # The base's columns of J hold the foot's pose: in the rows of linear velocity they are [-R_FB [p_BF]x, R_FB].
-        R_BF = posterior[foot_rotation + 9 * foot : foot_rotation + 9 * foot + 9].reshape(3, 3)
+                posterior.foot_jacobian[foot, i, j] = J[i, order[j]]
+            posterior.foot_bias[foot, i] = acceleration[i]
+        # The base's columns of J hold the foot's pose: in the rows of linear velocity they are
+        # [-R_FB [p_BF]x, R_FB].
+        R_BF, p = posterior.foot_rotation[foot], posterior.foot_position[foot]
         for i in range(3):
             for j in range(3):
                 R_BF[j, i] = J[3 + i, order[3 + j]]
-        p = posterior[foot_position + 3 * foot :]
         p[0] = p[1] = p[2] = 0.0
         for k in range(3):
             p[0] -= R_BF[2, k] * J[3 + k, y]
             p[1] -= R_BF[0, k] * J[3 + k, z]
             p[2] -= R_BF[1, k] * J[3 + k, x]
+
+
+@dataclass
+class _Posture:
+    """A plant in a measured posture: the value of a cache entry, which is written anew each time."""
+
+    context: Context
+    # [positions, velocities] as measured, and whether all are finite; if not, the context is older.
+    state: np.ndarray
+    finite: bool = False
 
 
 class FloatingBaseModel(RecursiveEstimator):
@@ -134,12 +156,14 @@ class FloatingBaseModel(RecursiveEstimator):
         - measurements
         output_ports:
         - posterior
+        - (one for each field)
         - at_step_start
 
-    `measurements` is the posterior of a `SensorMonitor`. `posterior` belongs to the present tick; `at_step_start` to the tick before, where
-    the step began whose accelerations and forces are measured now. Velocities are ordered [base angular (3), base linear (3), joints (n)]
-    whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but those of a foot, which are in
-    its sole frame F:
+    `measurements` is the posterior of a `SensorMonitor`. `posterior` belongs to the present tick;
+    `at_step_start` to the tick before, where the step began whose accelerations and forces are
+    measured now. Velocities are ordered [base angular (3), base linear (3), joints (n)] whatever
+    the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but
+    those of a foot, which are in its sole frame F:
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
         bias            (n,)       joint rows of C v [Nm]
@@ -152,55 +176,82 @@ class FloatingBaseModel(RecursiveEstimator):
         velocity        (v,)       [angular velocity, 0, joint velocities]
     """
 
-    def __init__(self, robot: Robot, measurements: dict[str, slice], clock: Clock):
+    def __init__(self, robot: Robot, measurements: np.dtype, clock: Clock):
+        """Declares ports and state.
+
+        Args:
+            measurements: type of the input's posterior.
+        """
         n, f = len(robot.joint_names), len(robot.description.sides)
         v = 6 + n
-        super().__init__(
-            {
-                "status": 1,
-                "mass_matrix": n * v,
-                "bias": n,
-                "foot_jacobian": f * 6 * v,
-                "foot_bias": f * 6,
-                "foot_position": f * 3,
-                "foot_rotation": f * 9,
-                "com": 3,
-                "com_velocity": 3,
-                "velocity": v,
-            },
-            clock,
+        posterior_type = record_type(
+            time=(),
+            status=(),
+            mass_matrix=(n, v),
+            bias=(n,),
+            foot_jacobian=(f, 6, v),
+            foot_bias=(f, 6),
+            foot_position=(f, 3),
+            foot_rotation=(f, 3, 3),
+            com=(3,),
+            com_velocity=(3,),
+            velocity=(v,),
         )
-        self._plant, self._plant_context = robot.plant, robot.plant.CreateDefaultContext()
-        self._world, self._soles = robot.plant.world_frame(), [robot.sole(side) for side in robot.description.sides]
-        self._R_BI = ImuMount(robot).R_BI.flatten()
+        super().__init__(posterior_type, clock)
+        self._robot, self._plant, self._world = robot, robot.plant, robot.plant.world_frame()
+        self._soles = [robot.sole(side) for side in robot.description.sides]
         # Place in the plant's velocities, and in its state, of each of ours.
         base = robot.base.floating_velocities_start_in_v()
-        self._order = np.concatenate([np.arange(base, base + 6), robot.velocity_index])
-        self._q_index, self._v_index = robot.position_index, robot.plant.num_positions() + self._order
-        self._state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(robot.plant.num_velocities())])
-        self._measured_places = np.array(starts(measurements, "joint_position", "joint_velocity", "angular_velocity"))
-        feet = ("foot_jacobian", "foot_bias", "foot_position", "foot_rotation")
-        self._places = np.array(starts(self.fields.slices, "mass_matrix", "bias", "com", "com_velocity", "velocity", *feet))
-        self._measurements = self.DeclareVectorInputPort("measurements", max(part.stop for part in measurements.values()))
+        order = np.concatenate([np.arange(base, base + 6), robot.velocity_index])
+        self._known = record(
+            mount=record(**vars(ImuMount(robot))),
+            order=order,
+            q_index=robot.position_index,
+            v_index=robot.plant.num_positions() + order,
+        )
+        self._measurements = self._declare_record_input("measurements", measurements)
+        self._posture = self.DeclareCacheEntry(
+            "plant in the measured posture",
+            ValueProducer(allocate=self._allocate_posture, calc=self._calc_posture),
+            {self.input_port_ticket(self._measurements.port.get_index())},
+        )
         self._declare_posterior("measurements")
         self.DeclareStateOutputPort("at_step_start", self._last)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:  # noqa: ARG002
-        plant, now, state, order = self._plant, self._plant_context, self._state, self._order
-        measured = self._measurements.Eval(context)
-        if not _plant_state(state, measured, self._q_index, self._v_index, self._measured_places, self._R_BI):
-            posterior.fill(math.nan)  # Drake would refuse it.
+    def _allocate_posture(self) -> AbstractValue:
+        upright = self._robot.base_pose_positions(RigidTransform())
+        state = np.concatenate([upright, np.zeros(self._plant.num_velocities())])
+        return AbstractValue.Make(_Posture(self._plant.CreateDefaultContext(), state))
+
+    def _calc_posture(self, context: Context, value: AbstractValue) -> None:
+        posture, measured = value.get_mutable_value(), self._measurements.Eval(context)
+        posture.finite = _plant_state(posture.state, measured, self._known)
+        if posture.finite:  # Drake would refuse it.
+            self._plant.SetPositionsAndVelocities(posture.context, posture.state)
+
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,  # noqa: ARG002
+        elapsed: float,  # noqa: ARG002
+        posterior: np.ndarray,
+    ) -> None:
+        posture = self._posture.Eval(context)
+        if not posture.finite:
+            posterior["velocity"] = math.nan  # So it is not taken.
             return
-        plant.SetPositionsAndVelocities(now, state)
+        plant, now, origin = self._plant, posture.context, _ORIGIN
         world, wrt = self._world, JacobianWrtVariable.kV
         feet = tuple(
             [
                 (
-                    plant.CalcJacobianSpatialVelocity(now, wrt, sole, _ORIGIN, world, sole),
-                    plant.CalcBiasSpatialAcceleration(now, wrt, sole, _ORIGIN, world, sole).get_coeffs(),
+                    plant.CalcJacobianSpatialVelocity(now, wrt, sole, origin, world, sole),
+                    plant.CalcBiasSpatialAcceleration(
+                        now, wrt, sole, origin, world, sole
+                    ).get_coeffs(),
                 )
                 for sole in self._soles
             ]
         )
         M, bias = plant.CalcMassMatrix(now), plant.CalcBiasTerm(now)
-        _put_terms(posterior, state, M, bias, feet, order, self._v_index, self._places)
+        _put_terms(posterior, posture.state, M, bias, feet, self._known)

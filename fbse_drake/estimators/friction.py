@@ -1,7 +1,8 @@
-"""From the measured friction, which is noisy, to the friction estimate: two LeafSystems with the same ports.
+"""From the measured friction, which is noisy, to the friction estimate.
 
-`RecursiveLeastSquares` is the paper's: the measurement while the leg stands, a model identified from it while the leg swings.
-`ModelAided` weighs both at all times.
+Two LeafSystems with the same ports: `RecursiveLeastSquares` is the paper's: the measurement while
+the leg stands, a model identified from it while the leg swings. `ModelAided` weighs both at all
+times.
 """
 
 import math
@@ -10,13 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numba.np.unsafe.ndarray import to_fixed_tuple
 from pydrake.systems.framework import Context
 
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
-from fbse_drake.estimators.recursive import STATUS, Clock, RecursiveEstimator, starts
+from fbse_drake.estimators.records import record, record_type
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import leg_of_joint
 
@@ -27,10 +28,13 @@ def _adopted_model() -> CoulombViscousFriction:
 
 @dataclass(frozen=True)
 class RecursiveLeastSquares:
-    """Recursive least squares (64)-(67), one joint at a time: the covariance of the paper's 12 parameters never couples joints."""
+    """Recursive least squares (64)-(67), one joint at a time.
 
-    # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are identified, from their values here on; the others
-    # stay as they are.
+    The covariance of the paper's 12 parameters never couples joints.
+    """
+
+    # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are
+    # identified, from their values here on; the others stay as they are.
     model: FrictionModel = field(default_factory=_adopted_model)
     # Initial covariance of every parameter, Table II.
     covariance: float = 10.0
@@ -40,7 +44,8 @@ class RecursiveLeastSquares:
     reset_period: float = 0.0
     # Cut-off of the low-pass on the measured friction [Hz]; 0 does not filter, as the paper.
     cutoff: float = 0.0
-    # What is taken while a leg swings: `model` as in the paper, or the `measurement` (which needs fused accelerations).
+    # What is taken while a leg swings: `model` as in the paper, or the `measurement` (which needs
+    # fused accelerations).
     swing: str = "model"
 
     def __post_init__(self) -> None:
@@ -54,14 +59,17 @@ class RecursiveLeastSquares:
 
 @dataclass(frozen=True)
 class ModelAided:
-    """Kalman filter, joint by joint, for a friction model's parameters and what the model does not explain.
+    """Kalman filter for a friction model's parameters and what the model does not explain.
 
-    The friction is u = phi(velocity)^T parameters + d with constant parameters and d a random walk. Compared is not the measured friction
-    itself but its impulse, the integral over time: errors of velocities, which accelerations differentiate, are white in it. So sharp
-    features come from the model without delay, and the measurement decides over everything slower.
+    It goes joint by joint. The friction is u = phi(velocity)^T parameters + d with constant
+    parameters and d a random walk. Compared is not the measured friction itself but its impulse,
+    the integral over time: errors of velocities, which accelerations differentiate, are white in
+    it. So sharp features come from the model without delay, and the measurement decides over
+    everything slower.
     """
 
-    # Friction model, of which the linear parameters are identified, from their values here on; the others stay as they are.
+    # Friction model, of which the linear parameters are identified, from their values here on; the
+    # others stay as they are.
     model: FrictionModel = field(default_factory=CoulombViscousFriction)
     # Initial standard deviation of every parameter [its unit].
     parameter_uncertainty: float = 3.0
@@ -76,9 +84,9 @@ class ModelAided:
     swing: str = "measurement"
 
     def __post_init__(self) -> None:
-        require_not_negative(
-            self, "parameter_uncertainty", "disturbance_walk", "disturbance_uncertainty", "parameter_walk", "velocity_smoothing"
-        )
+        require_not_negative(self, "parameter_uncertainty", "parameter_walk")
+        require_not_negative(self, "disturbance_walk", "disturbance_uncertainty")
+        require_not_negative(self, "velocity_smoothing")
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
 
@@ -88,7 +96,10 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 
 @dataclass(frozen=True)
 class FrictionRegressor:
-    """A joint torque effect as a regressor: its basis torques, (n,) for each parameter, at a velocity (n,)."""
+    """A joint torque effect as a regressor.
+
+    It gives the basis torques, (n,) for each parameter, at a velocity (n,).
+    """
 
     effect: type[JointTorqueEffect]
     # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
@@ -116,17 +127,20 @@ def recursive_least_squares(
     """One tick of (64)-(67) for n joints at once.
 
     Args:
-        parameters: (n, m); P: their covariances (n, m, m); phi: regressors (n, m); measured: friction (n,) [Nm].
+        parameters: (n, m); P: their covariances (n, m, m).
+        phi: regressors (n, m); measured: friction (n,) [Nm].
         forgetting: weight of the past, 1 for the paper's.
 
     Returns:
-        Parameters, covariances, innovation (n,) and its variance (n,), in units of the measurement noise.
+        Parameters, covariances, innovation (n,) and its variance (n,), in units of the measurement
+        noise.
     """
     innovation = measured - (phi * parameters).sum(axis=1)  # (65)
     P_phi = (P @ phi[:, :, None])[:, :, 0]
     S = forgetting + (phi * P_phi).sum(axis=1)
     K = P_phi / S[:, None]  # (66)
-    return parameters + K * innovation[:, None], (P - K[:, :, None] * P_phi[:, None, :]) / forgetting, innovation, S  # (64), (67)
+    P_new = (P - K[:, :, None] * P_phi[:, None, :]) / forgetting  # (67)
+    return parameters + K * innovation[:, None], P_new, innovation, S  # (64)
 
 
 class FrictionEstimator(RecursiveEstimator):
@@ -140,47 +154,57 @@ class FrictionEstimator(RecursiveEstimator):
         - link_torque
         output_ports:
         - posterior
+        - (one for each field)
 
-    Inputs: posteriors of `SensorMonitor` and `LinkTorqueEstimator`. Fields of the posterior: `friction` (n,) [Nm], the estimate for the
-    tick that ends now; `parameters` (n, m) and `covariance` (n, m, m) of the model; `innovation` and `innovation_variance` (n,).
+    Inputs: posteriors of `SensorMonitor` and `LinkTorqueEstimator`. Fields of the posterior:
+    `friction` (n,) [Nm], the estimate for the tick that ends now; `parameters` (n, m), their
+    `parameter_variance` (n, m) and `covariance` (n, m, m) of the model; `innovation` and
+    `innovation_variance` (n,).
     """
 
     def __init__(
         self,
         model: JointTorqueEffect,
         robot: Robot,
-        measurements: dict[str, slice],
-        link_torque: dict[str, slice],
+        measurements: np.dtype,
+        link_torque: np.dtype,
         clock: Clock,
         covariance_size: int,
-        further: dict[str, int],
+        **further: tuple[int, ...],
     ):
+        """Declares ports and state.
+
+        Args:
+            model: of the friction.
+            measurements, link_torque: types of the inputs' posteriors.
+            covariance_size: how many states each joint's covariance has besides its parameters.
+            further: shapes of further fields of the posterior.
+        """
         self._regressor = FrictionRegressor.of(model, robot)
         n, m = len(robot.joint_names), self._regressor.parameters
-        super().__init__(
-            {
-                "status": 1,
-                "friction": n,
-                "parameters": n * m,
-                "parameter_variance": n * m,
-                "covariance": n * (m + covariance_size) ** 2,
-                "innovation": n,
-                "innovation_variance": n,
-                **further,
-            },
-            clock,
+        size = m + covariance_size
+        posterior_type = record_type(
+            time=(),
+            status=(),
+            friction=(n,),
+            parameters=(n, m),
+            parameter_variance=(n, m),
+            covariance=(n, size, size),
+            innovation=(n,),
+            innovation_variance=(n,),
+            **further,
         )
-        self._measured, self._link_torque, self._n, self._m = measurements, link_torque, n, m
+        super().__init__(posterior_type, clock)
         self._leg = leg_of_joint(robot)
-        for name, parts in (("measurements", measurements), ("link_torque", link_torque)):
-            self.DeclareVectorInputPort(name, max(part.stop for part in parts.values()))
-        names = ("measurements", "link_torque")
-        self._measurements, self._link = (self.GetInputPort(name) for name in names)
-        self._declare_posterior(*names)
+        self._measurements = self._declare_record_input("measurements", measurements)
+        self._link = self._declare_record_input("link_torque", link_torque)
+        self._declare_posterior("measurements", "link_torque")
 
 
 class RecursiveLeastSquaresEstimator(FrictionEstimator):
-    """Friction as in the paper (Sec. 6-7): measured in stance, modelled in swing; see `RecursiveLeastSquares` and `FrictionEstimator`.
+    """Friction as in the paper (Sec. 6-7): measured in stance, modelled in swing.
+
+    See `RecursiveLeastSquares` and `FrictionEstimator`.
 
     .. pydrake_system::
 
@@ -190,73 +214,84 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         - link_torque
         output_ports:
         - posterior
+        - (one for each field)
 
-    Further fields: `filtered` (2, n), state of the low-pass [Nm]; `age` [s], time since the last reset of the covariance.
+    Further fields: `filtered` (2, n), state of the low-pass [Nm]; `age` [s], time since the last
+    reset of the covariance.
     """
 
     def __init__(
-        self, config: RecursiveLeastSquares, robot: Robot, measurements: dict[str, slice], link_torque: dict[str, slice], clock: Clock
+        self,
+        config: RecursiveLeastSquares,
+        robot: Robot,
+        measurements: np.dtype,
+        link_torque: np.dtype,
+        clock: Clock,
     ):
-        n = len(robot.joint_names)
-        super().__init__(config.model, robot, measurements, link_torque, clock, 0, {"filtered": 2 * n, "age": 1})
+        further = {"filtered": (2, len(robot.joint_names)), "age": ()}
+        super().__init__(config.model, robot, measurements, link_torque, clock, 0, **further)
         self._config = config
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
-        support = measured[self._measured["support"]]
-        config, fields, n, m = self._config, self.fields, self._n, self._m
-        posterior[:] = last
-        posterior[STATUS] = max(measured[self._measured["trust"]].tolist())
-        parameters = posterior[fields["parameters"]].reshape(n, m)
-        P = posterior[fields["covariance"]].reshape(n, m, m)
+        config = self._config
+        posterior[...] = last
+        posterior["status"] = max(measured["trust"].tolist())
+        parameters, P = posterior["parameters"], posterior["covariance"]
         if math.isnan(elapsed):
             parameters[:] = self._regressor.initial
-        age = math.inf if math.isnan(elapsed) else posterior[fields["age"]][0] + elapsed
-        if age == math.inf or (config.reset_period and age >= config.reset_period * (1 - 1e-9)):
-            P[:], age = config.covariance * np.eye(m), 0.0
-        posterior[fields["age"]] = age
-        phi = np.array(self._regressor(measured[self._measured["joint_velocity"]])).T
-        valid = link_torque[self._link_torque["valid"]] > 0
+        age = math.inf if math.isnan(elapsed) else last["age"] + elapsed
+        reset = config.reset_period
+        if age == math.inf or (reset and age >= reset * (1 - 1e-9)):
+            P[:], age = config.covariance * np.eye(P.shape[1]), 0.0
+        posterior["age"] = age
+        phi = np.array(self._regressor(measured["joint_velocity"])).T
+        valid = link_torque["valid"] > 0
         if config.swing == "model":
-            valid &= support[self._leg] > 0
-        residual = link_torque[self._link_torque["residual"]]
-        filtered = posterior[fields["filtered"]].reshape(2, n)
+            valid &= measured["support"][self._leg] > 0
+        residual, filtered = link_torque["residual"], posterior["filtered"]
         if config.cutoff > 0 and not math.isnan(elapsed):
             # Two equal poles; a joint that was not measured starts afresh from its model.
             keep = math.exp(-2 * math.pi * config.cutoff * 1.55 * elapsed)
             modelled = (phi * parameters).sum(axis=1)
-            filtered[0] = np.where(valid, keep * filtered[0] + (1 - keep) * residual, modelled)
-            filtered[1] = np.where(valid, keep * filtered[1] + (1 - keep) * filtered[0], modelled)
+            once = keep * filtered[0] + (1 - keep) * residual
+            filtered[0] = np.where(valid, once, modelled)
+            twice = keep * filtered[1] + (1 - keep) * filtered[0]
+            filtered[1] = np.where(valid, twice, modelled)
             smooth = filtered[1]
         else:
             smooth = residual
         if valid.any():
-            forgetting = 1.0 if config.forgetting == 1 else config.forgetting ** (elapsed / 1e-3)
-            new, P_new, innovation, S = recursive_least_squares(parameters, P, phi, residual, forgetting)
+            forgets = config.forgetting != 1
+            forgetting = config.forgetting ** (elapsed / 1e-3) if forgets else 1.0
+            new, P_new, innovation, S = recursive_least_squares(
+                parameters, P, phi, residual, forgetting
+            )
             parameters[valid], P[valid] = new[valid], P_new[valid]
-            posterior[fields["innovation"]], posterior[fields["innovation_variance"]] = innovation * valid, S
-        posterior[fields["parameter_variance"]] = np.diagonal(P, axis1=1, axis2=2).ravel()
-        posterior[fields["friction"]] = np.where(valid, smooth, (phi * parameters).sum(axis=1))
+            posterior["innovation"], posterior["innovation_variance"] = innovation * valid, S
+        posterior["parameter_variance"] = np.diagonal(P, axis1=1, axis2=2)
+        posterior["friction"] = np.where(valid, smooth, (phi * parameters).sum(axis=1))
 
 
 @njit(cache=True)
 def smooth_velocity(
-    velocity: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, places: np.ndarray, time_constant: float
+    posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
 ) -> None:
     """Low-pass of first order over joint velocities.
 
     Args:
-        velocity: to be filled, shape (n,) [rad/s].
-        last, measured: posteriors of `ModelAidedEstimator` a tick ago and of `SensorMonitor`.
-        places: of what is read, see the first line.
-        time_constant: of the low-pass [s], 0 does not smooth.
+        posterior, last: of `ModelAidedEstimator`, now, whose `velocity` is filled, and a tick ago.
+        measured: posterior of `SensorMonitor`.
+        time: time constant of the low-pass [s], 0 does not smooth.
     """
-    joint_velocity, smoothed, measured_last = to_fixed_tuple(places, 3)
-    keep = math.exp(-elapsed / time_constant) if time_constant > 0 else 0.0
-    for joint in range(len(velocity)):
+    posterior, last, measured = posterior[()], last[()], measured[()]
+    keep = math.exp(-elapsed / time) if time > 0 else 0.0
+    for joint in range(len(posterior.velocity)):
         # The joint's velocity over the tick is the mean of those at its ends.
-        mean = 0.5 * (measured[joint_velocity + joint] + last[measured_last + joint])
-        velocity[joint] = keep * last[smoothed + joint] + (1 - keep) * mean
+        mean = 0.5 * (measured.joint_velocity[joint] + last.last_velocity[joint])
+        posterior.velocity[joint] = keep * last.velocity[joint] + (1 - keep) * mean
 
 
 @njit(cache=True)
@@ -267,42 +302,38 @@ def _estimate_friction(
     measured: np.ndarray,
     link_torque: np.ndarray,
     phi: tuple[np.ndarray, ...],
-    joint_leg: np.ndarray,
-    places: np.ndarray,
-    measures_swing: bool,
-    walks: np.ndarray,
+    known: np.ndarray,
 ) -> None:
-    """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint; fills the posterior but for its `velocity`.
+    """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint.
+
+    Fills the posterior but for its `velocity`.
 
     Args:
         phi: the model's regressors, m of shape (n,).
-        joint_leg: which leg each joint belongs to, shape (n,).
-        places: of what is read and written, see the first lines.
-        measures_swing: whether the measurement counts while the leg swings.
-        walks: random walks of disturbance and parameters, see `ModelAided`.
+        known: record with the numbers of `ModelAided` as `config`; `joint_leg` (n,), which leg each
+            joint belongs to; `measures_swing`, whether the measurement counts while the leg swings.
     """
-    trust, joint_velocity, support_start, support_stop = to_fixed_tuple(places, 4)
-    residual, torque_variance, impulse_variance, valid_at = to_fixed_tuple(places[4:], 4)
-    friction, parameters, variances, covariance, innovations, innovation_variances = to_fixed_tuple(places[8:], 6)
-    disturbance, impulse_at, measured_at = to_fixed_tuple(places[14:], 3)
-    disturbance_walk, parameter_walk = to_fixed_tuple(walks, 2)
-    support, m, n = measured[support_start:support_stop], len(phi), len(joint_leg)
+    posterior, last, known = posterior[()], last[()], known[()]
+    measured, link = measured[()], link_torque[()]
+    disturbance_walk = known.config.disturbance_walk
+    parameter_walk = known.config.parameter_walk
+    support, m, n = measured.support, len(phi), len(known.joint_leg)
     size = m + 2
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
-    posterior[STATUS] = measured[trust : trust + 2 + len(support)].max()
-    stop = covariance + n * size * size
-    posterior[covariance:stop] = last[covariance:stop]
-    covariances = posterior[covariance:stop].reshape(n, size, size)
+    posterior.status = measured.trust.max()
+    posterior.covariance[:] = last.covariance
     for joint in range(n):
-        valid = link_torque[valid_at + joint] > 0 and (measures_swing or support[joint_leg[joint]] > 0)
+        stands = support[known.joint_leg[joint]] > 0
+        valid = link.valid[joint] > 0 and (known.measures_swing or stands)
         # Parameters and disturbance, whose regressor is one.
         for k in range(m):
-            regressor[k], x[k] = phi[k][joint], last[parameters + joint * m + k]
-        x[m] = last[disturbance + joint]
-        P, impulse_uncertainty = covariances[joint], covariances[joint, 0, 0]
+            regressor[k], x[k] = phi[k][joint], last.parameters[joint, k]
+        x[m] = last.disturbance[joint]
+        P = posterior.covariance[joint]
+        impulse_uncertainty = P[0, 0]
         # Prediction: the impulse error grows by the friction's error times the tick.
-        innovation = last[impulse_at + joint] + elapsed * link_torque[residual + joint]
-        added = elapsed**2 * link_torque[torque_variance + joint]
+        innovation = last.impulse[joint] + elapsed * link.residual[joint]
+        added = elapsed**2 * link.torque_variance[joint]
         for k in range(m + 1):
             innovation -= elapsed * regressor[k] * x[k]
         for i in range(size):
@@ -321,7 +352,7 @@ def _estimate_friction(
         P[0, size - 1] = P[size - 1, 0]
         # Update.
         column[:] = P[:, 0]
-        S = column[0] + link_torque[impulse_variance + joint]
+        S = column[0] + link.impulse_variance[joint]
         impulse = innovation
         if valid:
             for i in range(size):
@@ -341,11 +372,13 @@ def _estimate_friction(
         for k in range(m + 1):
             total += regressor[k] * x[k]
         for k in range(m):
-            posterior[parameters + joint * m + k], posterior[variances + joint * m + k] = x[k], P[1 + k, 1 + k]
-        posterior[friction + joint] = total
-        posterior[disturbance + joint], posterior[impulse_at + joint] = x[m], impulse
-        posterior[innovations + joint], posterior[innovation_variances + joint] = innovation if valid else 0.0, S
-        posterior[measured_at + joint] = measured[joint_velocity + joint]
+            posterior.parameters[joint, k] = x[k]
+            posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
+        posterior.friction[joint] = total
+        posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
+        posterior.innovation[joint] = innovation if valid else 0.0
+        posterior.innovation_variance[joint] = S
+        posterior.last_velocity[joint] = measured.joint_velocity[joint]
 
 
 class ModelAidedEstimator(FrictionEstimator):
@@ -359,61 +392,45 @@ class ModelAidedEstimator(FrictionEstimator):
         - link_torque
         output_ports:
         - posterior
+        - (one for each field)
 
-    Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse [Nm s], after the update; `velocity` that
-    the model sees and `last_velocity` as measured [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is
-    that of [impulse, parameters, disturbance].
+    Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
+    [Nm s], after the update; `velocity` that the model sees and `last_velocity` as measured
+    [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
+    [impulse, parameters, disturbance].
     """
 
-    def __init__(self, config: ModelAided, robot: Robot, measurements: dict[str, slice], link_torque: dict[str, slice], clock: Clock):
-        n = len(robot.joint_names)
-        further = {"disturbance": n, "impulse": n, "velocity": n, "last_velocity": n}
-        super().__init__(config.model, robot, measurements, link_torque, clock, 2, further)
-        self._config, self._measures_swing = config, config.swing == "measurement"
-        self._velocity_places = np.array(
-            [*starts(measurements, "joint_velocity"), *starts(self.fields.slices, "velocity", "last_velocity")]
-        )
-        self._smoothing, self._walks = float(config.velocity_smoothing), np.array([config.disturbance_walk, config.parameter_walk], float)
-        self._velocity = self.fields["velocity"]
-        model, innovation = ("parameters", "parameter_variance", "covariance"), ("innovation", "innovation_variance")
-        written = ("friction", *model, *innovation, "disturbance", "impulse", "last_velocity")
-        self._places = np.array(
-            [
-                *starts(measurements, "trust", "joint_velocity", "support"),
-                measurements["support"].stop,
-                *starts(link_torque, "residual", "torque_variance", "impulse_variance", "valid"),
-                *starts(self.fields.slices, *written),
-            ]
-        )
+    def __init__(
+        self,
+        config: ModelAided,
+        robot: Robot,
+        measurements: np.dtype,
+        link_torque: np.dtype,
+        clock: Clock,
+    ):
+        further = ("disturbance", "impulse", "velocity", "last_velocity")
+        shapes = dict.fromkeys(further, (len(robot.joint_names),))
+        super().__init__(config.model, robot, measurements, link_torque, clock, 2, **shapes)
+        self._config, self._smoothing = config, float(config.velocity_smoothing)
+        measures_swing = config.swing == "measurement"
+        self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         if math.isnan(elapsed):
             self._start(posterior, measured)
             return
-        velocity = posterior[self._velocity]
-        smooth_velocity(velocity, last, measured, elapsed, self._velocity_places, self._smoothing)
-        _estimate_friction(
-            posterior,
-            last,
-            elapsed,
-            measured,
-            link_torque,
-            self._regressor(velocity),
-            self._leg,
-            self._places,
-            self._measures_swing,
-            self._walks,
-        )
+        smooth_velocity(posterior, last, measured, elapsed, self._smoothing)
+        phi = self._regressor(posterior["velocity"])
+        _estimate_friction(posterior, last, elapsed, measured, link_torque, phi, self._known)
 
     def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
-        config, n, m = self._config, self._n, self._m
-        P = np.diag([0.0, *[config.parameter_uncertainty**2] * m, config.disturbance_uncertainty**2])
-        now = measured[self._measured["joint_velocity"]]
-        posterior[:] = self.fields.pack(
-            status=measured[self._measured["trust"]].max(),
-            parameters=self._regressor.initial,
-            covariance=np.tile(P, (n, 1, 1)),
-            velocity=now,
-            last_velocity=now,
-        )
+        config, m = self._config, self._regressor.parameters
+        uncertainty = [config.parameter_uncertainty**2] * m
+        posterior[...] = np.zeros((), self.posterior_type)
+        posterior["status"] = measured["trust"].max()
+        posterior["parameters"] = self._regressor.initial
+        posterior["covariance"] = np.diag([0.0, *uncertainty, config.disturbance_uncertainty**2])
+        posterior["velocity"] = posterior["last_velocity"] = measured["joint_velocity"]

@@ -1,17 +1,15 @@
-"""What all estimators share: a LeafSystem whose discrete state is its posterior, in named fields."""
+"""What all estimators share: a LeafSystem whose discrete state is its posterior, a record."""
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import partial
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, State
 
-# Place of the status in the posterior of every estimator.
-STATUS = 1
+from fbse_drake.estimators.records import as_record, parts, size_of
 
 
 class Status(IntEnum):
@@ -27,89 +25,80 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
-class Fields:
-    """Named parts of a vector, in order, with their sizes."""
-
-    sizes: Mapping[str, int]
-
-    @cached_property
-    def size(self) -> int:
-        return sum(self.sizes.values())
-
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        ends = np.cumsum(list(self.sizes.values())).tolist()
-        return {name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)}
-
-    def __getitem__(self, name: str) -> slice:
-        return self.slices[name]
-
-    def pack(self, **values: np.ndarray | float) -> np.ndarray:
-        """A vector with these values, zero where none is given."""
-        vector = np.zeros(self.size)
-        for name, value in values.items():
-            vector[self[name]] = np.ravel(value)
-        return vector
-
-    def unpack(self, vectors: np.ndarray) -> dict[str, np.ndarray]:
-        """Parts of one vector (size,) or of many (N, size)."""
-        return {name: vectors[..., part] for name, part in self.slices.items()}
-
-
-def starts(parts: Mapping[str, slice], *names: str) -> tuple[int, ...]:
-    """Where these parts of a vector start.
-
-    Kernels get such places, and their other constants, as arrays and name them with `to_fixed_tuple`: numba unboxes a tuple item by item.
-    """
-    return tuple(parts[name].start for name in names)
-
-
-@dataclass(frozen=True)
 class Clock:
     """When an estimator ticks."""
 
     # Nominal period [s].
     period: float = 0.001
-    # An evaluation that comes sooner after the last tick than this [s] is no tick: the posterior is held. Over a recorded log every
-    # sample is one.
+    # An evaluation that comes sooner after the last tick than this [s] is no tick: the posterior is
+    # held. Over a recorded log every sample is one.
     shortest: float = 0.001 * (1 - 1e-6)
+
+
+@dataclass(frozen=True)
+class RecordInput:
+    """An input port that gets the posterior of another estimator."""
+
+    port: InputPort
+    kind: np.dtype
+
+    def Eval(self, context: Context) -> np.ndarray:  # noqa: N802
+        """The posterior as a record."""
+        return as_record(self.port.Eval(context), self.kind)
 
 
 class RecursiveEstimator(LeafSystem):
     """Base of the estimators.
 
-    The output port `posterior` holds the estimator's posterior of the present tick, made from the posterior of the tick before (the
-    discrete state) and the inputs of this tick; so a chain of estimators adds no delay. The state takes it over in an unrestricted update,
-    see `fbse_drake.sampling`. The first field of every posterior is `time`, that of its tick [s], NaN before the first; the second one of
-    an estimator is `status`, see `Status`. A posterior that would not be finite is not taken: the last one is held and the status says so.
+    The output port `posterior` holds the estimator's posterior of the present tick, made from the
+    posterior of the tick before (the discrete state) and the inputs of this tick; so a chain of
+    estimators adds no delay. The state takes it over in an unrestricted update, see
+    `fbse_drake.sampling`. A posterior is a record, see `fbse_drake.estimators.records`, and each of
+    its fields is an output port of its own as well, flat. The first field of every posterior is
+    `time`, that of its tick [s], NaN before the first; the second one of an estimator is `status`,
+    see `Status`. A posterior that would not be finite is not taken: the last one is held and the
+    status says so.
     """
 
-    def __init__(self, fields: Mapping[str, int], clock: Clock):
+    def __init__(self, posterior_type: np.dtype, clock: Clock):
         """Declares the state.
 
         Args:
-            fields: of the posterior, besides `time`.
+            posterior_type: see `record_type`.
         """
         super().__init__()
-        self.fields = Fields({"time": 1, **fields})
-        self._has_status, self._shortest = "status" in fields, clock.shortest
-        self._last = self.DeclareDiscreteState([math.nan, *np.zeros(self.fields.size - 1)])
+        self.posterior_type = posterior_type
+        self._has_status, self._shortest = "status" in posterior_type.names, clock.shortest
+        start = np.zeros(size_of(posterior_type))
+        as_record(start, posterior_type)["time"] = math.nan
+        self._last = self.DeclareDiscreteState(start)
         self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, self._remember)
         self.DeclareForcedUnrestrictedUpdateEvent(self._remember)
 
+    def _declare_record_input(self, name: str, kind: np.dtype) -> RecordInput:
+        """Declares an input port for a posterior of this type."""
+        return RecordInput(self.DeclareVectorInputPort(name, size_of(kind)), kind)
+
     def _declare_posterior(self, *inputs: str) -> None:
-        """Declares the output; to be called when the input ports are declared.
+        """Declares the outputs; to be called when the input ports are declared.
 
         Args:
-            inputs: names of the ports that it is made from.
+            inputs: names of the ports that the posterior is made from.
         """
         tickets = {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs}
+        tickets |= {self.time_ticket(), self.xd_ticket()}
+        size = size_of(self.posterior_type)
         self._posterior = self.DeclareVectorOutputPort(
-            "posterior", self.fields.size, self._calc_posterior, tickets | {self.time_ticket(), self.xd_ticket()}
+            "posterior", size, self._calc_posterior, tickets
         )
+        for name, part in parts(self.posterior_type).items():
+            calc = partial(self._calc_field, part)
+            self.DeclareVectorOutputPort(name, part.stop - part.start, calc, tickets)
 
     @abstractmethod
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         """Makes the posterior of this tick.
 
         Args:
@@ -119,21 +108,25 @@ class RecursiveEstimator(LeafSystem):
         """
 
     def _calc_posterior(self, context: Context, output: BasicVector) -> None:
-        last, time = context.get_discrete_state().value(0), context.get_time()
-        elapsed = time - last.item(0)
+        before, time = context.get_discrete_state().value(0), context.get_time()
+        elapsed = time - before.item(0)
         if elapsed < self._shortest:
-            output.SetFromVector(last)
+            output.SetFromVector(before)
             return
-        posterior = output.get_mutable_value()
-        self._tick(context, last, elapsed, posterior)
-        posterior[0] = time
+        now = output.get_mutable_value()
+        posterior = as_record(now, self.posterior_type)
+        self._tick(context, as_record(before, self.posterior_type), elapsed, posterior)
+        now[0] = time  # The first field.
         # Is it finite? The square is the cheapest sum over all.
-        if not math.isfinite(posterior.dot(posterior)):
-            posterior[1:] = last[1:]
+        if not math.isfinite(now.dot(now)):
+            now[1:] = before[1:]
             if self._has_status:
-                posterior[STATUS] = Status.NOT_FINITE
-        if math.isnan(elapsed) and self._has_status and posterior[STATUS] == Status.NOT_FINITE:
-            posterior[0] = math.nan  # Nothing to start from yet.
+                posterior["status"] = Status.NOT_FINITE
+        if math.isnan(elapsed) and self._has_status and posterior["status"] == Status.NOT_FINITE:
+            posterior["time"] = math.nan  # Nothing to start from yet.
+
+    def _calc_field(self, part: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._posterior.Eval(context)[part])
 
     def _remember(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state().set_value(0, self._posterior.Eval(context))

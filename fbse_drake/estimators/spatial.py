@@ -18,23 +18,29 @@ Rotation = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @njit(cache=True)
-def vector_at(x: np.ndarray, start: int) -> Vector:
-    """The three components that start at a place of x."""
-    return x[start], x[start + 1], x[start + 2]
+def vector(x: np.ndarray) -> Vector:
+    """The components of an array of shape (3,)."""
+    return x[0], x[1], x[2]
 
 
 @njit(cache=True)
-def rotation_at(x: np.ndarray, start: int) -> Rotation:
-    """The rotation matrix that starts at a place of x."""
-    return x[start], x[start + 1], x[start + 2], x[start + 3], x[start + 4], x[start + 5], x[start + 6], x[start + 7], x[start + 8]
+def quaternion(x: np.ndarray) -> Quaternion:
+    """The components of an array of shape (4,)."""
+    return x[0], x[1], x[2], x[3]
 
 
 @njit(cache=True)
-def put(x: np.ndarray, start: int, values: tuple[float, ...]) -> int:
-    """Writes values to a place of x; returns the place behind them."""
+def rotation(R: np.ndarray) -> Rotation:
+    """The components of an array of shape (3, 3)."""
+    return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
+
+
+@njit(cache=True)
+def put(x: np.ndarray, values: tuple[float, ...]) -> None:
+    """Fills an array (of any shape, row by row) with as many values."""
+    x = x.ravel()
     for i in range(len(values)):
-        x[start + i] = values[i]
-    return start + len(values)
+        x[i] = values[i]
 
 
 @njit(cache=True)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from fbse_drake.errors import InputError, require_not_negative
 
@@ -45,7 +44,9 @@ def detect_support(
     trust: np.ndarray,
     thresholds: np.ndarray,
 ) -> None:
-    """One tick of `MeasuredSupport`; all arrays have shape (feet,). A foot whose sensors are not trusted stays what it was.
+    """One tick of `MeasuredSupport`; all arrays have shape (feet,).
+
+    A foot whose sensors are not trusted stays what it was.
 
     Args:
         support: filled with 1 for a foot that stands, else 0.
@@ -54,15 +55,18 @@ def detect_support(
         elapsed: time since then [s], NaN at the first tick.
         load: vertical force on each foot [N].
         trust: status of each foot's sensors, 0 for trusted ones.
-        thresholds: loads that begin and end a stance [N], and the debounce [s].
+        thresholds: record with the loads that begin and end a stance, `on` and `off` [N], and the
+            `debounce` [s].
     """
-    on, off, debounce = to_fixed_tuple(thresholds, 3)
     for foot in range(len(support)):
         if math.isnan(elapsed):
-            support[foot], waiting[foot] = 1.0 if load[foot] > on else 0.0, 0.0
+            support[foot], waiting[foot] = 1.0 if load[foot] > thresholds.on else 0.0, 0.0
             continue
         support[foot] = last_support[foot]
-        beyond = load[foot] < off if last_support[foot] > 0 else load[foot] > on
+        if last_support[foot] > 0:
+            beyond = load[foot] < thresholds.off
+        else:
+            beyond = load[foot] > thresholds.on
         waiting[foot] = last_waiting[foot] + elapsed if beyond and trust[foot] == 0 else 0.0
-        if waiting[foot] > debounce:
+        if waiting[foot] > thresholds.debounce:
             support[foot], waiting[foot] = 1.0 - last_support[foot], 0.0

@@ -70,12 +70,12 @@ def vertical_loads(force: np.ndarray, pad_foot: np.ndarray, feet: int) -> np.nda
     """Vertical force on each foot, in its sole frame, shape (feet,) [N].
 
     Args:
-        force: on each pad, [x, y, z] pad by pad, at the beginning of a vector [N].
+        force: on each pad, shape (P, 3) [N].
         pad_foot: see `FootPads`.
     """
     load = np.zeros(feet)
     for pad in range(len(pad_foot)):
-        load[pad_foot[pad]] += force[3 * pad + 2]
+        load[pad_foot[pad]] += force[pad, 2]
     return load
 
 
@@ -84,14 +84,14 @@ def foot_wrenches(force: np.ndarray, pad_position: np.ndarray, pad_foot: np.ndar
     """Wrench [moment, force] on each foot at the sole's origin in the sole frame, shape (feet, 6) [Nm, N].
 
     Args:
-        force: on each pad, [x, y, z] pad by pad, at the beginning of a vector [N].
+        force: on each pad, shape (P, 3) [N].
         pad_position, pad_foot: see `FootPads`.
     """
     wrench = np.zeros((feet, 6))
     for pad in range(len(pad_foot)):
         foot = wrench[pad_foot[pad]]
         x, y, z = pad_position[pad, 0], pad_position[pad, 1], pad_position[pad, 2]
-        fx, fy, fz = force[3 * pad], force[3 * pad + 1], force[3 * pad + 2]
+        fx, fy, fz = force[pad, 0], force[pad, 1], force[pad, 2]
         foot[0] += y * fz - z * fy
         foot[1] += z * fx - x * fz
         foot[2] += x * fy - y * fx

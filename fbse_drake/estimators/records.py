@@ -1,0 +1,63 @@
+"""Records: named numbers in one piece of memory, `posterior.base_velocity`, `posterior.anchor[foot]`.
+
+A posterior is a plain vector for Drake and a record for the estimators. A record is handed on as an
+array without axes: in Python its fields are views, `posterior["anchor"][foot]`; a compiled function
+takes the record out of it, `posterior[()]`, and writes `posterior.anchor[foot]`. (It could be
+called with the record itself, but numba needs ten times as long to unpack one.)
+"""
+
+from dataclasses import is_dataclass
+from typing import Any
+
+import numpy as np
+
+
+def record_type(**fields: tuple[int, ...] | np.dtype) -> np.dtype:
+    """The type of a record of floats.
+
+    Args:
+        fields: shape of each, () for a number; or the type of a record within the record.
+    """
+    kinds = fields.items()
+    return np.dtype([(n, k if isinstance(k, np.dtype) else (float, k)) for n, k in kinds])
+
+
+def size_of(kind: np.dtype) -> int:
+    """How many numbers a record has."""
+    return kind.itemsize // np.dtype(float).itemsize
+
+
+def as_record(vector: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """A vector (size,) seen as a record; it is a view. (`vector.view` takes three times as long.)"""
+    return np.ndarray((), kind, vector)
+
+
+def parts(kind: np.dtype) -> dict[str, slice]:
+    """Where the fields of a record are in its vector; fields without numbers are left out."""
+    number = np.dtype(float).itemsize
+    ends = {name: (offset, field.itemsize) for name, (field, offset) in kind.fields.items()}
+    return {
+        name: slice(start // number, (start + size) // number)
+        for name, (start, size) in ends.items()
+        if size > 0
+    }
+
+
+def record(**values: Any) -> np.ndarray:
+    """A record of constants for compiled functions.
+
+    Args:
+        values: numbers, arrays, records, or dataclasses, whose numbers are taken.
+    """
+    arrays = {name: _as_array(value) for name, value in values.items()}
+    kind = np.dtype([(name, x.dtype, x.shape) for name, x in arrays.items()], align=True)
+    result = np.empty((), kind)
+    for name, array in arrays.items():
+        result[name] = array
+    return result
+
+
+def _as_array(value: Any) -> np.ndarray:
+    if is_dataclass(value):
+        return record(**{name: x for name, x in vars(value).items() if isinstance(x, int | float)})
+    return np.asarray(float(value) if type(value) is int else value)
