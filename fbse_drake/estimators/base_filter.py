@@ -1,8 +1,10 @@
-"""Base state from IMU, standing feet and foot forces in one filter (right-invariant EKF).
+"""Attitude, velocity and position of the base, the feet that stand and the IMU's biases together.
 
-After R. Hartley, M. Ghaffari, R. M. Eustice, J. W. Grizzle, "Contact-aided invariant extended Kalman
-filtering for robot state estimation", Int. J. Robotics Research 39(4), 2020, with the orientation of
-standing feet (Bloesch et al., RSS 2012) and foot forces besides.
+A right-invariant extended Kalman filter after R. Hartley, M. Ghaffari, R. M. Eustice and
+J. W. Grizzle, "Contact-aided invariant extended Kalman filtering for robot state estimation",
+Int. J. Robotics Research 39(4), 2020; with the orientation of feet that stand, after M. Bloesch et
+al., "State estimation for legged robots on unstable and slippery terrain", IROS 2013; and with the
+acceleration of the centre of mass from the foot forces.
 """
 
 import math
@@ -10,243 +12,759 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from pydrake.systems.framework import BasicVector, Context
 
-# Blocks of three of the error state: attitude, velocity, position, biases of gyro and accelerometer;
-# then for each foot its position and orientation.
-_ATTITUDE, _VELOCITY, _POSITION, _GYRO, _ACCELEROMETER, _FEET = range(0, 18, 3)
-# Groups of what a standing foot tells.
-POSITION, ORIENTATION, VELOCITY, RATE = range(4)
+from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.records import as_record, record, record_type
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.spatial import (
+    Rotation,
+    Vector,
+    add,
+    conjugate,
+    cross,
+    dot,
+    matrix_product,
+    normalized,
+    put,
+    quaternion,
+    quaternion_from_gravity,
+    quaternion_of,
+    quaternion_product,
+    rotate,
+    rotate_back,
+    rotation,
+    rotation_matrix,
+    rotation_vector,
+    rotation_vector_to_quaternion,
+    scale,
+    skew,
+    subtract,
+    vector,
+    yaw_of,
+)
+from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
+
+_NOT_FINITE = float(Status.NOT_FINITE)
+# Where three errors each start in the filter's error state; every foot has six, of its position and
+# its orientation.
+_ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = range(0, 18, 3)
+# What a standing foot tells.
+_FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_OPPOSITE = (-1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+_NONE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+# While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2].
+_UNKNOWN_RATE, _UNKNOWN_ACCELERATION = 0.3, 3.0
+# An innovation is taken for a fault, and counts as little as makes it just likely, above this
+# quantile of chi^2 with three degrees of freedom (one in 3000).
+_GATE = 18.5
+# For how long innovations must agree to be no white noise [s], and how much larger than white noise
+# leaves it their mean square must be.
+_AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# Below this share of its weight, the robot is not carried by its feet.
+_CARRIED = 0.3
+# A foot that carries less than this share of the weight moves more easily the less it carries.
+_FIRM_LOAD = 0.5
+
+
+@dataclass(frozen=True)
+class InvariantFilter:
+    """What the filter believes of the robot; what it believes of the sensors, see `SensorBeliefs`.
+
+    Errors that last are given by their size (standard deviation) and by how long they last.
+    """
+
+    # What a standing foot does in spite of all, because it rolls, tilts, slips or sinks: position
+    # [m], orientation [rad], velocity [m/s] and angular velocity [rad/s] ...
+    foot_position: float = 3.5e-4
+    foot_orientation: float = 5.0e-3
+    foot_velocity: float = 1.5e-3
+    foot_rate: float = 1.5e-2
+    # ... and how long that lasts [s].
+    foot_time: float = 0.1
+    # How far a standing foot creeps: random walk of position [m/sqrt(s)] and orientation
+    # [rad/sqrt(s)].
+    foot_creep: float = 1.0e-3
+    foot_turning: float = 1.0e-3
+    # How wrong the mean acceleration of the robot by its foot forces is: any way [m/s^2] and as a
+    # share of the whole, through wrong masses and gains; and how long that lasts [s].
+    force_error: float = 0.05
+    force_gain_error: float = 0.05
+    force_time: float = 0.3
+    # How level the ground is under standing soles [rad]; 0 says nothing of it.
+    level_ground: float = 0.0
+    # Random walks of the biases of gyro [rad/s/sqrt(s)] and accelerometer [m/s^2/sqrt(s)].
+    gyro_walk: float = 1.0e-5
+    accelerometer_walk: float = 1.0e-4
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self,
+            "foot_position",
+            "foot_orientation",
+            "foot_velocity",
+            "foot_rate",
+            "foot_time",
+            "force_error",
+            "force_time",
+        )
+        require_not_negative(
+            self,
+            "foot_creep",
+            "foot_turning",
+            "force_gain_error",
+            "level_ground",
+            "gyro_walk",
+            "accelerometer_walk",
+        )
 
 
 @njit(cache=True)
-def skew(a: np.ndarray) -> np.ndarray:
-    """Matrix of a x."""
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-
-
-@njit(cache=True)
-def exp_so3(r: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector [rad]."""
-    angle2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6, 0.5 - angle2 / 24
-    else:
-        angle = math.sqrt(angle2)
-        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2
-    K = skew(r)
-    R = np.eye(3)
+def _add_product(to: np.ndarray, row: int, A: Rotation, source: np.ndarray, block: int) -> None:
+    """to[row : row + 3] += A source[block : block + 3]."""
     for i in range(3):
-        for j in range(3):
-            R[i, j] += a * K[i, j] + b * (r[i] * r[j])
-        R[i, i] -= b * angle2
-    return R
+        x, y, z = A[3 * i], A[3 * i + 1], A[3 * i + 2]
+        for j in range(to.shape[1]):
+            total = x * source[block, j] + y * source[block + 1, j] + z * source[block + 2, j]
+            to[row + i, j] += total
 
 
 @njit(cache=True)
-def log_so3(R: np.ndarray) -> np.ndarray:
-    """Rotation vector of a rotation of less than half a turn [rad]."""
-    r = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = 0.5 * math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
-    cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1)
-    angle = math.atan2(sine, cosine)
-    return r * (0.5 if sine < 1e-9 else 0.5 * angle / sine)
+def _propagate(P: np.ndarray, x: np.ndarray, gravity: Vector, T: float) -> None:
+    """P becomes F P F^T, with F = I + T A of the right-invariant error.
 
-
-@njit(cache=True)
-def mul(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """A B of 3 x 3 matrices."""
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-    return C
-
-
-@njit(cache=True)
-def mulT(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """A B^T of 3 x 3 matrices."""
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
-    return C
-
-
-@njit(cache=True)
-def apply(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """A b."""
-    return np.array([A[i, 0] * b[0] + A[i, 1] * b[1] + A[i, 2] * b[2] for i in range(3)])
-
-
-@njit(cache=True)
-def apply_T(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """A^T b."""
-    return np.array([A[0, i] * b[0] + A[1, i] * b[1] + A[2, i] * b[2] for i in range(3)])
-
-
-@njit(cache=True)
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b."""
-    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return np.array([x, y, z])
-
-
-@njit(cache=True)
-def _add_rows(to: np.ndarray, row: int, A: np.ndarray, source: np.ndarray, block: int) -> None:
-    """to[row] += A source[block], blocks of three rows."""
-    for i in range(3):
-        for k in range(3):
-            a = A[i, k]
-            if a != 0.0:
-                for j in range(to.shape[1]):
-                    to[row + i, j] += a * source[block + k, j]
-
-
-@njit(cache=True)
-def predict(x, P, w, f, elapsed, gravity, gyro_variance, acc_variance, walks, standing):
-    """x: named arrays."""
-    R, v, p, feet = x[0], x[1], x[2], x[3]
-    n, T = len(P), elapsed
-    TR = R * (-T)
-    F_v, F_p = mul(skew(v), TR), mul(skew(p), TR)
-    G = skew(gravity) * T
-    eye = np.eye(3) * T
-    F_d = [mul(skew(feet[k]), TR) for k in range(len(feet))]
-    for transposed in range(2):
+    Args:
+        x: record of the posterior where the step begins.
+    """
+    R = rotation(x.rotation)
+    TR = _scaled(-T, R)
+    fall = _scaled(T, skew(gravity))
+    of_velocity = matrix_product(skew(vector(x.imu_velocity)), TR)
+    of_position = matrix_product(skew(vector(x.imu_position)), TR)
+    for _ in range(2):
         M = P.copy()
-        _add_rows(M, _ATTITUDE, TR, P, _GYRO)
-        _add_rows(M, _VELOCITY, G, P, _ATTITUDE)
-        _add_rows(M, _VELOCITY, F_v, P, _GYRO)
-        _add_rows(M, _VELOCITY, TR, P, _ACCELEROMETER)
-        _add_rows(M, _POSITION, eye, P, _VELOCITY)
-        _add_rows(M, _POSITION, F_p, P, _GYRO)
-        for k in range(len(feet)):
-            _add_rows(M, _FEET + 6 * k, F_d[k], P, _GYRO)
-        for i in range(n):
-            for j in range(n):
-                P[i, j] = M[j, i]
-    # Noise of the gyro enters attitude and, by the group, all that turns with it.
-    q = gyro_variance
-    blocks = [(_ATTITUDE, TR), (_VELOCITY, F_v), (_POSITION, F_p)]
-    for k in range(len(feet)):
-        blocks.append((_FEET + 6 * k, F_d[k]))
-    for a in range(len(blocks)):
-        for b in range(len(blocks)):
-            C = mulT(blocks[a][1], blocks[b][1])
+        _add_product(M, _ATTITUDE, TR, P, _GYRO_BIAS)
+        _add_product(M, _VELOCITY, fall, P, _ATTITUDE)
+        _add_product(M, _VELOCITY, of_velocity, P, _GYRO_BIAS)
+        _add_product(M, _VELOCITY, TR, P, _ACCELEROMETER_BIAS)
+        _add_product(M, _POSITION, of_position, P, _GYRO_BIAS)
+        for i in range(3):
+            for j in range(len(P)):
+                M[_POSITION + i, j] += T * P[_VELOCITY + i, j]
+        for foot in range(len(x.foot_standing)):
+            if x.foot_standing[foot] > 0:
+                of_foot = matrix_product(skew(vector(x.foot_position[foot])), TR)
+                _add_product(M, _FEET + 6 * foot, of_foot, P, _GYRO_BIAS)
+        P[:] = M.T
+
+
+@njit(cache=True)
+def _scaled(factor: float, A: Rotation) -> Rotation:
+    return (
+        factor * A[0],
+        factor * A[1],
+        factor * A[2],
+        factor * A[3],
+        factor * A[4],
+        factor * A[5],
+        factor * A[6],
+        factor * A[7],
+        factor * A[8],
+    )
+
+
+@njit(cache=True)
+def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
+    for i in range(start, start + 3):
+        P[i, i] += variance
+
+
+@njit(cache=True)
+def _predict(
+    x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known
+) -> None:
+    """The step that ends now, in place.
+
+    Args:
+        x: record of the posterior where the step begins.
+        w, f: angular velocity and specific force of the IMU in base axes, free of biases.
+        rate_variance: of w and of the velocity change by f over the step, see below.
+        known: see `_estimate_base`.
+    """
+    config, gravity = known.config, vector(known.gravity)
+    _propagate(P, x, gravity, T)
+    # Noise of the gyro turns attitude, and by the group all that turns with it.
+    sources = (_ATTITUDE, _VELOCITY, _POSITION)
+    v, p = vector(x.imu_velocity), vector(x.imu_position)
+    q = rate_variance * T * T
+    lever = (_IDENTITY, skew(v), skew(p))
+    for a in range(3):
+        for b in range(3):
+            A, B = lever[a], lever[b]
             for i in range(3):
                 for j in range(3):
-                    P[blocks[a][0] + i, blocks[b][0] + j] += q * C[i, j]
-    for i in range(3):
-        P[_VELOCITY + i, _VELOCITY + i] += acc_variance * T * T
-        P[_GYRO + i, _GYRO + i] += walks[0] ** 2 * T
-        P[_ACCELEROMETER + i, _ACCELEROMETER + i] += walks[1] ** 2 * T
-        for k in range(len(feet)):
-            if standing[k] > 0:
-                P[_FEET + 6 * k + i, _FEET + 6 * k + i] += walks[2] ** 2 * T
-                P[_FEET + 6 * k + 3 + i, _FEET + 6 * k + 3 + i] += walks[3] ** 2 * T
-    acceleration = apply(R, f) + gravity
-    turned = mul(R, exp_so3(w * T))
-    for i in range(3):
-        p[i] += T * v[i] + 0.5 * T * T * acceleration[i]
-        v[i] += T * acceleration[i]
-        for j in range(3):
-            R[i, j] = turned[i, j]
+                    total = 0.0
+                    for k in range(3):
+                        total += A[3 * i + k] * B[3 * j + k]
+                    P[sources[a] + i, sources[b] + j] += q * total
+    _add_noise(P, _GYRO_BIAS, config.gyro_walk**2 * T)
+    _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
+    for foot in range(len(x.foot_standing)):
+        if x.foot_standing[foot] > 0:
+            _add_noise(P, _FEET + 6 * foot, config.foot_creep**2 * T)
+            _add_noise(P, _FEET + 6 * foot + 3, config.foot_turning**2 * T)
+    acceleration = add(rotate(rotation(x.rotation), f), gravity)
+    put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
+    put(x.imu_velocity, add(v, scale(T, acceleration)))
+    _turn(x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w))))
 
 
 @njit(cache=True)
-def inverse3(S: np.ndarray) -> np.ndarray:
+def _turn(x: np.ndarray, q: tuple[float, float, float, float]) -> None:
+    """Sets the attitude."""
+    q = normalized(q)
+    put(x.orientation, q)
+    put(x.rotation, rotation_matrix(q))
+
+
+@njit(cache=True)
+def _inverse(S: np.ndarray) -> Rotation:
     """Inverse of a symmetric 3 x 3 matrix."""
     a, b, c, d, e, f = S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2]
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * A + b * B + c * C
     D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
-    return np.array([[A, B, C], [B, D, E], [C, E, F]]) / det
+    scaling = 1.0 / (a * A + b * B + c * C)
+    return _scaled(scaling, (A, B, C, B, D, E, C, E, F))
 
 
 @njit(cache=True)
-def update(P, dx, z, blocks, signs, matrices, noise, keep, mean, limit):
-    """Kalman update with a vector z (3,) = sum of signs * matrices * error blocks + noise.
+def _update(
+    P: np.ndarray,
+    correction: np.ndarray,
+    z: Vector,
+    first: int,
+    A: Rotation,
+    second: int,
+    B: Rotation,
+    noise: np.ndarray,
+    keep: float,
+    agreement: np.ndarray,
+    innovation: np.ndarray,
+) -> float:
+    """Kalman update with z = A error[first] + B error[second] + noise, in place.
 
-    `dx` (n,) collects the correction. `mean` is the running mean of the innovation, which widens the
-    noise; returns NIS.
+    Innovations that agree with each other are no white noise, whatever P and the noise say: as
+    many as agree count as one with their mean as its error. One beyond all likelihood counts as
+    little as makes it likely.
+
+    Args:
+        P, correction: covariance of the errors, and what is known of them since P was made, (n,).
+        noise: covariance of z's noise, (3, 3).
+        keep: what a tick leaves of the running mean of innovations `agreement` (3,).
+        innovation: filled, (3,).
+
+    Returns:
+        Variance of the innovation, mean over its axes; as widened.
     """
     n = len(P)
-    e = z.copy()
-    PH = np.zeros((n, 3))
-    for k in range(len(blocks)):
-        b, A = blocks[k], matrices[k]
-        for i in range(3):
-            for j in range(3):
-                a = signs[k] * A[i, j]
-                if a != 0.0:
-                    e[i] -= a * dx[b + j]
-                    for m in range(n):
-                        PH[m, i] += a * P[m, b + j]
-    S = noise.copy()
-    for k in range(len(blocks)):
-        b, A = blocks[k], matrices[k]
-        for i in range(3):
-            for j in range(3):
-                a = signs[k] * A[i, j]
-                if a != 0.0:
-                    for m in range(3):
-                        S[i, m] += a * PH[b + j, m]
-    # What the innovations have in common is no white noise: as many of them count as one.
-    count = (1 + keep) / (1 - keep)
-    excess = 0.0
+    PH, S = np.zeros((3, n)), noise.copy()
     for i in range(3):
-        mean[i] = keep * mean[i] + (1 - keep) * e[i]
-        excess += (count * mean[i] ** 2 - limit * S[i, i]) / 3
-    if excess > 0:
-        for i in range(3):
-            S[i, i] += excess
-    W = inverse3(S)
-    nis = 0.0
+        e = z[i]
+        for k in range(3):
+            a, b = A[3 * i + k], B[3 * i + k]
+            e -= a * correction[first + k] + b * correction[second + k]
+            for j in range(n):
+                PH[i, j] += a * P[first + k, j] + b * P[second + k, j]
+        innovation[i] = e
     for i in range(3):
         for j in range(3):
-            nis += e[i] * W[i, j] * e[j]
-    # One that is out of all likelihood counts as little as makes it likely.
-    if nis > 16.0:
-        W *= 16.0 / nis
-    K = np.zeros((n, 3))
-    for m in range(n):
+            for k in range(3):
+                S[i, j] += PH[i, first + k] * A[3 * j + k] + PH[i, second + k] * B[3 * j + k]
+    count, excess = (1.0 + keep) / (1.0 - keep), 0.0
+    for i in range(3):
+        agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
+        excess += (count * agreement[i] ** 2 - _AGREEMENT * S[i, i]) / 3.0
+    W = _inverse(S)
+    distance = dot(vector(innovation), rotate(W, vector(innovation)))
+    widening = max(0.0, excess)
+    if distance > _GATE:
+        widening += (distance / _GATE - 1.0) * (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
+    if widening > 0.0:
         for i in range(3):
-            K[m, i] = PH[m, 0] * W[0, i] + PH[m, 1] * W[1, i] + PH[m, 2] * W[2, i]
-    for m in range(n):
-        dx[m] += K[m, 0] * e[0] + K[m, 1] * e[1] + K[m, 2] * e[2]
-        for k in range(m + 1):
-            P[m, k] -= K[m, 0] * PH[k, 0] + K[m, 1] * PH[k, 1] + K[m, 2] * PH[k, 2]
-            P[k, m] = P[m, k]
-    return nis, e, S
+            S[i, i] += widening
+        W = _inverse(S)
+    gain = np.empty((3, n))
+    for i in range(3):
+        x, y, z_ = W[3 * i], W[3 * i + 1], W[3 * i + 2]
+        for j in range(n):
+            gain[i, j] = x * PH[0, j] + y * PH[1, j] + z_ * PH[2, j]
+    e0, e1, e2 = innovation[0], innovation[1], innovation[2]
+    for i in range(n):
+        a, b, c = gain[0, i], gain[1, i], gain[2, i]
+        correction[i] += a * e0 + b * e1 + c * e2
+        for j in range(n):
+            P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
+    return (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
 
 
 @njit(cache=True)
-def retract(x, bg, ba, dx, feet_R):
-    R, v, p, d = x
-    turn = exp_so3(dx[_ATTITUDE : _ATTITUDE + 3])
-    R[:] = mul(turn, R)
-    v[:] = apply(turn, v) + dx[_VELOCITY : _VELOCITY + 3]
-    p[:] = apply(turn, p) + dx[_POSITION : _POSITION + 3]
-    bg += dx[_GYRO : _GYRO + 3]
-    ba += dx[_ACCELEROMETER : _ACCELEROMETER + 3]
-    for k in range(len(d)):
-        b = _FEET + 6 * k
-        d[k] = apply(turn, d[k]) + dx[b : b + 3]
-        feet_R[k] = mul(exp_so3(dx[b + 3 : b + 6]), feet_R[k])
-    dx[:] = 0.0
+def _correct(x: np.ndarray, error: np.ndarray) -> None:
+    """Moves the estimate along the group by an error (n,)."""
+    turn = rotation_vector_to_quaternion(vector(error[_ATTITUDE:_VELOCITY]))
+    R = rotation_matrix(turn)
+    _turn(x, quaternion_product(turn, quaternion(x.orientation)))
+    v, p = rotate(R, vector(x.imu_velocity)), rotate(R, vector(x.imu_position))
+    put(x.imu_velocity, add(v, vector(error[_VELOCITY:_POSITION])))
+    put(x.imu_position, add(p, vector(error[_POSITION:_GYRO_BIAS])))
+    for i in range(3):
+        x.gyro_bias_B[i] += error[_GYRO_BIAS + i]
+        x.accelerometer_bias_B[i] += error[_ACCELEROMETER_BIAS + i]
+    for foot in range(len(x.foot_standing)):
+        if not x.foot_standing[foot] > 0:
+            continue
+        start = _FEET + 6 * foot
+        p = rotate(R, vector(x.foot_position[foot]))
+        put(x.foot_position[foot], add(p, vector(error[start : start + 3])))
+        turn = rotation_vector_to_quaternion(vector(error[start + 3 : start + 6]))
+        q = quaternion_product(turn, quaternion(x.foot_orientation[foot]))
+        put(x.foot_orientation[foot], normalized(q))
 
 
 @njit(cache=True)
-def land(P, foot, position_variance, orientation_variance):
-    """The error of a foot that lands is that of the base and of the leg."""
-    n = len(P)
-    for part in range(2):
-        to, source = _FEET + 6 * foot + 3 * part, _ATTITUDE if part else _POSITION
-        for i in range(3):
-            for j in range(n):
-                P[to + i, j] = P[source + i, j]
-        for i in range(3):
-            for j in range(n):
-                P[j, to + i] = P[j, source + i]
-        for i in range(3):
-            P[to + i, to + i] += orientation_variance if part else position_variance
+def _land(P: np.ndarray, foot: int) -> None:
+    """The errors of a foot that lands are those of the base."""
+    for part, source in ((0, _POSITION), (3, _ATTITUDE)):
+        start = _FEET + 6 * foot + part
+        P[start : start + 3] = P[source : source + 3]
+        P[:, start : start + 3] = P[:, source : source + 3]
+
+
+@njit(cache=True)
+def _leg_noise(J: np.ndarray, first: int) -> float:
+    """Mean square over three rows of what joint velocities with an error of one make there."""
+    total = 0.0
+    for i in range(first, first + 3):
+        for j in range(6, J.shape[1]):
+            total += J[i, j] ** 2
+    return total / 3.0
+
+
+@njit(cache=True)
+def _isotropic(variance: float) -> np.ndarray:
+    S = np.zeros((3, 3))
+    S[0, 0] = S[1, 1] = S[2, 2] = variance
+    return S
+
+
+@njit(cache=True)
+def _listen_to_foot(
+    x: np.ndarray,
+    P: np.ndarray,
+    correction: np.ndarray,
+    foot: int,
+    share: float,
+    w_raw: Vector,
+    model: np.ndarray,
+    elapsed: float,
+    known: np.ndarray,
+) -> None:
+    """What a foot that stands tells: where it is, how it is turned, and that it rests.
+
+    Args:
+        share: of the weight, that it carries.
+        w_raw: the gyro's reading in base axes.
+    """
+    config, sensors, J = known.config, known.sensors, model.foot_jacobian[foot]
+    R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
+    R_BF = rotation(model.foot_rotation[foot])
+    p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
+    start, keep = _FEET + 6 * foot, math.exp(-elapsed / _AGREEMENT_TIME)
+    # Errors that last for some time, as white noise that leaves as much over many ticks.
+    lasting = max(1.0, 2.0 * config.foot_time / elapsed) * max(1.0, _FIRM_LOAD / share) ** 2
+    angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
+    turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
+    agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
+    variance = x.foot_innovation_variance[foot]
+
+    z = subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p))
+    noise = _isotropic(config.foot_position**2 * lasting + moving * angle)
+    variance[_FOOT_POSITION] = _update(
+        P, correction, z, start, _IDENTITY, _POSITION, _OPPOSITE, noise, keep,
+        agreement[_FOOT_POSITION], innovation[_FOOT_POSITION],
+    )  # fmt: skip
+
+    q_BF = quaternion_of(R_BF)
+    seen = quaternion_product(quaternion(x.orientation), q_BF)
+    z = rotation_vector(quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot]))))
+    noise = _isotropic(config.foot_orientation**2 * lasting + turning * angle)
+    variance[_FOOT_ORIENTATION] = _update(
+        P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
+        agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
+    )  # fmt: skip
+
+    w_F, v_F = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for j in range(6, J.shape[1]):
+        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
+        v_F = add(v_F, scale(model.velocity[j], (J[3, j], J[4, j], J[5, j])))
+    w_BF, v_BF = rotate(R_BF, w_F), rotate(R_BF, v_F)
+    w = subtract(w_raw, vector(x.gyro_bias_B))
+    z = subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v)
+    gyro = sensors.angular_velocity_noise**2
+    noise = _isotropic(
+        config.foot_velocity**2 * lasting + moving * rate + dot(p_IF, p_IF) * gyro
+    )
+    variance[_FOOT_VELOCITY] = _update(
+        P, correction, z, _VELOCITY, _IDENTITY, _GYRO_BIAS, matrix_product(R, skew(p_IF)), noise,
+        keep, agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY],
+    )  # fmt: skip
+
+    z = add(w, w_BF)
+    noise = _isotropic(config.foot_rate**2 * lasting + turning * rate + gyro)
+    variance[_FOOT_RATE] = _update(
+        P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
+        agreement[_FOOT_RATE], innovation[_FOOT_RATE],
+    )  # fmt: skip
+
+    if config.level_ground > 0.0:
+        # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
+        n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
+        noise = _isotropic(config.level_ground**2 * lasting)
+        noise[2, 2] += 1e6
+        spare = np.zeros(3)
+        z = cross(n, (0.0, 0.0, 1.0))
+        _update(
+            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare, spare.copy(),
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _listen_to_forces(
+    x: np.ndarray,
+    P: np.ndarray,
+    correction: np.ndarray,
+    force: Vector,
+    f_raw: Vector,
+    w: Vector,
+    away: Vector,
+    away_before: Vector,
+    elapsed: float,
+    known: np.ndarray,
+) -> None:
+    """The foot forces tell how the centre of mass accelerates, and so the accelerometer's bias.
+
+    Args:
+        force: of the ground on the robot, in base axes [N].
+        f_raw: the accelerometer's reading in base axes [m/s^2].
+        w: angular velocity of the base [rad/s].
+        away, away_before: velocity of the centre of mass relative to the IMU in base axes, now and
+            a tick ago [m/s].
+    """
+    config = known.config
+    relative = add(scale(1.0 / elapsed, subtract(away, away_before)), cross(w, away))
+    f = subtract(f_raw, vector(x.accelerometer_bias_B))
+    z = subtract(add(f, relative), scale(1.0 / known.mass, force))
+    lasting = max(1.0, 2.0 * config.force_time / elapsed)
+    noise = _isotropic(config.force_error**2 * lasting)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += config.force_gain_error**2 * lasting * f_raw[i] * f_raw[j]
+    x.force_innovation_variance = _update(
+        P, correction, z, _ACCELEROMETER_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise,
+        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
+    """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
+    to be."""
+    config, sensors, P = known.config, known.sensors, x.error_covariance
+    R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
+    f = rotate(R_BI, vector(measured.specific_force))
+    _turn(x, quaternion_from_gravity(f, 0.0))
+    R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
+    for foot in range(feet):
+        middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
+    base = subtract(vector(known.origin), rotate(R, middle))
+    put(x.imu_position, add(base, rotate(R, p_BI)))
+    for i in range(2):  # Yaw and place are what they are said to be.
+        P[_ATTITUDE + i, _ATTITUDE + i] = known.start.tilt**2
+    _add_noise(P, _VELOCITY, known.start.velocity**2)
+    _add_noise(P, _GYRO_BIAS, sensors.angular_velocity_bias**2 + 1e-12)
+    _add_noise(P, _ACCELEROMETER_BIAS, sensors.acceleration_bias**2 + 1e-12)
+    # What the accelerometer reads is gravity, its bias and some motion.
+    correction, spare = np.zeros(len(P)), np.zeros(3)
+    reading = rotate(R, f)
+    z = add(reading, vector(known.gravity))
+    noise = _isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
+    _update(
+        P, correction, z, _ATTITUDE, skew(reading), _ACCELEROMETER_BIAS, R, noise, 0.0, spare,
+        spare.copy(),
+    )  # fmt: skip
+    _correct(x, correction)
+
+
+@njit(cache=True)
+def _estimate_base(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    model: np.ndarray,
+    known: np.ndarray,
+) -> None:
+    """One tick of `InvariantBaseFilter`; fills the posterior.
+
+    Args:
+        known: record with the numbers of `InvariantFilter` and `SensorBeliefs`, `mount`, see
+            `ImuMount`, `pads`, see `FootPads`, `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
+            sure the first posterior is, and `origin`, where the middle of the soles is at the start
+            (3,) [m].
+    """
+    posterior[()] = last[()]
+    x, last, measured, model, known = posterior[()], last[()], measured[()], model[()], known[()]
+    trust, feet, sensors, P = measured.trust, len(measured.support), known.sensors, x.error_covariance
+    first = math.isnan(elapsed)
+    if first and trust[:2].max() > 0:
+        x.status = _NOT_FINITE
+        return
+    x.status = trust.max()
+    R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
+    w_raw = rotate(R_BI, vector(measured.angular_velocity))
+    f_raw = rotate(R_BI, vector(measured.specific_force))
+    if first:
+        _start(x, measured, model, known)
+    else:
+        w, f = subtract(w_raw, vector(x.gyro_bias_B)), subtract(f_raw, vector(x.accelerometer_bias_B))
+        rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
+        if trust[1] > 0:
+            w, f = (0.0, 0.0, 0.0), rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
+            rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
+        _predict(x, P, w, f, rate_noise**2, elapsed, known)
+        _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
+    R = rotation(x.rotation)
+    wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
+    weight, force, carried = known.mass * 9.81, (0.0, 0.0, 0.0), 0.0
+    x.foot_innovation[:] = 0.0
+    x.foot_innovation_variance[:] = 0.0
+    correction = np.zeros(len(P))
+    for foot in range(feet):
+        load, stands = wrench[foot, 5], measured.support[foot] > 0
+        if stands and not x.foot_standing[foot] > 0:
+            _land(P, foot)
+            p_IF = subtract(vector(model.foot_position[foot]), p_BI)
+            put(x.foot_position[foot], add(vector(x.imu_position), rotate(R, p_IF)))
+            q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
+            put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
+            x.foot_agreement[foot] = 0.0
+            # It stands when the tick is over: what was just set it cannot correct.
+        elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
+            share = max(load, 1.0) / weight
+            _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
+        x.foot_standing[foot] = measured.support[foot]
+        R_BF = rotation(model.foot_rotation[foot])
+        force = add(force, rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load)))
+        carried += load
+    # Velocity of the centre of mass relative to the IMU.
+    w = subtract(w_raw, vector(x.gyro_bias_B))
+    away = subtract(vector(model.com_velocity), cross(w, p_BI))
+    was_known = last.away_known > 0 and not first
+    if was_known and trust.max() == 0 and carried > _CARRIED * weight:
+        before = vector(last.away)
+        _listen_to_forces(x, P, correction, force, f_raw, w, away, before, elapsed, known)
+    put(x.away, away)
+    x.away_known = 1.0 if trust[0] == 0 and trust[1] == 0 else 0.0
+    _correct(x, correction)
+    _conclude(x, w_raw, wrench, measured, model, known)
+
+
+@njit(cache=True)
+def _conclude(
+    x: np.ndarray,
+    w_raw: Vector,
+    wrench: np.ndarray,
+    measured: np.ndarray,
+    model: np.ndarray,
+    known: np.ndarray,
+) -> None:
+    """Fills what follows from the state: the base, the centre of mass and the ZMP."""
+    P, R = x.error_covariance, rotation(x.rotation)
+    R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
+    w = subtract(w_raw, vector(x.gyro_bias_B))
+    if measured.trust[1] == 0:
+        put(x.angular_velocity, w)
+    w = vector(x.angular_velocity)
+    position = subtract(vector(x.imu_position), rotate(R, p_BI))
+    velocity = subtract(vector(x.imu_velocity), rotate(R, cross(w, p_BI)))
+    put(x.base_position, position)
+    put(x.base_velocity, velocity)
+    put(x.com_position, add(position, rotate(R, vector(model.com))))
+    put(x.com_velocity, add(velocity, rotate(R, vector(model.com_velocity))))
+    put(x.angular_velocity_bias, rotate_back(R_BI, vector(x.gyro_bias_B)))
+    put(x.acceleration_bias, rotate_back(R_BI, vector(x.accelerometer_bias_B)))
+    total, zmp_x, zmp_y = 0.0, 0.0, 0.0
+    for foot in range(len(x.foot_standing)):
+        load = wrench[foot, 5]
+        if x.foot_standing[foot] > 0 and measured.trust[2 + foot] == 0 and load > 1.0:
+            lever = (-wrench[foot, 1] / load, wrench[foot, 0] / load, 0.0)
+            R_WF = rotation_matrix(quaternion(x.foot_orientation[foot]))
+            centre = add(vector(x.foot_position[foot]), rotate(R_WF, lever))
+            zmp_x, zmp_y, total = zmp_x + load * centre[0], zmp_y + load * centre[1], total + load
+    if total > 0:
+        put(x.zmp, (zmp_x / total, zmp_y / total))
+    # The group's errors of velocity and position turn with the attitude's: v - v_hat = xi_v + phi x v.
+    for i in range(3):
+        x.attitude_std[i] = math.sqrt(max(0.0, P[_ATTITUDE + i, _ATTITUDE + i]))
+        x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[_GYRO_BIAS + i, _GYRO_BIAS + i]))
+        at = _ACCELEROMETER_BIAS + i
+        x.acceleration_bias_std[i] = math.sqrt(max(0.0, P[at, at]))
+        x.velocity_std[i] = _moved_std(P, _VELOCITY, i, velocity)
+        x.position_std[i] = _moved_std(P, _POSITION, i, position)
+
+
+@njit(cache=True)
+def _moved_std(P: np.ndarray, block: int, i: int, a: Vector) -> float:
+    """Standard deviation of component i of error[block] + attitude error x a."""
+    j, k = (i + 1) % 3, (i + 2) % 3
+    # Component i of phi x a is phi_j a_k - phi_k a_j.
+    m, s, t = block + i, _ATTITUDE + j, _ATTITUDE + k
+    variance = P[m, m] + a[k] ** 2 * P[s, s] + a[j] ** 2 * P[t, t]
+    variance += 2.0 * (a[k] * P[m, s] - a[j] * P[m, t] - a[j] * a[k] * P[s, t])
+    return math.sqrt(max(0.0, variance))
+
+
+class InvariantBaseFilter(RecursiveEstimator):
+    """Attitude, velocity and position of the base with the IMU's biases, see `InvariantFilter`.
+
+    .. pydrake_system::
+
+        name: InvariantBaseFilter
+        input_ports:
+        - measurements
+        - model
+        output_ports:
+        - posterior
+        - (one for each field)
+        - last_angular_velocity_bias
+
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
+    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+
+        orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
+        rotation               (3, 3)  R_WB
+        angular_velocity       (3,)    of the base in base axes, free of the bias [rad/s]
+        base_position, base_velocity   (3,)  of the base's origin [m, m/s]
+        com_position, com_velocity     (3,)  [m, m/s]
+        zmp                    (2,)    from the foot forces (eqs. 8, 9) [m]
+        attitude_std, velocity_std, position_std   (3,)  standard deviations, of a rotation vector
+                                       in world axes [rad], [m/s], [m]
+        angular_velocity_bias, acceleration_bias   (3,)  of the IMU in its axes [rad/s, m/s^2], and
+                                       `..._std` in base axes
+        imu_position, imu_velocity     (3,)  of the IMU [m, m/s]
+        gyro_bias_B, accelerometer_bias_B   (3,)  in base axes
+        foot_standing          (feet,)     who stood at the last tick
+        foot_position, foot_orientation   (feet, 3), (feet, 4)  of each sole while it stands
+        error_covariance       (n, n)  of the errors [attitude, velocity, position, gyro bias,
+                                       accelerometer bias, (position, orientation) of each foot] on
+                                       the group, n = 15 + 6 feet
+        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's position,
+                                       orientation, velocity and angular velocity; the variance is
+                                       the mean over the axes
+        force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
+        foot_agreement, force_agreement   running means of the innovations
+        away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
+                                       axes [m/s], and whether it was measured
+    """
+
+    def __init__(
+        self,
+        config: InvariantFilter,
+        sensors: SensorBeliefs,
+        robot: Robot,
+        measurements: np.dtype,
+        model: np.dtype,
+        clock: Clock,
+        origin: tuple[float, float],
+    ):
+        """Declares ports and state.
+
+        Args:
+            measurements, model: types of the inputs' posteriors.
+            origin: where the middle of the soles is at the start, (x, y) [m].
+        """
+        super().__init__(base_filter_type(robot), clock)
+        pads, plant = FootPads(robot), robot.plant
+        self._known = record(
+            config=config,
+            sensors=sensors,
+            mount=record(**vars(ImuMount(robot))),
+            pads=record(position=pads.position, foot=pads.foot),
+            mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
+            gravity=plant.gravity_field().gravity_vector(),
+            start=record(tilt=0.2, velocity=0.1, acceleration=0.05),
+            origin=np.array([*origin, 0.0]),
+        )
+        self._measurements = self._declare_record_input("measurements", measurements)
+        self._model = self._declare_record_input("model", model)
+        self._declare_posterior("measurements", "model")
+        self.DeclareVectorOutputPort(
+            "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
+        )
+
+    def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
+        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        output.SetFromVector(last["angular_velocity_bias"])
+
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
+        measured, model = self._measurements.Eval(context), self._model.Eval(context)
+        _estimate_base(posterior, last, elapsed, measured, model, self._known)
+
+
+def base_filter_type(robot: Robot) -> np.dtype:
+    """Type of the posterior of `InvariantBaseFilter`."""
+    feet = len(robot.description.sides)
+    n = _FEET + 6 * feet
+    triples = (
+        "angular_velocity",
+        "base_position",
+        "base_velocity",
+        "com_position",
+        "com_velocity",
+        "attitude_std",
+        "velocity_std",
+        "position_std",
+        "angular_velocity_bias",
+        "acceleration_bias",
+        "angular_velocity_bias_std",
+        "acceleration_bias_std",
+        "imu_position",
+        "imu_velocity",
+        "gyro_bias_B",
+        "accelerometer_bias_B",
+        "away",
+        "force_innovation",
+        "force_agreement",
+    )
+    return record_type(
+        time=(),
+        status=(),
+        orientation=(4,),
+        rotation=(3, 3),
+        **dict.fromkeys(triples, (3,)),
+        zmp=(2,),
+        away_known=(),
+        force_innovation_variance=(),
+        foot_standing=(feet,),
+        foot_position=(feet, 3),
+        foot_orientation=(feet, 4),
+        foot_agreement=(feet, _TOLD, 3),
+        foot_innovation=(feet, _TOLD, 3),
+        foot_innovation_variance=(feet, _TOLD),
+        error_covariance=(n, n),
+    )

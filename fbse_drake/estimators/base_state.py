@@ -71,8 +71,6 @@ class ContactAided:
         require_not_negative(self, "acceleration_error")
 
 
-BaseStateConfig = AdaptiveLipm | ContactAided
-
 # Acceleration of the base while the IMU is not trusted: zero, give or take this [m/s^2].
 _UNKNOWN_ACCELERATION = 3.0
 

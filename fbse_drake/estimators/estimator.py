@@ -8,14 +8,15 @@ from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
 from fbse_drake.estimators.base_state import (
     AdaptiveLipm,
     AdaptiveLipmEstimator,
-    BaseStateConfig,
     BaseStateEstimator,
     ContactAided,
     ContactAidedEstimator,
 )
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.friction import (
     FrictionConfig,
@@ -47,6 +48,9 @@ from fbse_drake.signals import estimates
 from fbse_drake.walking.plan import TaskPlan
 
 
+BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
+
+
 @dataclass(frozen=True)
 class Fbse:
     """Foot base sensor estimation: attitude, base state, joint accelerations, link torque, friction.
@@ -57,7 +61,8 @@ class Fbse:
     sensor_monitor: SensorMonitorConfig = field(default_factory=SensorMonitorConfig)
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
     # !ContactAided or the paper's !AdaptiveLipm.
-    base_state: BaseStateConfig = field(default_factory=ContactAided)
+    base_state: BaseStateConfig = field(default_factory=InvariantFilter)
+    sensors: SensorBeliefs = field(default_factory=SensorBeliefs)
     # !MeasuredSupport or the paper's !PlannedSupport.
     support: SupportConfig = field(default_factory=MeasuredSupport)
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
@@ -154,7 +159,10 @@ class EstimatorDiagram(Diagram):
             raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._type("sensor_monitor")
-        model = self._add("model", FloatingBaseModel(robot, measurements, clock))
+        invariant = isinstance(config.base_state, InvariantFilter)
+        model = self._add(
+            "model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant)
+        )
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
         if isinstance(config.support, PlannedSupport):
@@ -163,10 +171,27 @@ class EstimatorDiagram(Diagram):
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
             source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
             self._builder.Connect(source.get_output_port(), self._systems["sensor_monitor"].GetInputPort("planned_support"))
-        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock))
-        self._join(attitude, measurements="sensor_monitor", model="model")
         middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
-        shared = (robot, measurements, self._type("attitude"), self._type("model"), clock, (float(middle[0]), float(middle[1])))
+        origin = (float(middle[0]), float(middle[1]))
+        if invariant:
+            types = (measurements, self._type("model"))
+            both = InvariantBaseFilter(
+                config.base_state, config.sensors, robot, *types, clock, origin
+            )
+            self._add("base_state", both)
+            self._join(both, measurements="sensor_monitor", model="model")
+            self._builder.Connect(
+                both.GetOutputPort("last_angular_velocity_bias"),
+                model.GetInputPort("angular_velocity_bias"),
+            )
+            self._systems["attitude"] = both
+            return
+        attitude = self._add(
+            "attitude",
+            AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock),
+        )
+        self._join(attitude, measurements="sensor_monitor", model="model")
+        shared = (robot, measurements, self._type("attitude"), self._type("model"), clock, origin)
         base_state: BaseStateEstimator
         if isinstance(config.base_state, AdaptiveLipm):
             base_state = AdaptiveLipmEstimator(config.base_state, *shared)

@@ -29,6 +29,7 @@ from fbse_drake.estimators.spatial import (
     rotate,
     rotation,
     scale,
+    subtract,
     vector,
 )
 from fbse_drake.robot.plant import Robot
@@ -62,18 +63,22 @@ def base_specific_force(
 
 
 @njit(cache=True)
-def _plant_state(state: np.ndarray, measured: np.ndarray, known: np.ndarray) -> bool:
+def _plant_state(
+    state: np.ndarray, measured: np.ndarray, rate_bias: np.ndarray, known: np.ndarray
+) -> bool:
     """Puts the measured motion into a plant's state, in place; says whether all of it is finite.
 
     Args:
         state: [positions, velocities] of the plant; joint angles and velocities and the base's
             angular velocity are written.
+        rate_bias: of the gyro, (3,) [rad/s].
         known: record with `q_index` (n,) and `v_index` (6 + n,), places in the state of each
             joint's angle and each of our velocities [base angular, base linear, joints], and
             `mount`, see `ImuMount`.
     """
     measured, known = measured[()], known[()]
-    w = rotate(rotation(known.mount.R_BI), vector(measured.angular_velocity))
+    w_I = subtract(vector(measured.angular_velocity), vector(rate_bias))
+    w = rotate(rotation(known.mount.R_BI), w_I)
     for i in range(3):
         state[known.v_index[i]] = w[i]
     for i in range(len(known.q_index)):
@@ -154,12 +159,14 @@ class FloatingBaseModel(RecursiveEstimator):
         name: FloatingBaseModel
         input_ports:
         - measurements
+        - angular_velocity_bias
         output_ports:
         - posterior
         - (one for each field)
         - at_step_start
 
-    `measurements` is the posterior of a `SensorMonitor`. `posterior` belongs to the present tick;
+    `measurements` is the posterior of a `SensorMonitor`. `angular_velocity_bias` (3,) [rad/s] of
+    the gyro, as it was known a tick ago, is there where somebody estimates it. `posterior` belongs to the present tick;
     `at_step_start` to the tick before, where the step began whose accelerations and forces are
     measured now. Velocities are ordered [base angular (3), base linear (3), joints (n)] whatever
     the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but
@@ -176,11 +183,14 @@ class FloatingBaseModel(RecursiveEstimator):
         velocity        (v,)       [angular velocity, 0, joint velocities]
     """
 
-    def __init__(self, robot: Robot, measurements: np.dtype, clock: Clock):
+    def __init__(
+        self, robot: Robot, measurements: np.dtype, clock: Clock, *, knows_bias: bool = False
+    ):
         """Declares ports and state.
 
         Args:
             measurements: type of the input's posterior.
+            knows_bias: has an input `angular_velocity_bias`.
         """
         n, f = len(robot.joint_names), len(robot.description.sides)
         v = 6 + n
@@ -210,12 +220,16 @@ class FloatingBaseModel(RecursiveEstimator):
             v_index=robot.plant.num_positions() + order,
         )
         self._measurements = self._declare_record_input("measurements", measurements)
+        self._bias, inputs = None, ["measurements"]
+        if knows_bias:
+            self._bias = self.DeclareVectorInputPort("angular_velocity_bias", 3)
+            inputs.append("angular_velocity_bias")
         self._posture = self.DeclareCacheEntry(
             "plant in the measured posture",
             ValueProducer(allocate=self._allocate_posture, calc=self._calc_posture),
-            {self.input_port_ticket(self._measurements.port.get_index())},
+            {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs},
         )
-        self._declare_posterior("measurements")
+        self._declare_posterior(*inputs)
         self.DeclareStateOutputPort("at_step_start", self._last)
 
     def _allocate_posture(self) -> AbstractValue:
@@ -225,7 +239,8 @@ class FloatingBaseModel(RecursiveEstimator):
 
     def _calc_posture(self, context: Context, value: AbstractValue) -> None:
         posture, measured = value.get_mutable_value(), self._measurements.Eval(context)
-        posture.finite = _plant_state(posture.state, measured, self._known)
+        bias = _ORIGIN if self._bias is None else self._bias.Eval(context)
+        posture.finite = _plant_state(posture.state, measured, bias, self._known)
         if posture.finite:  # Drake would refuse it.
             self._plant.SetPositionsAndVelocities(posture.context, posture.state)
 

@@ -23,6 +23,10 @@ from fbse_drake.estimators.spatial import (
 from fbse_drake.robot.plant import Robot
 
 
+# For how long innovations must agree to be no noise [s].
+_AGREEMENT_TIME = 0.02
+
+
 @dataclass(frozen=True)
 class JointAccelerationConfig:
     """How accelerations are had, and the sensors' noise as it is believed."""
@@ -113,13 +117,20 @@ def fuse(
 
 @njit(cache=True)
 def measured_acceleration(
-    measured: np.ndarray, model: np.ndarray, elapsed: float, known: np.ndarray
+    last_rate: np.ndarray,
+    measured: np.ndarray,
+    attitude: np.ndarray,
+    model: np.ndarray,
+    elapsed: float,
+    known: np.ndarray,
 ) -> np.ndarray:
     """What gyro, accelerometer and encoders say of the accelerations of base and joints.
 
     Args:
-        measured, model: records of the posteriors of `SensorMonitor`, and of `FloatingBaseModel`
-            where the tick began.
+        last_rate: the gyro's reading a tick ago in base axes, (3,) [rad/s].
+        measured, attitude, model: records of the posteriors of `SensorMonitor`, of
+            `AttitudeEstimator` or `InvariantBaseFilter`, and of `FloatingBaseModel` where the tick
+            began.
         known: see `_fuse_accelerations`.
 
     Returns:
@@ -129,10 +140,11 @@ def measured_acceleration(
     v, velocity = len(model.velocity), model.velocity
     acceleration = np.empty(v)
     w_start = vector(velocity)
+    # Both readings have the same bias.
     w = rotate(R_BI, vector(measured.angular_velocity))
-    w_dot = scale(1.0 / elapsed, subtract(w, w_start))
+    w_dot = scale(1.0 / elapsed, subtract(w, vector(last_rate)))
     put(acceleration[:3], w_dot)
-    force = vector(measured.specific_force)
+    force = subtract(vector(measured.specific_force), vector(attitude.acceleration_bias))
     put(acceleration[3:6], base_specific_force(force, w_start, w_dot, R_BI, p_BI))
     for i in range(6, v):
         acceleration[i] = (measured.joint_velocity[i - 6] - velocity[i]) / elapsed
@@ -179,7 +191,11 @@ def standing_feet(measured: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _begin(
-    posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray
+    posterior: np.ndarray,
+    elapsed: float,
+    measured: np.ndarray,
+    model: np.ndarray,
+    known: np.ndarray,
 ) -> bool:
     """Sets a posterior to zero but for its status.
 
@@ -193,7 +209,10 @@ def _begin(
     posterior.sensitivity[:] = 0.0
     posterior.innovation[:] = 0.0
     posterior.innovation_variance[:] = 0.0
+    posterior.agreement[:] = 0.0
     posterior.status = max(measured.trust[0], measured.trust[1])
+    w_I = vector(measured.angular_velocity)
+    put(posterior.rate, rotate(rotation(known.mount.R_BI), w_I))
     if math.isnan(elapsed):
         return False
     # Where the tick began there may have been no measurement yet.
@@ -201,8 +220,47 @@ def _begin(
 
 
 @njit(cache=True)
+def _foot_variance(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    raw: np.ndarray,
+    J: np.ndarray,
+    y: np.ndarray,
+    stands: np.ndarray,
+    elapsed: float,
+    noise: np.ndarray,
+) -> np.ndarray:
+    """Variance of what standing feet accelerate, one for each row of the no-slip condition.
+
+    Where the other sensors keep saying that a foot does accelerate, because it slips, rolls or
+    sinks, it is believed to: by the mean that their noise does not reach, for as many ticks as that
+    mean lasts. The running means are filled.
+    """
+    keep, row = math.exp(-elapsed / _AGREEMENT_TIME), 0
+    count = (1.0 + keep) / (1.0 - keep)
+    variance = np.empty(len(y))
+    for foot in range(len(stands)):
+        agreement = posterior.agreement[foot]
+        agreement[:] = 0.0
+        if not stands[foot]:
+            continue
+        for i in range(6):
+            innovation = y[row + i]
+            for k in range(len(raw)):
+                innovation -= J[row + i, k] * raw[k]
+            agreement[i] = keep * last.agreement[foot, i] + (1.0 - keep) * innovation
+        for start, size in ((0, noise.foot_angular_acceleration), (3, noise.foot_acceleration)):
+            x, y_, z = agreement[start], agreement[start + 1], agreement[start + 2]
+            mean_square = (x * x + y_ * y_ + z * z) / 3.0
+            variance[row + start : row + start + 3] = size**2 + count * mean_square
+        row += 6
+    return variance
+
+
+@njit(cache=True)
 def _fuse_accelerations(
     posterior: np.ndarray,
+    last: np.ndarray,
     elapsed: float,
     measured: np.ndarray,
     attitude: np.ndarray,
@@ -215,20 +273,18 @@ def _fuse_accelerations(
         known: record with the numbers of `JointAccelerationConfig`, `mount`, see `ImuMount`, and
             `gravity` (3,) [m/s^2].
     """
-    posterior, measured, attitude = posterior[()], measured[()], attitude[()]
-    model, known = model[()], known[()]
-    if not _begin(posterior, elapsed, measured, model):
+    posterior, last, measured = posterior[()], last[()], measured[()]
+    attitude, model, known = attitude[()], model[()], known[()]
+    if not _begin(posterior, elapsed, measured, model, known):
         return
     noise, stands = known.noise, standing_feet(measured)
-    raw = measured_acceleration(measured, model, elapsed, known)
+    raw = measured_acceleration(last.rate, measured, attitude, model, elapsed, known)
     # Differences of velocities have their noise twice.
     variance = np.full(len(raw), 2 * (noise.joint_velocity_noise / elapsed) ** 2)
     variance[:3] = 2 * (noise.angular_velocity_noise / elapsed) ** 2
     variance[3:6] = noise.acceleration_noise**2
     J, y = no_slip_condition(model, attitude, stands, known.gravity)
-    foot_variance = np.full(len(y), noise.foot_acceleration**2)
-    for row in range(0, len(y), 6):
-        foot_variance[row : row + 3] = noise.foot_angular_acceleration**2
+    foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, noise)
     fused, sensitivity, innovation, innovation_variance = fuse(raw, variance, J, y, foot_variance)
     posterior.base_angular_acceleration[:] = fused[:3]
     posterior.base_specific_force[:] = fused[3:6]
@@ -247,6 +303,7 @@ def _fuse_accelerations(
 @njit(cache=True)
 def _no_slip_problem(
     posterior: np.ndarray,
+    last: np.ndarray,
     elapsed: float,
     measured: np.ndarray,
     attitude: np.ndarray,
@@ -259,13 +316,14 @@ def _no_slip_problem(
         Is there something to estimate from? If so, the feet that stand, see `standing_feet`, their
         `no_slip_condition`, and the `measured_acceleration`.
     """
-    posterior, measured, attitude = posterior[()], measured[()], attitude[()]
-    model, known = model[()], known[()]
+    posterior, last, measured = posterior[()], last[()], measured[()]
+    attitude, model, known = attitude[()], model[()], known[()]
     stands = standing_feet(measured)
     J, y = no_slip_condition(model, attitude, stands, known.gravity)
-    if not _begin(posterior, elapsed, measured, model):
+    if not _begin(posterior, elapsed, measured, model, known):
         return False, stands, J, y, np.empty(0)
-    return True, stands, J, y, measured_acceleration(measured, model, elapsed, known)
+    acceleration = measured_acceleration(last.rate, measured, attitude, model, elapsed, known)
+    return True, stands, J, y, acceleration
 
 
 class JointAccelerationEstimator(RecursiveEstimator):
@@ -292,6 +350,8 @@ class JointAccelerationEstimator(RecursiveEstimator):
         sensitivity           (v, v)  of these three to what gyro, accelerometer and encoders say
         innovation, innovation_variance  (feet, 6)  of the no-slip condition; zero for a foot that
                                       swings
+        agreement             (feet, 6)  running mean of the innovation
+        rate                  (3,)    the gyro's reading in base axes [rad/s]
     """
 
     def __init__(
@@ -320,6 +380,8 @@ class JointAccelerationEstimator(RecursiveEstimator):
             sensitivity=(v, v),
             innovation=(feet, 6),
             innovation_variance=(feet, 6),
+            agreement=(feet, 6),
+            rate=(3,),
         )
         super().__init__(posterior_type, clock)
         self._method = config.method
@@ -341,11 +403,12 @@ class JointAccelerationEstimator(RecursiveEstimator):
         if last["status"]:
             elapsed = math.nan  # Velocities are differentiated: both ends must be trusted.
         solve = _fuse_accelerations if self._method == "fused" else self._solve_no_slip
-        solve(posterior, elapsed, measured, attitude, model, self._known)
+        solve(posterior, last, elapsed, measured, attitude, model, self._known)
 
     def _solve_no_slip(
         self,
         posterior: np.ndarray,
+        last: np.ndarray,
         elapsed: float,
         measured: np.ndarray,
         attitude: np.ndarray,
@@ -357,7 +420,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
         They have the joints of the feet that stand from the other sensors.
         """
         found, stands, J, y, acceleration = _no_slip_problem(
-            posterior, elapsed, measured, attitude, model, known
+            posterior, last, elapsed, measured, attitude, model, known
         )
         if not found:
             return

@@ -158,3 +158,57 @@ def rotation_matrix(q: Quaternion) -> Rotation:
         2 * (y * z + w * x),
         1 - 2 * (x * x + y * y),
     )
+
+
+@njit(cache=True)
+def skew(a: Vector) -> Rotation:
+    """Matrix of a x, row by row."""
+    return 0.0, -a[2], a[1], a[2], 0.0, -a[0], -a[1], a[0], 0.0
+
+
+@njit(cache=True)
+def matrix_product(A: Rotation, B: Rotation) -> Rotation:
+    """A B of 3 x 3 matrices."""
+    return (
+        A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
+        A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
+        A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
+        A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
+        A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
+        A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
+        A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
+        A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
+        A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
+    )
+
+
+@njit(cache=True)
+def conjugate(q: Quaternion) -> Quaternion:
+    """The inverse of a unit quaternion."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@njit(cache=True)
+def rotation_vector(q: Quaternion) -> Vector:
+    """Rotation vector of a unit quaternion, of at most half a turn [rad]."""
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    sign = 1.0 if q[0] >= 0 else -1.0
+    factor = 2.0 * sign if sine < 1e-9 else 2.0 * math.atan2(sine, abs(q[0])) * sign / sine
+    return factor * q[1], factor * q[2], factor * q[3]
+
+
+@njit(cache=True)
+def quaternion_of(R: Rotation) -> Quaternion:
+    """Unit quaternion of a rotation matrix, by its largest component."""
+    trace = R[0] + R[4] + R[8]
+    if trace > 0.0:
+        s = 2.0 * math.sqrt(1.0 + trace)
+        return 0.25 * s, (R[7] - R[5]) / s, (R[2] - R[6]) / s, (R[3] - R[1]) / s
+    if R[0] > R[4] and R[0] > R[8]:
+        s = 2.0 * math.sqrt(1.0 + R[0] - R[4] - R[8])
+        return (R[7] - R[5]) / s, 0.25 * s, (R[1] + R[3]) / s, (R[2] + R[6]) / s
+    if R[4] > R[8]:
+        s = 2.0 * math.sqrt(1.0 + R[4] - R[0] - R[8])
+        return (R[2] - R[6]) / s, (R[1] + R[3]) / s, 0.25 * s, (R[5] + R[7]) / s
+    s = 2.0 * math.sqrt(1.0 + R[8] - R[0] - R[4])
+    return (R[3] - R[1]) / s, (R[2] + R[6]) / s, (R[5] + R[7]) / s, 0.25 * s
