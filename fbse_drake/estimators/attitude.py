@@ -77,7 +77,9 @@ class AttitudeConfig:
             "standing_acceleration",
             "level_feet",
         )
-        require_positive(self, "acceleration_noise", "motion_acceleration", "motion_time", "stance_time")
+        require_positive(
+            self, "acceleration_noise", "motion_acceleration", "motion_time", "stance_time"
+        )
 
 
 class GravityEstimate(NamedTuple):
@@ -95,7 +97,12 @@ class GravityEstimate(NamedTuple):
 
 
 @njit(cache=True)
-def start_gravity(specific_force: Vector, acceleration_variance: float, bias_variance: float, noise_variance: float) -> GravityEstimate:
+def start_gravity(
+    specific_force: Vector,
+    acceleration_variance: float,
+    bias_variance: float,
+    noise_variance: float,
+) -> GravityEstimate:
     """Decomposes the first reading by the pseudo-inverse, weighted with how large each part may be.
 
     (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all of it where it belongs.)
@@ -107,14 +114,30 @@ def start_gravity(specific_force: Vector, acceleration_variance: float, bias_var
     g, a, b = 9.81**2, acceleration_variance, bias_variance
     total = g + a + b + noise_variance
     # Covariance of one axis given the reading.
-    covariance = (g - g * g / total, -g * a / total, -g * b / total, a - a * a / total, -a * b / total, b - b * b / total)
-    parts = scale(g / total, specific_force), scale(a / total, specific_force), scale(b / total, specific_force)
+    covariance = (
+        g - g * g / total,
+        -g * a / total,
+        -g * b / total,
+        a - a * a / total,
+        -a * b / total,
+        b - b * b / total,
+    )
+    parts = (
+        scale(g / total, specific_force),
+        scale(a / total, specific_force),
+        scale(b / total, specific_force),
+    )
     return GravityEstimate(parts[0], parts[1], parts[2], covariance, (0.0, 0.0, 0.0), 0.0)
 
 
 @njit(cache=True)
 def predict_gravity(
-    x: GravityEstimate, w: Vector, rate_variance: float, motion_acceleration: float, motion_time: float, elapsed: float
+    x: GravityEstimate,
+    w: Vector,
+    rate_variance: float,
+    motion_acceleration: float,
+    motion_time: float,
+    elapsed: float,
 ) -> GravityEstimate:
     """Gravity and linear acceleration turn with the IMU; the acceleration fades as a first-order Gauss-Markov process.
 
@@ -130,11 +153,20 @@ def predict_gravity(
     gg, ga, gb, aa, ab, bb = x.covariance
     gg += (9.81 * elapsed) ** 2 * rate_variance
     aa = fade * fade * aa + (1 - fade * fade) * motion_acceleration**2
-    return GravityEstimate(gravity, acceleration, x.bias, (gg, fade * ga, gb, aa, fade * ab, bb), x.innovation, x.innovation_variance)
+    return GravityEstimate(
+        gravity,
+        acceleration,
+        x.bias,
+        (gg, fade * ga, gb, aa, fade * ab, bb),
+        x.innovation,
+        x.innovation_variance,
+    )
 
 
 @njit(cache=True)
-def update_gravity(x: GravityEstimate, specific_force: Vector, noise_variance: float) -> GravityEstimate:
+def update_gravity(
+    x: GravityEstimate, specific_force: Vector, noise_variance: float
+) -> GravityEstimate:
     """Kalman update with y = gravity + acceleration + bias + noise."""
     gg, ga, gb, aa, ab, bb = x.covariance
     pg, pa, pb = gg + ga + gb, ga + aa + ab, gb + ab + bb
@@ -166,7 +198,9 @@ class QuaternionEstimate(NamedTuple):
 
 
 @njit(cache=True)
-def predict_quaternion(x: QuaternionEstimate, w: Vector, noise_variance: float, elapsed: float) -> QuaternionEstimate:
+def predict_quaternion(
+    x: QuaternionEstimate, w: Vector, noise_variance: float, elapsed: float
+) -> QuaternionEstimate:
     """Turns the quaternion with the gyro, free of its bias.
 
     Args:
@@ -180,7 +214,9 @@ def predict_quaternion(x: QuaternionEstimate, w: Vector, noise_variance: float, 
 
 
 @njit(cache=True)
-def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float) -> QuaternionEstimate:
+def update_quaternion(
+    x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float
+) -> QuaternionEstimate:
     """Extended Kalman update with a measured quaternion, written for the small rotation between prediction and measurement,
     followed by the norm correction; q and -q count as the same attitude.
 
@@ -204,7 +240,12 @@ def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: flo
 
 @njit(cache=True)
 def stand_still(
-    x: QuaternionEstimate, measured: Quaternion, tilt_variance: float, w: Vector, noise_variance: float, own_rate_variance: float
+    x: QuaternionEstimate,
+    measured: Quaternion,
+    tilt_variance: float,
+    w: Vector,
+    noise_variance: float,
+    own_rate_variance: float,
 ) -> QuaternionEstimate:
     """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias.
 
@@ -215,7 +256,9 @@ def stand_still(
     bb = x.covariance[2]
     k = bb / (bb + noise_variance + own_rate_variance)
     bias = add(x.bias, scale(k, subtract(w, x.bias)))
-    return QuaternionEstimate(measured, bias, (tilt_variance, 0.0, bb - k * bb), x.innovation, x.innovation_variance)
+    return QuaternionEstimate(
+        measured, bias, (tilt_variance, 0.0, bb - k * bb), x.innovation, x.innovation_variance
+    )
 
 
 @njit(cache=True)
@@ -303,9 +346,7 @@ def _estimate_attitude(
             drift = (_UNKNOWN_RATE * elapsed) ** 2
             gg, ga, gb, aa, ab, bb = x.covariance
             P_gravity = (gg + 9.81**2 * drift, ga, gb, aa, ab, bb)
-            x = GravityEstimate(
-                x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0
-            )
+            x = GravityEstimate(x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0)
             pp, pb, bb = y.covariance
             y = QuaternionEstimate(y.q, y.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
             w = y.bias

@@ -16,7 +16,6 @@ from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.spatial import (
-    Rotation,
     Vector,
     add,
     put,
@@ -150,7 +149,9 @@ def update_lipm(
     mean_correction = (n_q - 1) / n_q * learnt.mean_correction + correction / n_q  # (31)
     spread = (correction - mean_correction) ** 2 / (n_q - 1)
     Q = (n_q - 1) / n_q * learnt.Q + np.diag(P - propagated) / n_q + spread
-    return LipmEstimate(x, P, Adaptation(np.abs(Q), R, mean_residual, mean_correction), e, S)  # (27)
+    return LipmEstimate(
+        x, P, Adaptation(np.abs(Q), R, mean_residual, mean_correction), e, S
+    )  # (27)
 
 
 class LegOdometry(NamedTuple):
@@ -449,7 +450,11 @@ def predict_contact_aided(
     T, fade = elapsed, math.exp(-elapsed / error_time)
     pp, pv, pa, vv, va, aa = x.covariance
     pp, pv, pa = pp + T * (2 * pv + T * vv), pv + T * (vv - pa - T * va), fade * (pa + T * va)
-    vv, va, aa = vv + T * (T * aa - 2 * va) + (T * noise) ** 2, fade * (va - T * aa), fade * fade * aa
+    vv, va, aa = (
+        vv + T * (T * aa - 2 * va) + (T * noise) ** 2,
+        fade * (va - T * aa),
+        fade * fade * aa,
+    )
     aa += (1 - fade * fade) * error**2
     return ContactAidedEstimate(
         add(x.position, add(scale(T, x.velocity), scale(0.5 * T * T, acceleration))),
@@ -508,9 +513,7 @@ def _estimate_base_state(
         vector(posterior.base_position),
         vector(posterior.base_velocity),
         vector(posterior.acceleration_error),
-        ContactAidedCovariance(
-            before.pp, before.pv, before.pa, before.vv, before.va, before.aa
-        ),
+        ContactAidedCovariance(before.pp, before.pv, before.pa, before.vv, before.va, before.aa),
     )
     if math.isnan(elapsed):
         P_first = ContactAidedCovariance(

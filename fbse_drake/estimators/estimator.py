@@ -23,7 +23,10 @@ from fbse_drake.estimators.friction import (
     ModelAidedEstimator,
     RecursiveLeastSquaresEstimator,
 )
-from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
+from fbse_drake.estimators.joint_acceleration import (
+    JointAccelerationConfig,
+    JointAccelerationEstimator,
+)
 from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
 from fbse_drake.estimators.records import parts
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
@@ -66,7 +69,9 @@ class Fbse:
     friction: FrictionConfig = field(default_factory=ModelAided)
 
 
-EstimatorConfig = NoEstimator | Fbse | TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
+EstimatorConfig = (
+    NoEstimator | Fbse | TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
+)
 
 
 class EstimatorDiagram(Diagram):
@@ -107,7 +112,9 @@ class EstimatorDiagram(Diagram):
             self._feed(friction, "measured_torque", "torque_command")
         elif isinstance(config, FixedFriction):
             self._add_monitor(SensorMonitorConfig(), MeasuredSupport(), robot, clock)
-            friction = self._add("friction", FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock))
+            friction = self._add(
+                "friction", FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock)
+            )
             self._join(friction, measurements="sensor_monitor")
         elif isinstance(config, DisturbanceObserver):
             friction = self._add_momentum_observer(config, robot, clock, plan)
@@ -119,31 +126,61 @@ class EstimatorDiagram(Diagram):
         self._builder.BuildInto(self)
         del self._builder
 
-    def _add_fbse(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+    def _add_fbse(
+        self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None
+    ) -> RecursiveEstimator:
         self._add_base(config, robot, clock, plan)
-        measurements, attitude, model = (self._type(name) for name in ("sensor_monitor", "attitude", "model"))
+        measurements, attitude, model = (
+            self._type(name) for name in ("sensor_monitor", "attitude", "model")
+        )
         acceleration = self._add(
             "joint_acceleration",
-            JointAccelerationEstimator(config.joint_acceleration, robot, measurements, attitude, model, clock),
+            JointAccelerationEstimator(
+                config.joint_acceleration, robot, measurements, attitude, model, clock
+            ),
         )
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
         self._connect_model_at_start(acceleration)
         link_torque = self._add(
-            "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._type("joint_acceleration"), clock)
+            "link_torque",
+            LinkTorqueEstimator(
+                config.link_torque,
+                robot,
+                measurements,
+                model,
+                self._type("joint_acceleration"),
+                clock,
+            ),
         )
-        self._join(link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration")
+        self._join(
+            link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration"
+        )
         self._connect_model_at_start(link_torque)
         self._feed(link_torque, "torque_command")
-        kind = ModelAidedEstimator if isinstance(config.friction, ModelAided) else RecursiveLeastSquaresEstimator
-        friction = self._add("friction", kind(config.friction, robot, measurements, self._type("link_torque"), clock))
+        kind = (
+            ModelAidedEstimator
+            if isinstance(config.friction, ModelAided)
+            else RecursiveLeastSquaresEstimator
+        )
+        friction = self._add(
+            "friction", kind(config.friction, robot, measurements, self._type("link_torque"), clock)
+        )
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
         return friction
 
-    def _add_momentum_observer(self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+    def _add_momentum_observer(
+        self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None
+    ) -> RecursiveEstimator:
         self._add_base(Fbse(), robot, clock, plan)
         parts = [self._type(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
         friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
-        self._join(friction, measurements="sensor_monitor", attitude="attitude", base_state="base_state", model="model")
+        self._join(
+            friction,
+            measurements="sensor_monitor",
+            attitude="attitude",
+            base_state="base_state",
+            model="model",
+        )
         self._connect_model_at_start(friction)
         self._feed(friction, "torque_command")
         return friction
@@ -151,7 +188,9 @@ class EstimatorDiagram(Diagram):
     def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
         """Sensor monitor with support, model, attitude and base state."""
         if not robot.has_floating_base or not robot.description.legs:
-            raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
+            raise InputError(
+                "estimator: needs a robot with a floating base and feet (no gantry_height)"
+            )
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._type("sensor_monitor")
         model = self._add("model", FloatingBaseModel(robot, measurements, clock))
@@ -159,14 +198,35 @@ class EstimatorDiagram(Diagram):
         sides = robot.description.sides
         if isinstance(config.support, PlannedSupport):
             if plan is None:
-                raise InputError("estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)")
+                raise InputError(
+                    "estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)"
+                )
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
-            source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
-            self._builder.Connect(source.get_output_port(), self._systems["sensor_monitor"].GetInputPort("planned_support"))
-        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock))
+            source = self._builder.AddNamedSystem(
+                "planned_support", held_signal(support, float(plan.time[1] - plan.time[0]))
+            )
+            self._builder.Connect(
+                source.get_output_port(),
+                self._systems["sensor_monitor"].GetInputPort("planned_support"),
+            )
+        attitude = self._add(
+            "attitude",
+            AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock),
+        )
         self._join(attitude, measurements="sensor_monitor", model="model")
-        middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
-        shared = (robot, measurements, self._type("attitude"), self._type("model"), clock, (float(middle[0]), float(middle[1])))
+        middle = (
+            np.zeros(2)
+            if plan is None
+            else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
+        )
+        shared = (
+            robot,
+            measurements,
+            self._type("attitude"),
+            self._type("model"),
+            clock,
+            (float(middle[0]), float(middle[1])),
+        )
         base_state: BaseStateEstimator
         if isinstance(config.base_state, AdaptiveLipm):
             base_state = AdaptiveLipmEstimator(config.base_state, *shared)
@@ -175,7 +235,9 @@ class EstimatorDiagram(Diagram):
         self._add("base_state", base_state)
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
 
-    def _add_monitor(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock) -> None:
+    def _add_monitor(
+        self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock
+    ) -> None:
         monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
         joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
         sizes = {
@@ -198,10 +260,15 @@ class EstimatorDiagram(Diagram):
     def _join(self, system: RecursiveEstimator, **sources: str) -> None:
         """Connects the posteriors of estimators to input ports of these names."""
         for port, source in sources.items():
-            self._builder.Connect(self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port))
+            self._builder.Connect(
+                self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port)
+            )
 
     def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
-        self._builder.Connect(self._systems["model"].GetOutputPort("at_step_start"), system.GetInputPort("model_at_step_start"))
+        self._builder.Connect(
+            self._systems["model"].GetOutputPort("at_step_start"),
+            system.GetInputPort("model_at_step_start"),
+        )
 
     def _feed(self, system: RecursiveEstimator, *ports: str) -> None:
         """Makes inputs of the diagram of a system's input ports."""
@@ -236,7 +303,12 @@ class EstimatorDiagram(Diagram):
 
 
 def make_estimator(
-    config: EstimatorConfig, robot: Robot, *, period: float, plan: TaskPlan | None = None, every_sample: bool = False
+    config: EstimatorConfig,
+    robot: Robot,
+    *,
+    period: float,
+    plan: TaskPlan | None = None,
+    every_sample: bool = False,
 ) -> EstimatorDiagram | None:
     """Builds a friction estimator, or None for `NoEstimator`.
 
@@ -251,4 +323,6 @@ def make_estimator(
     """
     if isinstance(config, NoEstimator):
         return None
-    return EstimatorDiagram(config, robot, Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)), plan)
+    return EstimatorDiagram(
+        config, robot, Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)), plan
+    )

@@ -79,7 +79,11 @@ def solve_positive_definite(S: np.ndarray, B: np.ndarray) -> None:
 
 @njit(cache=True)
 def fuse(
-    measured: np.ndarray, variance: np.ndarray, J: np.ndarray, y: np.ndarray, constraint_variance: np.ndarray
+    measured: np.ndarray,
+    variance: np.ndarray,
+    J: np.ndarray,
+    y: np.ndarray,
+    constraint_variance: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares of measured accelerations and J x = y.
 
@@ -178,9 +182,7 @@ def standing_feet(measured: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _begin(
-    posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray
-) -> bool:
+def _begin(posterior: np.ndarray, elapsed: float, measured: np.ndarray, model: np.ndarray) -> bool:
     """Sets a posterior to zero but for its status.
 
     Returns:

@@ -42,7 +42,7 @@ class RecordInput:
     port: InputPort
     kind: np.dtype
 
-    def Eval(self, context: Context) -> np.ndarray:  # noqa: N802
+    def Eval(self, context: Context) -> np.ndarray:
         """The posterior as a record."""
         return as_record(self.port.Eval(context), self.kind)
 

@@ -15,7 +15,12 @@ from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import vector
-from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, detect_support
+from fbse_drake.estimators.support import (
+    MeasuredSupport,
+    PlannedSupport,
+    SupportConfig,
+    detect_support,
+)
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
@@ -39,7 +44,9 @@ class SensorMonitorConfig:
     def __post_init__(self) -> None:
         require_positive(self, "stuck_after", "lost_after")
         if not 0 <= self.smallest_load_share < 1:
-            raise InputError(f"smallest_load_share: expected a number in [0, 1), found {self.smallest_load_share:g}")
+            raise InputError(
+                f"smallest_load_share: expected a number in [0, 1), found {self.smallest_load_share:g}"
+            )
 
 
 def _readings(robot: Robot) -> dict[str, tuple[int, ...]]:
