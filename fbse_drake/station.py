@@ -319,13 +319,11 @@ def add_compensation(
     if not scenario.compensation.uses_estimate:
         builder.ExportInput(target, "friction_estimate")
         return
-    period, n = scenario.control.period, target.size()
+    period = scenario.control.period
     system = FrictionCompensation(scenario.compensation, names, Clock(period, period * (1 - 1e-6)))
     compensation = builder.AddNamedSystem("compensation", system)
-    torque = builder.AddNamedSystem("compensation_torque", Demultiplexer([1, n]))
     builder.Connect(ports["friction_estimate"], compensation.get_input_port())
-    builder.Connect(compensation.get_output_port(), torque.get_input_port())
-    builder.Connect(torque.get_output_port(1), target)
+    builder.Connect(compensation.GetOutputPort("torque"), target)
 
 
 def add_meshcat(builder: DiagramBuilder, meshcat: Meshcat | None) -> None:

@@ -13,6 +13,7 @@ from fbse_drake import Log, Scenario, resources
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.estimator import EstimatorConfig, EstimatorDiagram, make_estimator
 from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.records import as_record, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
@@ -24,6 +25,11 @@ CLOCK = Clock(TICK, TICK * (1 - 1e-6))
 BENT = np.tile([0.0, 0.0, -0.4, 0.8, -0.4, 0.0], 2)
 
 
+def numbers(record: np.ndarray) -> np.ndarray:
+    """The numbers of a record, or of a record in it, one after the other."""
+    return record.reshape(1).view(float)
+
+
 class Rig:
     """One system with values on its input ports, ticked by hand."""
 
@@ -32,23 +38,34 @@ class Rig:
         self._ticks = 0
 
     def fix(self, **inputs: np.ndarray) -> None:
+        """Puts vectors or records on input ports."""
         for name, value in inputs.items():
-            self.system.GetInputPort(name).FixValue(self.context, np.asarray(value, dtype=float))
+            value = np.asarray(value)
+            vector = numbers(value) if value.dtype.names else value.astype(float)
+            self.system.GetInputPort(name).FixValue(self.context, vector)
 
-    def tick(self, **inputs: np.ndarray) -> dict[str, np.ndarray]:
-        """Fields of the posterior of the next tick."""
+    def tick(self, **inputs: np.ndarray) -> np.ndarray:
+        """The posterior of the next tick, a record."""
         assert isinstance(self.system, RecursiveEstimator)
         self.fix(**inputs)
         self.context.SetTime(self._ticks * TICK)
         self._ticks += 1
         posterior = self.system.GetOutputPort("posterior").Eval(self.context).copy()
         self.system.ExecuteForcedEvents(self.context, publish=False)
-        return self.system.fields.unpack(posterior)
+        return as_record(posterior, self.system.posterior_type)
 
 
-def pack(system: RecursiveEstimator, **values: np.ndarray | float) -> np.ndarray:
-    """A posterior as another system would send it."""
-    return system.fields.pack(**values)
+def pack(
+    system: RecursiveEstimator, start: np.ndarray | None = None, **values: np.ndarray | float
+) -> np.ndarray:
+    """A posterior as another system would send it: this one, or zeros, with these values."""
+    kind = system.posterior_type
+    posterior = as_record(np.zeros(size_of(kind)), kind)
+    if start is not None:
+        posterior[...] = start
+    for name, value in values.items():
+        posterior[name] = np.reshape(value, posterior[name].shape)
+    return posterior
 
 
 @dataclass(frozen=True)
@@ -63,7 +80,7 @@ class Base:
     def of(description: str = "biped") -> "Base":
         robot, _ = make_robot(description)
         monitor = SensorMonitor(SensorMonitorConfig(), MeasuredSupport(), robot, CLOCK)
-        return Base(robot, monitor, FloatingBaseModel(robot, monitor.fields.slices, CLOCK))
+        return Base(robot, monitor, FloatingBaseModel(robot, monitor.posterior_type, CLOCK))
 
     def measurements(self, **values: np.ndarray | float) -> np.ndarray:
         """Trusted readings of a robot that stands on level ground, but for the values given."""
@@ -72,8 +89,8 @@ class Base:
         resting = {"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, "support": np.ones(2)}
         return pack(self.monitor, **{**resting, **values})
 
-    def model_of(self, **values: np.ndarray | float) -> dict[str, np.ndarray]:
-        """Fields of the model for such readings."""
+    def model_of(self, **values: np.ndarray | float) -> np.ndarray:
+        """The posterior of the model for such readings."""
         return Rig(self.model).tick(measurements=self.measurements(**values))
 
 
@@ -156,8 +173,7 @@ class Replay:
             return self.estimator.GetOutputPort(name).Eval(self.context).copy()
         system_name, field = name.split(".")
         system = self.estimator.GetSubsystemByName(system_name)
-        posterior = system.GetOutputPort("posterior").Eval(system.GetMyContextFromRoot(self.context))
-        return posterior[system.fields[field]].copy()
+        return system.GetOutputPort(field).Eval(system.GetMyContextFromRoot(self.context)).copy()
 
 
 def rms(values: np.ndarray) -> float:

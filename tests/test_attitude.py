@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig import CLOCK, TICK, Base, Rig, rms, robot_copy
+from rig import CLOCK, TICK, Base, Rig, numbers, pack, rms, robot_copy
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
@@ -28,22 +28,33 @@ class Attitude(Rig):
     """An AttitudeEstimator on feet that are level when the base is."""
 
     def __init__(self, base: Base = BASE, **config: float):
-        estimator = AttitudeEstimator(AttitudeConfig(**config), base.robot, base.monitor.fields.slices, base.model.fields.slices, CLOCK)
-        super().__init__(estimator)
+        types = base.monitor.posterior_type, base.model.posterior_type
+        super().__init__(AttitudeEstimator(AttitudeConfig(**config), base.robot, *types, CLOCK))
         self._base = base
         self.fix(model=self.feet(np.eye(3)))
 
     def feet(self, R_BF: np.ndarray) -> np.ndarray:
         """Model input with both soles turned like this in the base."""
-        return self._base.model.fields.pack(foot_rotation=np.tile(np.ravel(R_BF), 2))
+        return pack(self._base.model, foot_rotation=np.tile(np.ravel(R_BF), 2))
 
-    def read(self, specific_force: np.ndarray, rate: np.ndarray, *, stands: bool = False, **inputs: np.ndarray) -> dict[str, np.ndarray]:
-        readings = self._base.measurements(specific_force=specific_force, angular_velocity=rate, support=np.full(2, float(stands)))
+    def read(
+        self,
+        specific_force: np.ndarray,
+        rate: np.ndarray,
+        *,
+        stands: bool = False,
+        **inputs: np.ndarray,
+    ) -> np.ndarray:
+        readings = self._base.measurements(
+            specific_force=specific_force,
+            angular_velocity=rate,
+            support=np.full(2, float(stands)),
+        )
         return self.tick(measurements=readings, **inputs)
 
 
-def matrix(posterior: dict[str, np.ndarray]) -> np.ndarray:
-    return posterior["rotation"].reshape(3, 3)
+def matrix(posterior: np.ndarray) -> np.ndarray:
+    return posterior["rotation"]
 
 
 def test_quaternion_helpers_agree_with_scipy():
@@ -86,10 +97,11 @@ def test_gravity_filter_is_the_textbook_kalman_filter():
         posterior = attitude.read(y, np.zeros(3))
         estimated = np.concatenate([posterior[name] for name in ("gravity", "acceleration", "acceleration_bias")])
         np.testing.assert_allclose(estimated, x, rtol=1e-8, atol=1e-9)
-        np.testing.assert_allclose(posterior["innovation"][:3], e, rtol=1e-8, atol=1e-9)
-        np.testing.assert_allclose(posterior["innovation_variance"][0], S[0, 0], rtol=1e-8)
+        np.testing.assert_allclose(posterior["innovation"]["gravity"], e, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(posterior["innovation_variance"]["gravity"], S[0, 0], rtol=1e-8)
         of_x = P[np.ix_([0, 3, 6], [0, 3, 6])]
-        np.testing.assert_allclose(posterior["covariance"][:6], of_x[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
+        found, expected = posterior["covariance"]["gravity"], of_x[np.triu_indices(3)]
+        np.testing.assert_allclose(numbers(found), expected, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(P, np.kron(of_x, I3), atol=1e-12)
 
 
@@ -109,7 +121,7 @@ def test_quaternion_filter_about_one_axis_is_the_textbook_kalman_filter():
         f = GRAVITY * np.array([0, math.sin(truth[k]), math.cos(truth[k])]) + generator.normal(scale=0.02, size=3) * [0, 1, 1]
         posterior = attitude.read(f, [gyro[k], 0, 0])
         angle = math.atan2(posterior["gravity"][1], posterior["gravity"][2])
-        variance = posterior["covariance"][0] / GRAVITY**2
+        variance = posterior["covariance"]["gravity"]["gg"] / GRAVITY**2
         if x is None:
             x, P = np.array([angle, 0.0]), np.diag([variance, config.angular_velocity_bias**2])
         else:
@@ -120,7 +132,8 @@ def test_quaternion_filter_about_one_axis_is_the_textbook_kalman_filter():
         estimated = Rotation.from_quat(posterior["imu_orientation"], scalar_first=True).as_rotvec()
         np.testing.assert_allclose(estimated, [x[0], 0, 0], atol=1e-7)
         np.testing.assert_allclose(posterior["angular_velocity_bias"], [x[1], 0, 0], atol=1e-7)
-        np.testing.assert_allclose(posterior["covariance"][6:], [P[0, 0], P[0, 1], P[1, 1]], rtol=1e-6)
+        found = numbers(posterior["covariance"]["quaternion"])
+        np.testing.assert_allclose(found, [P[0, 0], P[0, 1], P[1, 1]], rtol=1e-6)
         np.testing.assert_allclose(posterior["angular_velocity"][0], gyro[k] - x[1], atol=1e-7)
     # The filters agree; they also do their work.
     assert x[1] == pytest.approx(0.015, abs=0.002)
@@ -243,8 +256,8 @@ def test_innovations_are_as_large_as_believed():
     nis = []
     for _ in range(2000):
         posterior = attitude.read([0, 0, GRAVITY] + generator.normal(scale=0.02, size=3), generator.normal(scale=1e-3, size=3))
-        if posterior["innovation_variance"][0] > 0:
-            nis.append(posterior["innovation"][:3] ** 2 / posterior["innovation_variance"][0])
+        if posterior["innovation_variance"]["gravity"] > 0:
+            nis.append(posterior["innovation"]["gravity"] ** 2 / posterior["innovation_variance"]["gravity"])
     # 6000 values of chi-square with one degree of freedom, 4 sigma.
     assert np.mean(nis) == pytest.approx(1, abs=4 * math.sqrt(2 / 6000))
-    assert rms(posterior["rotation"].reshape(3, 3) - np.eye(3)) < 1e-3
+    assert rms(posterior["rotation"] - np.eye(3)) < 1e-3

@@ -25,12 +25,12 @@ from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstima
 
 GRAVITY = 9.81
 BASE = Base.of()
-PARTS, MODEL = BASE.monitor.fields.slices, BASE.model.fields.slices
+READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
 ACCELERATION = JointAccelerationEstimator(
     JointAccelerationConfig(),
     BASE.robot,
-    PARTS,
-    AttitudeEstimator(AttitudeConfig(), BASE.robot, PARTS, MODEL, CLOCK).fields.slices,
+    READINGS,
+    AttitudeEstimator(AttitudeConfig(), BASE.robot, READINGS, MODEL, CLOCK).posterior_type,
     MODEL,
     CLOCK,
 )
@@ -77,8 +77,9 @@ class Friction(Rig):
 
     def __init__(self, config: RecursiveLeastSquares | ModelAided):
         kind = ModelAidedEstimator if isinstance(config, ModelAided) else RecursiveLeastSquaresEstimator
-        self._link = LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, PARTS, MODEL, ACCELERATION.fields.slices, CLOCK)
-        super().__init__(kind(config, BASE.robot, PARTS, self._link.fields.slices, CLOCK))
+        types = READINGS, MODEL, ACCELERATION.posterior_type
+        self._link = LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, *types, CLOCK)
+        super().__init__(kind(config, BASE.robot, READINGS, self._link.posterior_type, CLOCK))
 
     def see(
         self,
@@ -104,13 +105,13 @@ def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_i
         residual = (phi * truth).sum(axis=1) + generator.normal(scale=0.05, size=12)
         posterior = estimator.see(velocity, residual)
         np.testing.assert_allclose(posterior["friction"], residual, atol=1e-12)
-    parameters = posterior["parameters"].reshape(12, 2)
+    parameters = posterior["parameters"]
     np.testing.assert_allclose(parameters, truth, atol=0.08)
     # Now the right leg swings, and what is measured there is nonsense.
     posterior = estimator.see(velocity, np.full(12, 77.0), support=(1, 0))
     np.testing.assert_allclose(posterior["friction"][:6], 77.0)
     np.testing.assert_allclose(posterior["friction"][6:], (phi * parameters).sum(axis=1)[6:], rtol=1e-9)
-    np.testing.assert_array_equal(posterior["parameters"].reshape(12, 2)[6:], parameters[6:])
+    np.testing.assert_array_equal(posterior["parameters"][6:], parameters[6:])
 
 
 def test_model_aided_filter_is_the_textbook_kalman_filter():
@@ -142,12 +143,12 @@ def test_model_aided_filter_is_the_textbook_kalman_filter():
             X[j], P[j] = X[j] + K * e, P[j] - np.outer(K, H @ P[j])
             assert posterior["innovation"][j] == pytest.approx(e, rel=1e-6, abs=1e-9)
             assert posterior["innovation_variance"][j] == pytest.approx(S, rel=1e-6)
-        np.testing.assert_allclose(posterior["parameters"].reshape(12, 2), X[:, 1:3], rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(posterior["parameters"], X[:, 1:3], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(posterior["disturbance"], X[:, 3], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(posterior["impulse"], y - X[:, 0], rtol=1e-6, atol=1e-10)
         np.testing.assert_allclose(posterior["friction"], (phi * X[:, 1:3]).sum(axis=1) + X[:, 3], rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(posterior["covariance"].reshape(12, 4, 4), P, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(posterior["parameter_variance"].reshape(12, 2), P[:, [1, 2], [1, 2]], rtol=1e-6)
+    np.testing.assert_allclose(posterior["covariance"], P, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(posterior["parameter_variance"], P[:, [1, 2], [1, 2]], rtol=1e-6)
 
 
 def believed_world(believed: float) -> tuple[float, float]:
@@ -175,7 +176,7 @@ def believed_world(believed: float) -> tuple[float, float]:
         error.append(posterior["friction"] - friction)
         raw.append(residual - friction)
         d = d + generator.normal(scale=config.disturbance_walk * math.sqrt(T), size=12)
-    np.testing.assert_allclose(posterior["parameters"].reshape(12, 2), parameters, atol=1.0)
+    np.testing.assert_allclose(posterior["parameters"], parameters, atol=1.0)
     return float(np.mean(nis)), rms(error[500:]) / rms(raw[500:])
 
 

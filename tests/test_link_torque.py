@@ -21,8 +21,8 @@ from fbse_drake.scenario import RobotConfig
 
 GRAVITY = 9.81
 BASE = Base.of()
-PARTS, MODEL = BASE.monitor.fields.slices, BASE.model.fields.slices
-ATTITUDE = AttitudeEstimator(AttitudeConfig(), BASE.robot, PARTS, MODEL, CLOCK)
+READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
+ATTITUDE = AttitudeEstimator(AttitudeConfig(), BASE.robot, READINGS, MODEL, CLOCK)
 PAPER = load_scenario("paper_walk_fbse", "paper_method").estimator
 # What an estimator believes of sensors without errors.
 EXACT = JointAccelerationConfig(acceleration_noise=1e-6, angular_velocity_noise=1e-9, joint_velocity_noise=1e-9)
@@ -30,11 +30,14 @@ Run = Callable[..., Log]
 
 
 def accelerations(config: JointAccelerationConfig | None = None) -> JointAccelerationEstimator:
-    return JointAccelerationEstimator(config or JointAccelerationConfig(), BASE.robot, PARTS, ATTITUDE.fields.slices, MODEL, CLOCK)
+    config = config or JointAccelerationConfig()
+    types = READINGS, ATTITUDE.posterior_type, MODEL
+    return JointAccelerationEstimator(config, BASE.robot, *types, CLOCK)
 
 
 def link_torques() -> LinkTorqueEstimator:
-    return LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, PARTS, MODEL, accelerations().fields.slices, CLOCK)
+    types = READINGS, MODEL, accelerations().posterior_type
+    return LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, *types, CLOCK)
 
 
 def test_minimum_norm_is_the_pseudo_inverse():
@@ -94,7 +97,7 @@ def test_link_torque_is_drakes_wherever_the_base_is(seed: int):
     )
     command = generator.normal(scale=50, size=12)
     estimator = Rig(link_torques())
-    model = BASE.model.fields.pack(**BASE.model_of(**readings))
+    model = BASE.model_of(**readings)
     estimator.fix(measurements=BASE.measurements(**readings), model_at_step_start=model, joint_acceleration=known)
     estimator.tick(torque_command=command)
     # The command of the next tick is not yet in it.
@@ -109,16 +112,16 @@ def residual_with(attitude: Rotation, support: list[float], method: str = "fused
     chain, torque = Rig(accelerations(JointAccelerationConfig(method=method))), Rig(link_torques())
     for rig in (chain, torque):
         rig.tick(
-            **{"measurements": BASE.measurements(), "model_at_step_start": np.zeros(BASE.model.fields.size)},
+            **{"measurements": BASE.measurements(), "model_at_step_start": pack(BASE.model)},
             **({"attitude": pack(ATTITUDE, rotation=np.eye(3))} if rig is chain else {}),
             **({"joint_acceleration": pack(accelerations()), "torque_command": np.full(12, 3.0)} if rig is torque else {}),
         )
     moving = {"joint_velocity": generator.normal(size=12), "angular_velocity": generator.normal(size=3)}
-    model = BASE.model.fields.pack(**BASE.model_of(**moving))
+    model = BASE.model_of(**moving)
     readings = BASE.measurements(**{name: value + 0.01 for name, value in moving.items()}, support=support)
     known = chain.tick(measurements=readings, model_at_step_start=model, attitude=pack(ATTITUDE, rotation=attitude.as_matrix()))
-    accelerated = chain.system.fields.pack(**known)
-    return torque.tick(measurements=readings, model_at_step_start=model, joint_acceleration=accelerated)["residual"]
+    inputs = {"measurements": readings, "model_at_step_start": model}
+    return torque.tick(**inputs, joint_acceleration=known)["residual"]
 
 
 def test_residual_does_not_know_the_attitude():
@@ -139,11 +142,12 @@ def test_joint_accelerations_keep_standing_feet_where_they_are(method: str):
     config = JointAccelerationConfig(method=method, foot_angular_acceleration=1e-6, foot_acceleration=1e-6)
     rig = Rig(accelerations(config))
     attitude = pack(ATTITUDE, rotation=np.eye(3))
-    rig.tick(measurements=BASE.measurements(), model_at_step_start=np.zeros(BASE.model.fields.size), attitude=attitude)
-    x = rig.tick(measurements=BASE.measurements(**moving), model_at_step_start=BASE.model.fields.pack(**terms))
+    readings = BASE.measurements()
+    rig.tick(measurements=readings, model_at_step_start=pack(BASE.model), attitude=attitude)
+    x = rig.tick(measurements=BASE.measurements(**moving), model_at_step_start=terms)
     names = ("base_angular_acceleration", "base_specific_force", "joint_acceleration")
     a = np.concatenate([x[name] for name in names]) - np.concatenate([np.zeros(3), [0, 0, GRAVITY], np.zeros(12)])
-    feet = terms["foot_jacobian"].reshape(12, 18) @ a + terms["foot_bias"]
+    feet = terms["foot_jacobian"].reshape(12, 18) @ a + terms["foot_bias"].ravel()
     np.testing.assert_allclose(feet, 0, atol=1e-4)
 
 

@@ -95,7 +95,12 @@ class GravityEstimate(NamedTuple):
 
 
 @njit(cache=True)
-def start_gravity(specific_force: Vector, acceleration_variance: float, bias_variance: float, noise_variance: float) -> GravityEstimate:
+def start_gravity(
+    specific_force: Vector,
+    acceleration_variance: float,
+    bias_variance: float,
+    noise_variance: float,
+) -> GravityEstimate:
     """Decomposes the first reading by the pseudo-inverse, weighted with how large each part may be.
 
     (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all of it where it belongs.)
@@ -107,14 +112,30 @@ def start_gravity(specific_force: Vector, acceleration_variance: float, bias_var
     g, a, b = 9.81**2, acceleration_variance, bias_variance
     total = g + a + b + noise_variance
     # Covariance of one axis given the reading.
-    covariance = (g - g * g / total, -g * a / total, -g * b / total, a - a * a / total, -a * b / total, b - b * b / total)
-    parts = scale(g / total, specific_force), scale(a / total, specific_force), scale(b / total, specific_force)
+    covariance = (
+        g - g * g / total,
+        -g * a / total,
+        -g * b / total,
+        a - a * a / total,
+        -a * b / total,
+        b - b * b / total,
+    )
+    parts = (
+        scale(g / total, specific_force),
+        scale(a / total, specific_force),
+        scale(b / total, specific_force),
+    )
     return GravityEstimate(parts[0], parts[1], parts[2], covariance, (0.0, 0.0, 0.0), 0.0)
 
 
 @njit(cache=True)
 def predict_gravity(
-    x: GravityEstimate, w: Vector, rate_variance: float, motion_acceleration: float, motion_time: float, elapsed: float
+    x: GravityEstimate,
+    w: Vector,
+    rate_variance: float,
+    motion_acceleration: float,
+    motion_time: float,
+    elapsed: float,
 ) -> GravityEstimate:
     """Gravity and linear acceleration turn with the IMU; the acceleration fades as a first-order Gauss-Markov process.
 
@@ -130,7 +151,14 @@ def predict_gravity(
     gg, ga, gb, aa, ab, bb = x.covariance
     gg += (9.81 * elapsed) ** 2 * rate_variance
     aa = fade * fade * aa + (1 - fade * fade) * motion_acceleration**2
-    return GravityEstimate(gravity, acceleration, x.bias, (gg, fade * ga, gb, aa, fade * ab, bb), x.innovation, x.innovation_variance)
+    return GravityEstimate(
+        gravity,
+        acceleration,
+        x.bias,
+        (gg, fade * ga, gb, aa, fade * ab, bb),
+        x.innovation,
+        x.innovation_variance,
+    )
 
 
 @njit(cache=True)
@@ -204,7 +232,12 @@ def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: flo
 
 @njit(cache=True)
 def stand_still(
-    x: QuaternionEstimate, measured: Quaternion, tilt_variance: float, w: Vector, noise_variance: float, own_rate_variance: float
+    x: QuaternionEstimate,
+    measured: Quaternion,
+    tilt_variance: float,
+    w: Vector,
+    noise_variance: float,
+    own_rate_variance: float,
 ) -> QuaternionEstimate:
     """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias.
 
@@ -303,9 +336,7 @@ def _estimate_attitude(
             drift = (_UNKNOWN_RATE * elapsed) ** 2
             gg, ga, gb, aa, ab, bb = x.covariance
             P_gravity = (gg + 9.81**2 * drift, ga, gb, aa, ab, bb)
-            x = GravityEstimate(
-                x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0
-            )
+            x = GravityEstimate(x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0)
             pp, pb, bb = y.covariance
             y = QuaternionEstimate(y.q, y.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
             w = y.bias
@@ -336,13 +367,9 @@ def _estimate_attitude(
                 y = update_quaternion(y, by_gravity, tilt_variance, 2.0 * motion_time / elapsed)
                 if use_feet:
                     by_feet = quaternion_from_gravity(up_I, yaw_of(y.q))
-                    z = update_quaternion(
-                        y, by_feet, level_variance, 2.0 * config.stance_time / elapsed
-                    )
+                    z = update_quaternion(y, by_feet, level_variance, 2.0 * config.stance_time / elapsed)
                     feet_innovation, feet_variance = z.innovation, z.innovation_variance
-                    y = QuaternionEstimate(
-                        z.q, z.bias, z.covariance, y.innovation, y.innovation_variance
-                    )
+                    y = QuaternionEstimate(z.q, z.bias, z.covariance, y.innovation, y.innovation_variance)
     q_WB = quaternion_product(y.q, q_IB)
     posterior.status = trust
     put(posterior.orientation, q_WB)
@@ -438,8 +465,6 @@ class AttitudeEstimator(RecursiveEstimator):
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
         _estimate_attitude(posterior, last, elapsed, measured, model, self._known)

@@ -184,9 +184,7 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 
 @njit(cache=True)
-def _predict(
-    x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known
-) -> None:
+def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known) -> None:
     """The step that ends now, in place.
 
     Args:
@@ -414,9 +412,7 @@ def _listen_to_foot(
     w = subtract(w_raw, vector(x.gyro_bias_B))
     z = subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v)
     gyro = sensors.angular_velocity_noise**2
-    noise = _isotropic(
-        config.foot_velocity**2 * lasting + moving * rate + dot(p_IF, p_IF) * gyro
-    )
+    noise = _isotropic(config.foot_velocity**2 * lasting + moving * rate + dot(p_IF, p_IF) * gyro)
     variance[_FOOT_VELOCITY] = _update(
         P, correction, z, _VELOCITY, _IDENTITY, _GYRO_BIAS, matrix_product(R, skew(p_IF)), noise,
         keep, agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY],
@@ -711,17 +707,13 @@ class InvariantBaseFilter(RecursiveEstimator):
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
-        self.DeclareVectorOutputPort(
-            "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
-        )
+        self.DeclareVectorOutputPort("last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()})
 
     def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)
         output.SetFromVector(last["angular_velocity_bias"])
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
         _estimate_base(posterior, last, elapsed, measured, model, self._known)
 

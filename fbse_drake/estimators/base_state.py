@@ -16,7 +16,6 @@ from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.spatial import (
-    Rotation,
     Vector,
     add,
     put,
@@ -346,9 +345,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
         )
         self._config, self._known = config, record(**self._legs)
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         model, first, config = self._model.Eval(context), math.isnan(elapsed), self._config
         legs = _follow_legs(posterior, last, elapsed, measured, attitude, model, self._known)
@@ -392,9 +389,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
             )
             before = LipmEstimate(state[axis], covariance[axis], adaptation)
             zmp = float(posterior["zmp"][axis])
-            new = update_lipm(
-                config, before, float(change[axis]), zmp, height, -self._gravity[2], elapsed
-            )
+            new = update_lipm(config, before, float(change[axis]), zmp, height, -self._gravity[2], elapsed)
             state[axis], covariance[axis], learnt = new.x, new.P, new.adaptation
             process_noise[axis], correction[axis] = learnt.Q, learnt.mean_correction
             measurement_noise[axis], residual[axis] = learnt.R, learnt.mean_residual
@@ -447,7 +442,11 @@ def predict_contact_aided(
     T, fade = elapsed, math.exp(-elapsed / error_time)
     pp, pv, pa, vv, va, aa = x.covariance
     pp, pv, pa = pp + T * (2 * pv + T * vv), pv + T * (vv - pa - T * va), fade * (pa + T * va)
-    vv, va, aa = vv + T * (T * aa - 2 * va) + (T * noise) ** 2, fade * (va - T * aa), fade * fade * aa
+    vv, va, aa = (
+        vv + T * (T * aa - 2 * va) + (T * noise) ** 2,
+        fade * (va - T * aa),
+        fade * fade * aa,
+    )
     aa += (1 - fade * fade) * error**2
     return ContactAidedEstimate(
         add(x.position, add(scale(T, x.velocity), scale(0.5 * T * T, acceleration))),
@@ -458,9 +457,7 @@ def predict_contact_aided(
 
 
 @njit(cache=True)
-def update_contact_aided(
-    x: ContactAidedEstimate, innovation: Vector, covariance: Vector, S: float
-) -> ContactAidedEstimate:
+def update_contact_aided(x: ContactAidedEstimate, innovation: Vector, covariance: Vector, S: float) -> ContactAidedEstimate:
     """Kalman update with a measured position or velocity.
 
     Args:
@@ -474,9 +471,7 @@ def update_contact_aided(
         add(x.position, scale(kp, innovation)),
         add(x.velocity, scale(kv, innovation)),
         add(x.acceleration_error, scale(ka, innovation)),
-        ContactAidedCovariance(
-            pp - kp * cp, pv - kp * cv, pa - kp * ca, vv - kv * cv, va - kv * ca, aa - ka * ca
-        ),
+        ContactAidedCovariance(pp - kp * cp, pv - kp * cv, pa - kp * ca, vv - kv * cv, va - kv * ca, aa - ka * ca),
     )
 
 
@@ -506,9 +501,7 @@ def _estimate_base_state(
         vector(posterior.base_position),
         vector(posterior.base_velocity),
         vector(posterior.acceleration_error),
-        ContactAidedCovariance(
-            before.pp, before.pv, before.pa, before.vv, before.va, before.aa
-        ),
+        ContactAidedCovariance(before.pp, before.pv, before.pa, before.vv, before.va, before.aa),
     )
     if math.isnan(elapsed):
         P_first = ContactAidedCovariance(
@@ -599,9 +592,7 @@ class ContactAidedEstimator(BaseStateEstimator):
         mount = record(**vars(self._mount))
         self._known = record(**self._legs, config=config, mount=mount, gravity=self._gravity)
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         _estimate_base_state(
             posterior,
             last,

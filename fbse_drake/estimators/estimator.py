@@ -24,7 +24,10 @@ from fbse_drake.estimators.friction import (
     ModelAidedEstimator,
     RecursiveLeastSquaresEstimator,
 )
-from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
+from fbse_drake.estimators.joint_acceleration import (
+    JointAccelerationConfig,
+    JointAccelerationEstimator,
+)
 from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
 from fbse_drake.estimators.records import parts
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
@@ -134,7 +137,15 @@ class EstimatorDiagram(Diagram):
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
         self._connect_model_at_start(acceleration)
         link_torque = self._add(
-            "link_torque", LinkTorqueEstimator(config.link_torque, robot, measurements, model, self._type("joint_acceleration"), clock)
+            "link_torque",
+            LinkTorqueEstimator(
+                config.link_torque,
+                robot,
+                measurements,
+                model,
+                self._type("joint_acceleration"),
+                clock,
+            ),
         )
         self._join(link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration")
         self._connect_model_at_start(link_torque)
@@ -148,7 +159,13 @@ class EstimatorDiagram(Diagram):
         self._add_base(Fbse(), robot, clock, plan)
         parts = [self._type(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
         friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
-        self._join(friction, measurements="sensor_monitor", attitude="attitude", base_state="base_state", model="model")
+        self._join(
+            friction,
+            measurements="sensor_monitor",
+            attitude="attitude",
+            base_state="base_state",
+            model="model",
+        )
         self._connect_model_at_start(friction)
         self._feed(friction, "torque_command")
         return friction
@@ -160,9 +177,7 @@ class EstimatorDiagram(Diagram):
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._type("sensor_monitor")
         invariant = isinstance(config.base_state, InvariantFilter)
-        model = self._add(
-            "model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant)
-        )
+        model = self._add("model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant))
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
         if isinstance(config.support, PlannedSupport):
@@ -170,28 +185,30 @@ class EstimatorDiagram(Diagram):
                 raise InputError("estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)")
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
             source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
-            self._builder.Connect(source.get_output_port(), self._systems["sensor_monitor"].GetInputPort("planned_support"))
-        middle = np.zeros(2) if plan is None else np.mean([plan.feet[side].position[0, :2] for side in sides], axis=0)
-        origin = (float(middle[0]), float(middle[1]))
-        if invariant:
-            types = (measurements, self._type("model"))
-            both = InvariantBaseFilter(
-                config.base_state, config.sensors, robot, *types, clock, origin
-            )
-            self._add("base_state", both)
-            self._join(both, measurements="sensor_monitor", model="model")
             self._builder.Connect(
-                both.GetOutputPort("last_angular_velocity_bias"),
-                model.GetInputPort("angular_velocity_bias"),
+                source.get_output_port(),
+                self._systems["sensor_monitor"].GetInputPort("planned_support"),
             )
-            self._systems["attitude"] = both
-            return
-        attitude = self._add(
-            "attitude",
-            AttitudeEstimator(config.attitude, robot, measurements, self._type("model"), clock),
-        )
+        feet = [] if plan is None else [plan.feet[side].position[0, :2] for side in sides]
+        x, y = np.mean(feet, axis=0) if feet else (0.0, 0.0)
+        add = self._add_invariant_base if invariant else self._add_base_in_stages
+        add(config, robot, clock, (float(x), float(y)))
+
+    def _add_invariant_base(self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]) -> None:
+        """Attitude and base state in one."""
+        types = (self._type("sensor_monitor"), self._type("model"))
+        base = InvariantBaseFilter(config.base_state, config.sensors, robot, *types, clock, origin)
+        self._systems["attitude"] = self._add("base_state", base)
+        self._join(base, measurements="sensor_monitor", model="model")
+        bias = base.GetOutputPort("last_angular_velocity_bias")
+        self._builder.Connect(bias, self._systems["model"].GetInputPort("angular_velocity_bias"))
+
+    def _add_base_in_stages(self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]) -> None:
+        """Attitude first, then the base state."""
+        measurements, model = self._type("sensor_monitor"), self._type("model")
+        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, model, clock))
         self._join(attitude, measurements="sensor_monitor", model="model")
-        shared = (robot, measurements, self._type("attitude"), self._type("model"), clock, origin)
+        shared = (robot, measurements, self._type("attitude"), model, clock, origin)
         base_state: BaseStateEstimator
         if isinstance(config.base_state, AdaptiveLipm):
             base_state = AdaptiveLipmEstimator(config.base_state, *shared)
@@ -226,7 +243,10 @@ class EstimatorDiagram(Diagram):
             self._builder.Connect(self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port))
 
     def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
-        self._builder.Connect(self._systems["model"].GetOutputPort("at_step_start"), system.GetInputPort("model_at_step_start"))
+        self._builder.Connect(
+            self._systems["model"].GetOutputPort("at_step_start"),
+            system.GetInputPort("model_at_step_start"),
+        )
 
     def _feed(self, system: RecursiveEstimator, *ports: str) -> None:
         """Makes inputs of the diagram of a system's input ports."""
@@ -261,7 +281,12 @@ class EstimatorDiagram(Diagram):
 
 
 def make_estimator(
-    config: EstimatorConfig, robot: Robot, *, period: float, plan: TaskPlan | None = None, every_sample: bool = False
+    config: EstimatorConfig,
+    robot: Robot,
+    *,
+    period: float,
+    plan: TaskPlan | None = None,
+    every_sample: bool = False,
 ) -> EstimatorDiagram | None:
     """Builds a friction estimator, or None for `NoEstimator`.
 

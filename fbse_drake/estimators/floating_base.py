@@ -47,9 +47,7 @@ class ImuMount:
 
 
 @njit(cache=True)
-def base_specific_force(
-    specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector
-) -> Vector:
+def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector) -> Vector:
     """Specific force of the base's origin in base axes [m/s^2].
 
     Args:
@@ -63,9 +61,7 @@ def base_specific_force(
 
 
 @njit(cache=True)
-def _plant_state(
-    state: np.ndarray, measured: np.ndarray, rate_bias: np.ndarray, known: np.ndarray
-) -> bool:
+def _plant_state(state: np.ndarray, measured: np.ndarray, rate_bias: np.ndarray, known: np.ndarray) -> bool:
     """Puts the measured motion into a plant's state, in place; says whether all of it is finite.
 
     Args:
@@ -183,9 +179,7 @@ class FloatingBaseModel(RecursiveEstimator):
         velocity        (v,)       [angular velocity, 0, joint velocities]
     """
 
-    def __init__(
-        self, robot: Robot, measurements: np.dtype, clock: Clock, *, knows_bias: bool = False
-    ):
+    def __init__(self, robot: Robot, measurements: np.dtype, clock: Clock, *, knows_bias: bool = False):
         """Declares ports and state.
 
         Args:
@@ -261,9 +255,7 @@ class FloatingBaseModel(RecursiveEstimator):
             [
                 (
                     plant.CalcJacobianSpatialVelocity(now, wrt, sole, origin, world, sole),
-                    plant.CalcBiasSpatialAcceleration(
-                        now, wrt, sole, origin, world, sole
-                    ).get_coeffs(),
+                    plant.CalcBiasSpatialAcceleration(now, wrt, sole, origin, world, sole).get_coeffs(),
                 )
                 for sole in self._soles
             ]

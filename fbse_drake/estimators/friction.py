@@ -232,9 +232,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         super().__init__(config.model, robot, measurements, link_torque, clock, 0, **further)
         self._config = config
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         config = self._config
         posterior[...] = last
@@ -266,9 +264,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if valid.any():
             forgets = config.forgetting != 1
             forgetting = config.forgetting ** (elapsed / 1e-3) if forgets else 1.0
-            new, P_new, innovation, S = recursive_least_squares(
-                parameters, P, phi, residual, forgetting
-            )
+            new, P_new, innovation, S = recursive_least_squares(parameters, P, phi, residual, forgetting)
             parameters[valid], P[valid] = new[valid], P_new[valid]
             posterior["innovation"], posterior["innovation_variance"] = innovation * valid, S
         posterior["parameter_variance"] = np.diagonal(P, axis1=1, axis2=2)
@@ -276,9 +272,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 
 @njit(cache=True)
-def smooth_velocity(
-    posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
-) -> None:
+def smooth_velocity(posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float) -> None:
     """Low-pass of first order over joint velocities.
 
     Args:
@@ -415,9 +409,7 @@ class ModelAidedEstimator(FrictionEstimator):
         measures_swing = config.swing == "measurement"
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         if math.isnan(elapsed):
             self._start(posterior, measured)

@@ -83,7 +83,11 @@ def solve_positive_definite(S: np.ndarray, B: np.ndarray) -> None:
 
 @njit(cache=True)
 def fuse(
-    measured: np.ndarray, variance: np.ndarray, J: np.ndarray, y: np.ndarray, constraint_variance: np.ndarray
+    measured: np.ndarray,
+    variance: np.ndarray,
+    J: np.ndarray,
+    y: np.ndarray,
+    constraint_variance: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares of measured accelerations and J x = y.
 
@@ -152,9 +156,7 @@ def measured_acceleration(
 
 
 @njit(cache=True)
-def no_slip_condition(
-    model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, gravity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def no_slip_condition(model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
 
     The base's acceleration in `a` is its specific force, so a foot at rest accelerates with minus
@@ -395,9 +397,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._model = self._declare_record_input("model_at_step_start", model)
         self._declare_posterior("measurements", "attitude", "model_at_step_start")
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         model = self._model.Eval(context)
         if last["status"]:
@@ -419,9 +419,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
 
         They have the joints of the feet that stand from the other sensors.
         """
-        found, stands, J, y, acceleration = _no_slip_problem(
-            posterior, last, elapsed, measured, attitude, model, known
-        )
+        found, stands, J, y, acceleration = _no_slip_problem(posterior, last, elapsed, measured, attitude, model, known)
         if not found:
             return
         sensitivity = np.eye(len(acceleration))

@@ -179,9 +179,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             noise=config,
             pads=record(position=pads.position, foot=pads.foot),
             wrench_variance=np.array([force_noise**2 * (G**2).sum(axis=1) for G in grasp]),
-            smallest_load=np.array(
-                [force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()]
-            ),
+            smallest_load=np.array([force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()]),
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)

@@ -15,7 +15,12 @@ from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import vector
-from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig, detect_support
+from fbse_drake.estimators.support import (
+    MeasuredSupport,
+    PlannedSupport,
+    SupportConfig,
+    detect_support,
+)
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
@@ -86,9 +91,7 @@ def _watch_channels(
 
 
 @njit(cache=True)
-def _watch_sensors(
-    posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray
-) -> None:
+def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
@@ -204,9 +207,7 @@ class SensorMonitor(RecursiveEstimator):
         waiting     (feet,)      see `detect_support`
     """
 
-    def __init__(
-        self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock
-    ):
+    def __init__(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock):
         readings = _readings(robot)
         sensors = record_type(**readings)
         legs = robot.description.legs
@@ -236,14 +237,10 @@ class SensorMonitor(RecursiveEstimator):
             limits=config,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
-            thresholds=record(
-                on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce
-            ),
+            thresholds=record(on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce),
         )
 
-    def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
-    ) -> None:
+    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
         _watch_sensors(posterior, last, elapsed, self._sensors.Eval(context), self._known)
         if self._planned is not None:
             posterior["support"] = self._planned.Eval(context) > 0

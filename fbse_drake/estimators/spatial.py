@@ -98,7 +98,12 @@ def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
     """a * b of quaternions [w, x, y, z]."""
     w, x, y, z = a
     s, i, j, k = b
-    return w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i, w * k + x * j - y * i + z * s
+    return (
+        w * s - x * i - y * j - z * k,
+        w * i + x * s + y * k - z * j,
+        w * j - x * k + y * s + z * i,
+        w * k + x * j - y * i + z * s,
+    )
 
 
 @njit(cache=True)

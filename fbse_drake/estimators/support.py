@@ -63,10 +63,8 @@ def detect_support(
             support[foot], waiting[foot] = 1.0 if load[foot] > thresholds.on else 0.0, 0.0
             continue
         support[foot] = last_support[foot]
-        if last_support[foot] > 0:
-            beyond = load[foot] < thresholds.off
-        else:
-            beyond = load[foot] > thresholds.on
+        stood, on, off = last_support[foot] > 0, thresholds.on, thresholds.off
+        beyond = load[foot] < off if stood else load[foot] > on
         waiting[foot] = last_waiting[foot] + elapsed if beyond and trust[foot] == 0 else 0.0
         if waiting[foot] > thresholds.debounce:
             support[foot], waiting[foot] = 1.0 - last_support[foot], 0.0
