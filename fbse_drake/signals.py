@@ -136,6 +136,7 @@ _TABLE: list[Signal] = [
     _estimate("joint/residual_torque", "link_torque", "residual", "Nm", ("n",)),
     _status("friction"),
     _estimate("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
+    _estimate("joint/friction_torque_std", "friction", "friction_std", "Nm", ("n",)),
     _own("friction", "parameters", shape=("n", "m")),
     _own("friction", "parameter_variance", shape=("n", "m")),
     _own("friction", "innovation"),

@@ -8,6 +8,7 @@ times.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -74,7 +75,7 @@ class ModelAided:
     # Initial standard deviation of every parameter [its unit].
     parameter_uncertainty: float = 3.0
     # Random walk of d [Nm/sqrt(s)], and its initial standard deviation [Nm].
-    disturbance_walk: float = 0.3
+    disturbance_walk: float = 0.15
     disturbance_uncertainty: float = 0.1
     # Random walk of the parameters [its unit/sqrt(s)].
     parameter_walk: float = 0.0
@@ -82,6 +83,10 @@ class ModelAided:
     velocity_smoothing: float = 0.0015
     # What is taken while a leg swings: the `measurement` as in stance, or the `model` alone.
     swing: str = "measurement"
+    # By what the nonlinear parameters (a transition velocity) may be wrong: the model is a mixture
+    # of such shapes; and the initial standard deviation of each one's weight [Nm].
+    factors: list[float] = field(default_factory=lambda: [0.2, 5.0])
+    shape_uncertainty: float = 3.0
 
     def __post_init__(self) -> None:
         require_not_negative(self, "parameter_uncertainty", "parameter_walk")
@@ -93,6 +98,13 @@ class ModelAided:
 
 FrictionConfig = RecursiveLeastSquares | ModelAided
 
+# For how long innovations must agree to be no noise [s], and how much larger than noise leaves it
+# their mean square must be then.
+_AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# How long it takes to learn that the sensors are noisier than believed [s], and how much of that
+# one tick may tell.
+_NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
+
 
 @dataclass(frozen=True)
 class FrictionRegressor:
@@ -102,23 +114,56 @@ class FrictionRegressor:
     """
 
     effect: type[JointTorqueEffect]
-    # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
+    # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with
+    # (n, parameters).
     nonlinear: np.ndarray
     initial: np.ndarray
+    # The nonlinear parameters may be wrong by these factors; each basis torque that they change is
+    # there as its difference for each factor, too, with a weight of zero to start with.
+    factors: tuple[float, ...] = ()
 
     @staticmethod
-    def of(model: JointTorqueEffect, robot: Robot) -> "FrictionRegressor":
+    def of(
+        model: JointTorqueEffect, robot: Robot, factors: tuple[float, ...] = ()
+    ) -> "FrictionRegressor":
         """Raises InputError for an unknown joint."""
         resolved = model.resolve(robot.description, key="estimator.friction.model")
-        return FrictionRegressor(resolved.effect, resolved.nonlinear, resolved.linear.T.copy())
+        effect, nonlinear = resolved.effect, resolved.nonlinear
+        return FrictionRegressor(effect, nonlinear, resolved.linear.T.copy(), factors)
 
     @property
     def parameters(self) -> int:
+        """How many linear parameters the model has."""
         return self.initial.shape[1]
 
-    def __call__(self, velocity: np.ndarray) -> Sequence[np.ndarray]:
-        basis, _ = self.effect.basis(JointMotion(velocity), self.nonlinear)
-        return basis
+    @property
+    def shapes(self) -> int:
+        """How many differences there are besides."""
+        return len(self(np.full(len(self.initial), 0.1))) - self.parameters
+
+    def __call__(self, velocity: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Basis torques of the model's parameters, then the differences."""
+        motion = JointMotion(velocity)
+        basis = tuple(self.effect.basis(motion, self.nonlinear)[0])
+        if not self.factors or not len(self.nonlinear):
+            return basis
+        others = [self.effect.basis(motion, self.nonlinear * f)[0] for f in self.factors]
+        return basis + tuple(
+            other[k] - basis[k]
+            for other in others
+            for k in self._shaped
+        )
+
+    @cached_property
+    def _shaped(self) -> list[int]:
+        """Places of the basis torques that the nonlinear parameters change."""
+        motion = JointMotion(np.full(len(self.initial), 0.1 * float(np.max(self.nonlinear))))
+        pairs = zip(
+            self.effect.basis(motion, self.nonlinear)[0],
+            self.effect.basis(motion, 2.0 * self.nonlinear)[0],
+            strict=True,
+        )
+        return [k for k, (one, other) in enumerate(pairs) if np.any(one != other)]
 
 
 def recursive_least_squares(
@@ -164,7 +209,7 @@ class FrictionEstimator(RecursiveEstimator):
 
     def __init__(
         self,
-        model: JointTorqueEffect,
+        regressor: FrictionRegressor,
         robot: Robot,
         measurements: np.dtype,
         link_torque: np.dtype,
@@ -175,12 +220,12 @@ class FrictionEstimator(RecursiveEstimator):
         """Declares ports and state.
 
         Args:
-            model: of the friction.
+            regressor: of the friction.
             measurements, link_torque: types of the inputs' posteriors.
             covariance_size: how many states each joint's covariance has besides its parameters.
             further: shapes of further fields of the posterior.
         """
-        self._regressor = FrictionRegressor.of(model, robot)
+        self._regressor = regressor
         n, m = len(robot.joint_names), self._regressor.parameters
         size = m + covariance_size
         posterior_type = record_type(
@@ -229,7 +274,8 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         clock: Clock,
     ):
         further = {"filtered": (2, len(robot.joint_names)), "age": ()}
-        super().__init__(config.model, robot, measurements, link_torque, clock, 0, **further)
+        regressor = FrictionRegressor.of(config.model, robot)
+        super().__init__(regressor, robot, measurements, link_torque, clock, 0, **further)
         self._config = config
 
     def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
@@ -303,31 +349,31 @@ def _estimate_friction(
     Fills the posterior but for its `velocity`.
 
     Args:
-        phi: the model's regressors, m of shape (n,).
+        phi: the model's regressors and its differences, m of shape (n,).
         known: record with the numbers of `ModelAided` as `config`; `joint_leg` (n,), which leg each
             joint belongs to; `measures_swing`, whether the measurement counts while the leg swings.
     """
     posterior, last, known = posterior[()], last[()], known[()]
-    measured, link = measured[()], link_torque[()]
-    disturbance_walk = known.config.disturbance_walk
-    parameter_walk = known.config.parameter_walk
+    measured, link, config = measured[()], link_torque[()], known.config
     support, m, n = measured.support, len(phi), len(known.joint_leg)
     size = m + 2
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
+    keep = math.exp(-elapsed / _AGREEMENT_TIME)
+    count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / _NOISE_TIME)
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
-        # Parameters and disturbance, whose regressor is one.
+        # Weights of the model and disturbance, whose regressor is one.
         for k in range(m):
-            regressor[k], x[k] = phi[k][joint], last.parameters[joint, k]
+            regressor[k], x[k] = phi[k][joint], last.weights[joint, k]
         x[m] = last.disturbance[joint]
-        P = posterior.covariance[joint]
+        P, noise = posterior.covariance[joint], last.noise[joint]
         impulse_uncertainty = P[0, 0]
         # Prediction: the impulse error grows by the friction's error times the tick.
         innovation = last.impulse[joint] + elapsed * link.residual[joint]
-        added = elapsed**2 * link.torque_variance[joint]
+        added = elapsed**2 * noise * link.torque_variance[joint]
         for k in range(m + 1):
             innovation -= elapsed * regressor[k] * x[k]
         for i in range(size):
@@ -339,14 +385,14 @@ def _estimate_friction(
                 added += elapsed * regressor[i - 1] * c
         # Its own row and column are the same.
         P[0, 0] += P[0, 0] - impulse_uncertainty + added
-        P[size - 1, size - 1] += disturbance_walk**2 * elapsed
+        P[size - 1, size - 1] += config.disturbance_walk**2 * elapsed
         for i in range(1, m + 1):
             P[0, i] = P[i, 0]
-            P[i, i] += parameter_walk**2 * elapsed
+            P[i, i] += config.parameter_walk**2 * elapsed
         P[0, size - 1] = P[size - 1, 0]
         # Update.
         column[:] = P[:, 0]
-        S = column[0] + link.impulse_variance[joint]
+        S = column[0] + noise * link.impulse_variance[joint]
         impulse = innovation
         if valid:
             for i in range(size):
@@ -357,18 +403,33 @@ def _estimate_friction(
                     x[i - 1] += gain * innovation
                 for k in range(size):
                     P[i, k] -= gain * column[k]
+            # Differences of innovations show the noise, whatever the model is wrong by ...
+            change = innovation - last.innovation[joint]
+            rough = min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
+            noise = max(1.0, noise * (1.0 + learning * (rough - 1.0)))
+            # ... and their mean what the model is wrong by, beyond the noise.
+            agreement = keep * last.agreement[joint] + (1.0 - keep) * innovation
+            posterior.agreement[joint] = agreement
+            if count * agreement * agreement > _AGREEMENT * S:
+                unexplained = column[0] / S * agreement / elapsed
+                P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
         else:
             # A joint that is not measured is left to its model.
-            x[m] = impulse = 0.0
+            x[m] = impulse = posterior.agreement[joint] = 0.0
             P[0, :] = 0.0
             P[:, 0] = 0.0
-        total = 0.0
-        for k in range(m + 1):
-            total += regressor[k] * x[k]
+        total, variance = 0.0, 0.0
+        for i in range(m + 1):
+            total += regressor[i] * x[i]
+            for k in range(m + 1):
+                variance += regressor[i] * regressor[k] * P[1 + i, 1 + k]
         for k in range(m):
+            posterior.weights[joint, k] = x[k]
+        for k in range(posterior.parameters.shape[1]):
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
-        posterior.friction[joint] = total
+        posterior.friction[joint], posterior.noise[joint] = total, noise
+        posterior.friction_std[joint] = math.sqrt(max(0.0, variance))
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
         posterior.innovation[joint] = innovation if valid else 0.0
         posterior.innovation_variance[joint] = S
@@ -391,7 +452,10 @@ class ModelAidedEstimator(FrictionEstimator):
     Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
     [Nm s], after the update; `velocity` that the model sees and `last_velocity` as measured
     [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
-    [impulse, parameters, disturbance].
+    [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
+    shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
+    the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
+    the running mean of the innovation [Nm s].
     """
 
     def __init__(
@@ -402,9 +466,15 @@ class ModelAidedEstimator(FrictionEstimator):
         link_torque: np.dtype,
         clock: Clock,
     ):
-        further = ("disturbance", "impulse", "velocity", "last_velocity")
-        shapes = dict.fromkeys(further, (len(robot.joint_names),))
-        super().__init__(config.model, robot, measurements, link_torque, clock, 2, **shapes)
+        n = len(robot.joint_names)
+        regressor = FrictionRegressor.of(config.model, robot, config.factors)
+        further = ("disturbance", "impulse", "velocity", "last_velocity", "friction_std")
+        further += ("noise", "agreement")
+        shapes = dict.fromkeys(further, (n,))
+        shapes["weights"] = (n, regressor.parameters + regressor.shapes)
+        super().__init__(
+            regressor, robot, measurements, link_torque, clock, regressor.shapes + 2, **shapes
+        )
         self._config, self._smoothing = config, float(config.velocity_smoothing)
         measures_swing = config.swing == "measurement"
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
@@ -421,8 +491,10 @@ class ModelAidedEstimator(FrictionEstimator):
     def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
         config, m = self._config, self._regressor.parameters
         uncertainty = [config.parameter_uncertainty**2] * m
+        uncertainty += [config.shape_uncertainty**2] * self._regressor.shapes
         posterior[...] = np.zeros((), self.posterior_type)
         posterior["status"] = measured["trust"].max()
-        posterior["parameters"] = self._regressor.initial
+        posterior["parameters"] = posterior["weights"][:, :m] = self._regressor.initial
+        posterior["noise"] = 1.0
         posterior["covariance"] = np.diag([0.0, *uncertainty, config.disturbance_uncertainty**2])
         posterior["velocity"] = posterior["last_velocity"] = measured["joint_velocity"]
