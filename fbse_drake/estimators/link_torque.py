@@ -19,6 +19,11 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 _NOT_FINITE = float(Status.NOT_FINITE)
 
 
+# How long it takes to learn that foot forces are noisier than believed [s], and how much of that one
+# tick may tell.
+_NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
+
+
 @dataclass(frozen=True)
 class LinkTorqueConfig:
     """Noise of the sensors as it is believed, for the variance of the measured friction."""
@@ -29,6 +34,8 @@ class LinkTorqueConfig:
     angular_velocity_noise: float = 1.0e-3
     joint_velocity_noise: float = 5.0e-4
     force_noise: float = 0.5
+    # Are the foot forces watched for noise that is larger than that?
+    learns_noise: bool = True
 
     def __post_init__(self) -> None:
         require_positive(self, "acceleration_noise", "angular_velocity_noise")
@@ -47,8 +54,38 @@ def _clear(posterior: np.ndarray, status: float) -> None:
 
 
 @njit(cache=True)
+def _watch_forces(
+    posterior: np.ndarray, last: np.ndarray, elapsed: float, measured: np.ndarray, known: np.ndarray
+) -> None:
+    """Fills the noise of each foot's forces.
+
+    It shows in their second differences, to which forces that change smoothly add little; one tick
+    does not tell much, for a foot may just have landed.
+    """
+    learning = 1.0 - math.exp(-elapsed / _NOISE_TIME)
+    feet, change = known.pads.foot, posterior.force_change
+    posterior.pad_force[:] = measured.pad_force
+    change[:] = measured.pad_force - last.pad_force
+    posterior.force_noise[:] = last.force_noise
+    if math.isnan(elapsed) or not known.learns_noise or not last.force_noise.all():
+        posterior.force_noise[:] = known.noise.force_noise
+        return
+    for foot in range(len(posterior.force_noise)):
+        total, count = 0.0, 0
+        for pad in range(len(feet)):
+            if feet[pad] == foot:
+                for i in range(3):
+                    total += (change[pad, i] - last.force_change[pad, i]) ** 2 / 6.0
+                    count += 1
+        share = min(_LARGEST_SHARE, total / count / last.force_noise[foot] ** 2)
+        learnt = last.force_noise[foot] * math.sqrt(1.0 + learning * (share - 1.0))
+        posterior.force_noise[foot] = max(known.noise.force_noise, learnt)
+
+
+@njit(cache=True)
 def _estimate_link_torque(
     posterior: np.ndarray,
+    last: np.ndarray,
     elapsed: float,
     measured: np.ndarray,
     model: np.ndarray,
@@ -61,12 +98,13 @@ def _estimate_link_torque(
     Args:
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the values of `LinkTorqueConfig` as `noise`; `pads`, see `FootPads`;
-            `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2];
-            `smallest_load` (feet,) that counts [N]; and `joint_leg` (n,), which leg each joint
-            belongs to.
+            `wrench_variance` (feet, 6) of each foot's measured wrench [m^2, 1] and `smallest_load`
+            (feet,) that counts [1], per noise of one pad; `joint_leg` (n,), which leg each joint
+            belongs to; and `learns_noise`.
     """
-    posterior, measured, model = posterior[()], measured[()], model[()]
-    acceleration, known = acceleration[()], known[()]
+    posterior, last, measured = posterior[()], last[()], measured[()]
+    model, acceleration, known = model[()], acceleration[()], known[()]
+    _watch_forces(posterior, last, elapsed, measured, known)
     if not np.isfinite(torque_command).all():
         _clear(posterior, _NOT_FINITE)
         return
@@ -101,11 +139,13 @@ def _estimate_link_torque(
             else:
                 impulse_variance += (to_sensors[j] * noise.joint_velocity_noise) ** 2
         for foot in range(feet):
-            if wrench[foot, 5] > known.smallest_load[foot]:
+            force_noise = posterior.force_noise[foot]
+            if wrench[foot, 5] > force_noise * known.smallest_load[foot]:
                 for k in range(6):
                     lever = model.foot_jacobian[foot, k, 6 + i]
                     link_torque -= wrench[foot, k] * lever
-                    torque_variance += known.wrench_variance[foot, k] * lever * lever
+                    wrench_variance = force_noise**2 * known.wrench_variance[foot, k]
+                    torque_variance += wrench_variance * lever * lever
         trusted = trust[0] == 0 and trust[1] == 0 and trust[2 + known.joint_leg[i]] == 0
         posterior.link_torque[i] = link_torque
         posterior.residual[i] = torque_command[i] - link_torque
@@ -145,6 +185,9 @@ class LinkTorqueEstimator(RecursiveEstimator):
                            differentiated [(Nm s)^2]
         valid              1 where all that the residual needs was known
 
+    and `force_noise` (feet,) [N] of each pad of a foot, at least what is believed; `pad_force` and
+    its last change `force_change` (pads, 3) [N].
+
     A foot that shows less load than its sensors' noise counts as unloaded.
     """
 
@@ -162,7 +205,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         Args:
             measurements, model, acceleration: types of the inputs' posteriors.
         """
-        n, legs = len(robot.joint_names), robot.description.legs
+        n, legs, pads = len(robot.joint_names), robot.description.legs, FootPads(robot)
         posterior_type = record_type(
             time=(),
             status=(),
@@ -171,15 +214,18 @@ class LinkTorqueEstimator(RecursiveEstimator):
             torque_variance=(n,),
             impulse_variance=(n,),
             valid=(n,),
+            force_noise=(len(legs),),
+            pad_force=(len(pads.foot), 3),
+            force_change=(len(pads.foot), 3),
         )
         super().__init__(posterior_type, clock)
-        grasp, pads = [grasp_map(robot.pad_positions(side)) for side in legs], FootPads(robot)
-        force_noise = config.force_noise
+        grasp = [grasp_map(robot.pad_positions(side)) for side in legs]
         self._known = record(
             noise=config,
             pads=record(position=pads.position, foot=pads.foot),
-            wrench_variance=np.array([force_noise**2 * (G**2).sum(axis=1) for G in grasp]),
-            smallest_load=np.array([force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()]),
+            wrench_variance=np.array([(G**2).sum(axis=1) for G in grasp]),
+            smallest_load=np.array([math.sqrt(len(leg.pads)) for leg in legs.values()]),
+            learns_noise=config.learns_noise,
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -192,12 +238,13 @@ class LinkTorqueEstimator(RecursiveEstimator):
     def _tick(
         self,
         context: Context,
-        last: np.ndarray,  # noqa: ARG002
+        last: np.ndarray,
         elapsed: float,
         posterior: np.ndarray,
     ) -> None:
         _estimate_link_torque(
             posterior,
+            last,
             elapsed,
             self._measurements.Eval(context),
             self._model.Eval(context),
