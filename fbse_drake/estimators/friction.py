@@ -102,7 +102,8 @@ class FrictionRegressor:
     """
 
     effect: type[JointTorqueEffect]
-    # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with (n, parameters).
+    # Values of the nonlinear parameters (nonlinear, n), and of the linear ones to start with
+    # (n, parameters).
     nonlinear: np.ndarray
     initial: np.ndarray
 
@@ -122,7 +123,11 @@ class FrictionRegressor:
 
 
 def recursive_least_squares(
-    parameters: np.ndarray, P: np.ndarray, phi: np.ndarray, measured: np.ndarray, forgetting: float
+    parameters: np.ndarray,
+    P: np.ndarray,
+    phi: np.ndarray,
+    measured: np.ndarray,
+    forgetting: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One tick of (64)-(67) for n joints at once.
 
@@ -233,7 +238,11 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         self._config = config
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         config = self._config
@@ -267,7 +276,11 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
             forgets = config.forgetting != 1
             forgetting = config.forgetting ** (elapsed / 1e-3) if forgets else 1.0
             new, P_new, innovation, S = recursive_least_squares(
-                parameters, P, phi, residual, forgetting
+                parameters,
+                P,
+                phi,
+                residual,
+                forgetting,
             )
             parameters[valid], P[valid] = new[valid], P_new[valid]
             posterior["innovation"], posterior["innovation_variance"] = innovation * valid, S
@@ -277,7 +290,11 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 @njit(cache=True)
 def smooth_velocity(
-    posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
+    posterior: np.ndarray,
+    last: np.ndarray,
+    measured: np.ndarray,
+    elapsed: float,
+    time: float,
 ) -> None:
     """Low-pass of first order over joint velocities.
 
@@ -416,7 +433,11 @@ class ModelAidedEstimator(FrictionEstimator):
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         if math.isnan(elapsed):

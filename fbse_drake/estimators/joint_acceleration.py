@@ -55,7 +55,10 @@ def minimum_norm(J: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def solve_positive_definite(S: np.ndarray, B: np.ndarray) -> None:
-    """Replaces B (c, m) by S^-1 B, by Cholesky; S (c, c) is symmetric positive definite and is overwritten."""
+    """Replaces B (c, m) by S^-1 B, by Cholesky.
+
+    S (c, c) is symmetric positive definite and is overwritten.
+    """
     c, m = B.shape
     for i in range(c):
         for j in range(i + 1):
@@ -92,7 +95,8 @@ def fuse(
         J: shape (c, v); y: shape (c,), with independent errors of `constraint_variance` (c,).
 
     Returns:
-        The accelerations x (v,), dx/dmeasured (v, v), the innovation y - J measured (c,) and its variance (c,).
+        The accelerations x (v,), dx/dmeasured (v, v), the innovation y - J measured (c,) and its
+        variance (c,).
     """
     c, v = J.shape
     gain, S, innovation, x = np.empty((c, v)), np.zeros((c, c)), y.copy(), measured.copy()
@@ -117,7 +121,10 @@ def fuse(
 
 @njit(cache=True)
 def measured_acceleration(
-    measured: np.ndarray, model: np.ndarray, elapsed: float, known: np.ndarray
+    measured: np.ndarray,
+    model: np.ndarray,
+    elapsed: float,
+    known: np.ndarray,
 ) -> np.ndarray:
     """What gyro, accelerometer and encoders say of the accelerations of base and joints.
 
@@ -145,7 +152,10 @@ def measured_acceleration(
 
 @njit(cache=True)
 def no_slip_condition(
-    model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, gravity: np.ndarray
+    model: np.ndarray,
+    attitude: np.ndarray,
+    stands: np.ndarray,
+    gravity: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
 
@@ -336,7 +346,11 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._declare_posterior("measurements", "attitude", "model_at_step_start")
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         model = self._model.Eval(context)
@@ -359,7 +373,12 @@ class JointAccelerationEstimator(RecursiveEstimator):
         They have the joints of the feet that stand from the other sensors.
         """
         found, stands, J, y, acceleration = _no_slip_problem(
-            posterior, elapsed, measured, attitude, model, known
+            posterior,
+            elapsed,
+            measured,
+            attitude,
+            model,
+            known,
         )
         if not found:
             return

@@ -180,7 +180,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             pads=record(position=pads.position, foot=pads.foot),
             wrench_variance=np.array([force_noise**2 * (G**2).sum(axis=1) for G in grasp]),
             smallest_load=np.array(
-                [force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()]
+                [force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()],
             ),
             joint_leg=leg_of_joint(robot),
         )

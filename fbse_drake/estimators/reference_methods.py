@@ -1,4 +1,4 @@
-"""Other ways to have the friction, to be compared with FBSE, whose place in the diagram they take."""
+"""Other ways to have the friction, in the place of FBSE, to be compared with it."""
 
 import math
 from dataclasses import dataclass, field
@@ -116,7 +116,11 @@ class TorqueSensorEstimator(RecursiveEstimator):
         self._declare_posterior("measured_torque")
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         if math.isnan(elapsed):
             posterior[...] = last
@@ -222,7 +226,11 @@ class MomentumObserver(RecursiveEstimator):
         self._declare_posterior(*inputs)
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         records = (port.Eval(context) for port in self._inputs)
         measured, attitude, base_state, model, start = records
