@@ -56,7 +56,9 @@ class Rig:
 
 
 def pack(
-    system: RecursiveEstimator, start: np.ndarray | None = None, **values: np.ndarray | float
+    system: RecursiveEstimator,
+    start: np.ndarray | None = None,
+    **values: np.ndarray | float,
 ) -> np.ndarray:
     """A posterior as another system would send it: this one, or zeros, with these values."""
     kind = system.posterior_type

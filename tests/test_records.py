@@ -106,8 +106,8 @@ def test_two_contexts_do_not_know_of_each_other(run: Run, name: str):
             replay.estimator.ExecuteForcedEvents(context.context, publish=False)
 
 
-def test_a_posture_belongs_to_its_context():
-    """The model's plant is in the posture of the one context while it is asked about the other."""
+def test_the_models_plant_belongs_to_its_context():
+    """A plant is in the posture of one context while the model is asked about the other."""
     base = Base.of()
     straight = np.zeros(12)
     bent, upright = Rig(base.model), Rig(base.model)

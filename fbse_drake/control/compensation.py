@@ -113,7 +113,11 @@ class FrictionCompensation(RecursiveEstimator):
         self._declare_posterior("friction_estimate")
 
     def _tick(
-        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
     ) -> None:
         if math.isnan(elapsed):
             posterior[...] = last

@@ -54,10 +54,12 @@ class AttitudeConfig:
     # The trunk's linear acceleration: its size [m/s^2] and how long it keeps its direction [s].
     motion_acceleration: float = 0.5
     motion_time: float = 0.3
-    # How large a constant accelerometer bias [m/s^2] and gyro bias [rad/s] may be; 0 does not estimate it.
+    # How large a constant accelerometer bias [m/s^2] and gyro bias [rad/s] may be; 0 does not
+    # estimate it.
     acceleration_bias: float = 0.0
     angular_velocity_bias: float = 0.0
-    # Robots start standing: for this long [s] the trunk accelerates [m/s^2] and turns [rad/s] by no more than this.
+    # Robots start standing: for this long [s] the trunk accelerates [m/s^2] and turns [rad/s] by no
+    # more than this.
     standing_time: float = 0.05
     standing_acceleration: float = 0.1
     standing_rate: float = 3.0e-3
@@ -77,11 +79,20 @@ class AttitudeConfig:
             "standing_acceleration",
             "level_feet",
         )
-        require_positive(self, "acceleration_noise", "motion_acceleration", "motion_time", "stance_time")
+        require_positive(
+            self,
+            "acceleration_noise",
+            "motion_acceleration",
+            "motion_time",
+            "stance_time",
+        )
 
 
 class GravityEstimate(NamedTuple):
-    """State of the gravity filter, in IMU axes [m/s^2]. The three axes share one covariance, for states and noise are isotropic."""
+    """State of the gravity filter, in IMU axes [m/s^2].
+
+    The three axes share one covariance, for states and noise are isotropic.
+    """
 
     # Specific force of rest (minus gravity), linear acceleration, accelerometer bias.
     gravity: Vector
@@ -103,11 +114,12 @@ def start_gravity(
 ) -> GravityEstimate:
     """Decomposes the first reading by the pseudo-inverse, weighted with how large each part may be.
 
-    (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all of it where it belongs.)
+    (The paper's plain pseudo-inverse gives each part a third of the reading; weights put nearly all
+    of it where it belongs.)
 
     Args:
-        acceleration_variance, bias_variance, noise_variance: how large the robot's acceleration, the accelerometer's bias and its noise
-            may be, per axis [m^2/s^4].
+        acceleration_variance, bias_variance, noise_variance: how large the robot's acceleration,
+            the accelerometer's bias and its noise may be, per axis [m^2/s^4].
     """
     g, a, b = 9.81**2, acceleration_variance, bias_variance
     total = g + a + b + noise_variance
@@ -137,12 +149,15 @@ def predict_gravity(
     motion_time: float,
     elapsed: float,
 ) -> GravityEstimate:
-    """Gravity and linear acceleration turn with the IMU; the acceleration fades as a first-order Gauss-Markov process.
+    """Gravity and linear acceleration turn with the IMU.
+
+    The acceleration fades as a first-order Gauss-Markov process.
 
     Args:
         w: angular velocity [rad/s].
         rate_variance: variance of w [(rad/s)^2].
-        motion_acceleration, motion_time: standard deviation of the linear acceleration [m/s^2], and how long it keeps its direction [s].
+        motion_acceleration, motion_time: standard deviation of the linear acceleration [m/s^2], and
+            how long it keeps its direction [s].
         elapsed: time step [s].
     """
     fade = math.exp(-elapsed / motion_time)
@@ -162,7 +177,11 @@ def predict_gravity(
 
 
 @njit(cache=True)
-def update_gravity(x: GravityEstimate, specific_force: Vector, noise_variance: float) -> GravityEstimate:
+def update_gravity(
+    x: GravityEstimate,
+    specific_force: Vector,
+    noise_variance: float,
+) -> GravityEstimate:
     """Kalman update with y = gravity + acceleration + bias + noise."""
     gg, ga, gb, aa, ab, bb = x.covariance
     pg, pa, pb = gg + ga + gb, ga + aa + ab, gb + ab + bb
@@ -180,7 +199,10 @@ def update_gravity(x: GravityEstimate, specific_force: Vector, noise_variance: f
 
 
 class QuaternionEstimate(NamedTuple):
-    """State of the quaternion filter. Attitude error and gyro bias are isotropic and share one 2 x 2 covariance for all axes."""
+    """State of the quaternion filter.
+
+    Attitude error and gyro bias are isotropic and share one 2 x 2 covariance for all axes.
+    """
 
     # Attitude of the IMU in the world.
     q: Quaternion
@@ -194,7 +216,12 @@ class QuaternionEstimate(NamedTuple):
 
 
 @njit(cache=True)
-def predict_quaternion(x: QuaternionEstimate, w: Vector, noise_variance: float, elapsed: float) -> QuaternionEstimate:
+def predict_quaternion(
+    x: QuaternionEstimate,
+    w: Vector,
+    noise_variance: float,
+    elapsed: float,
+) -> QuaternionEstimate:
     """Turns the quaternion with the gyro, free of its bias.
 
     Args:
@@ -208,9 +235,16 @@ def predict_quaternion(x: QuaternionEstimate, w: Vector, noise_variance: float, 
 
 
 @njit(cache=True)
-def update_quaternion(x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float) -> QuaternionEstimate:
-    """Extended Kalman update with a measured quaternion, written for the small rotation between prediction and measurement,
-    followed by the norm correction; q and -q count as the same attitude.
+def update_quaternion(
+    x: QuaternionEstimate,
+    measured: Quaternion,
+    variance: float,
+    correlated: float,
+) -> QuaternionEstimate:
+    """Extended Kalman update with a measured quaternion.
+
+    It is written for the small rotation between prediction and measurement and followed by the norm
+    correction; q and -q count as the same attitude.
 
     Args:
         variance: of the measured attitude about each horizontal axis [rad^2].
@@ -239,16 +273,25 @@ def stand_still(
     noise_variance: float,
     own_rate_variance: float,
 ) -> QuaternionEstimate:
-    """Initialisation: the attitude is the measured one; what the gyro says of a standing robot is mostly its bias.
+    """Initialisation: the attitude is the measured one.
+
+    What the gyro says of a standing robot is mostly its bias.
 
     Args:
         noise_variance: of w [(rad/s)^2].
-        own_rate_variance: of the standing robot's own rate [(rad/s)^2], as it counts in one tick: the rate is the same in all.
+        own_rate_variance: of the standing robot's own rate [(rad/s)^2], as it counts in one tick:
+            the rate is the same in all.
     """
     bb = x.covariance[2]
     k = bb / (bb + noise_variance + own_rate_variance)
     bias = add(x.bias, scale(k, subtract(w, x.bias)))
-    return QuaternionEstimate(measured, bias, (tilt_variance, 0.0, bb - k * bb), x.innovation, x.innovation_variance)
+    return QuaternionEstimate(
+        measured,
+        bias,
+        (tilt_variance, 0.0, bb - k * bb),
+        x.innovation,
+        x.innovation_variance,
+    )
 
 
 @njit(cache=True)
@@ -303,6 +346,7 @@ def _estimate_attitude(
             quaternion of the base in its axes.
     """
     if math.isnan(elapsed) and measured[()].trust[1] > 0:
+        # Nothing to start from.
         posterior[()] = last[()]
         posterior[()].status = _NOT_FINITE
         return
@@ -367,9 +411,20 @@ def _estimate_attitude(
                 y = update_quaternion(y, by_gravity, tilt_variance, 2.0 * motion_time / elapsed)
                 if use_feet:
                     by_feet = quaternion_from_gravity(up_I, yaw_of(y.q))
-                    z = update_quaternion(y, by_feet, level_variance, 2.0 * config.stance_time / elapsed)
+                    z = update_quaternion(
+                        y,
+                        by_feet,
+                        level_variance,
+                        2.0 * config.stance_time / elapsed,
+                    )
                     feet_innovation, feet_variance = z.innovation, z.innovation_variance
-                    y = QuaternionEstimate(z.q, z.bias, z.covariance, y.innovation, y.innovation_variance)
+                    y = QuaternionEstimate(
+                        z.q,
+                        z.bias,
+                        z.covariance,
+                        y.innovation,
+                        y.innovation_variance,
+                    )
     q_WB = quaternion_product(y.q, q_IB)
     posterior.status = trust
     put(posterior.orientation, q_WB)
@@ -465,6 +520,12 @@ class AttitudeEstimator(RecursiveEstimator):
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
         _estimate_attitude(posterior, last, elapsed, measured, model, self._known)

@@ -184,7 +184,9 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 
 @njit(cache=True)
-def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known) -> None:
+def _predict(
+    x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known
+) -> None:
     """The step that ends now, in place.
 
     Args:
@@ -218,7 +220,9 @@ def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: 
     acceleration = add(rotate(rotation(x.rotation), f), gravity)
     put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
     put(x.imu_velocity, add(v, scale(T, acceleration)))
-    _turn(x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w))))
+    _turn(
+        x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w)))
+    )
 
 
 @njit(cache=True)
@@ -523,7 +527,12 @@ def _estimate_base(
     """
     posterior[()] = last[()]
     x, last, measured, model, known = posterior[()], last[()], measured[()], model[()], known[()]
-    trust, feet, sensors, P = measured.trust, len(measured.support), known.sensors, x.error_covariance
+    trust, feet, sensors, P = (
+        measured.trust,
+        len(measured.support),
+        known.sensors,
+        x.error_covariance,
+    )
     first = math.isnan(elapsed)
     if first and trust[:2].max() > 0:
         x.status = _NOT_FINITE
@@ -535,10 +544,16 @@ def _estimate_base(
     if first:
         _start(x, measured, model, known)
     else:
-        w, f = subtract(w_raw, vector(x.gyro_bias_B)), subtract(f_raw, vector(x.accelerometer_bias_B))
+        w, f = (
+            subtract(w_raw, vector(x.gyro_bias_B)),
+            subtract(f_raw, vector(x.accelerometer_bias_B)),
+        )
         rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
         if trust[1] > 0:
-            w, f = (0.0, 0.0, 0.0), rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
+            w, f = (
+                (0.0, 0.0, 0.0),
+                rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity))),
+            )
             rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
         _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
@@ -707,13 +722,17 @@ class InvariantBaseFilter(RecursiveEstimator):
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
-        self.DeclareVectorOutputPort("last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()})
+        self.DeclareVectorOutputPort(
+            "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
+        )
 
     def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)
         output.SetFromVector(last["angular_velocity_bias"])
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
         _estimate_base(posterior, last, elapsed, measured, model, self._known)
 

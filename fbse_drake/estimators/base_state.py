@@ -55,9 +55,9 @@ class ContactAided:
     (After Bloesch et al. 2013, with the attitude taken from the attitude estimator.)
     """
 
-    # Standard deviations: acceleration of the base [m/s^2]; what a standing foot moves and turns, as
-    # position [m] and velocity [m/s] of the base seen through the leg; error of the acceleration
-    # through bias and attitude, its size [m/s^2] and how long it lasts [s].
+    # Standard deviations: acceleration of the base [m/s^2]; what a standing foot moves and turns,
+    # as position [m] and velocity [m/s] of the base seen through the leg; error of the
+    # acceleration through bias and attitude, its size [m/s^2] and how long it lasts [s].
     acceleration_noise: float = 0.05
     position_noise: float = 3.0e-4
     velocity_noise: float = 1.5e-3
@@ -117,7 +117,8 @@ def update_lipm(
 ) -> LipmEstimate:
     """One tick of the stable adaptive Kalman filter along one axis, paper eqs. (17)-(31).
 
-    The input of (13) is the jerk, here as the change of the IMU-derived CoM acceleration over the tick.
+    The input of (13) is the jerk, here as the change of the IMU-derived CoM acceleration over the
+    tick.
 
     Args:
         acceleration_change: jerk times tick [m/s^2].
@@ -147,13 +148,20 @@ def update_lipm(
     mean_correction = (n_q - 1) / n_q * learnt.mean_correction + correction / n_q  # (31)
     spread = (correction - mean_correction) ** 2 / (n_q - 1)
     Q = (n_q - 1) / n_q * learnt.Q + np.diag(P - propagated) / n_q + spread
-    return LipmEstimate(x, P, Adaptation(np.abs(Q), R, mean_residual, mean_correction), e, S)  # (27)
+    return LipmEstimate(
+        x,
+        P,
+        Adaptation(np.abs(Q), R, mean_residual, mean_correction),
+        e,
+        S,
+    )  # (27)
 
 
 class LegOdometry(NamedTuple):
     """The base seen through the legs that stand."""
 
-    # Does any foot stand whose sensors, and the encoders, are trusted? Without one, position and velocity mean nothing.
+    # Does any foot stand whose sensors, and the encoders, are trusted? Without one, position and
+    # velocity mean nothing.
     stands: bool
     # Of the base's origin in the world [m], [m/s].
     position: Vector
@@ -345,7 +353,13 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
         )
         self._config, self._known = config, record(**self._legs)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         model, first, config = self._model.Eval(context), math.isnan(elapsed), self._config
         legs = _follow_legs(posterior, last, elapsed, measured, attitude, model, self._known)
@@ -389,7 +403,15 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
             )
             before = LipmEstimate(state[axis], covariance[axis], adaptation)
             zmp = float(posterior["zmp"][axis])
-            new = update_lipm(config, before, float(change[axis]), zmp, height, -self._gravity[2], elapsed)
+            new = update_lipm(
+                config,
+                before,
+                float(change[axis]),
+                zmp,
+                height,
+                -self._gravity[2],
+                elapsed,
+            )
             state[axis], covariance[axis], learnt = new.x, new.P, new.adaptation
             process_noise[axis], correction[axis] = learnt.Q, learnt.mean_correction
             measurement_noise[axis], residual[axis] = learnt.R, learnt.mean_residual
@@ -404,7 +426,7 @@ class AdaptiveLipmEstimator(BaseStateEstimator):
 
 
 class ContactAidedCovariance(NamedTuple):
-    """Covariance of position, velocity and acceleration error of the base, the same for all three axes."""
+    """Covariance of position, velocity and acceleration error, the same for all three axes."""
 
     pp: float
     pv: float
@@ -415,7 +437,10 @@ class ContactAidedCovariance(NamedTuple):
 
 
 class ContactAidedEstimate(NamedTuple):
-    """Position [m] and velocity [m/s] of the base and error of its acceleration [m/s^2], in world axes."""
+    """Position [m] and velocity [m/s] of the base and error of its acceleration [m/s^2].
+
+    All in world axes.
+    """
 
     position: Vector
     velocity: Vector
@@ -435,7 +460,8 @@ def predict_contact_aided(
     """Prediction of one axis: p' = p + T v, v' = v - T a, a' = fade a.
 
     Args:
-        acceleration: of the base, free of its estimated error [m/s^2]; noise: its standard deviation [m/s^2].
+        acceleration: of the base, free of its estimated error [m/s^2].
+        noise: its standard deviation [m/s^2].
         error, error_time: size of the acceleration's error [m/s^2], and how long it lasts [s].
         elapsed: time step T [s].
     """
@@ -457,7 +483,12 @@ def predict_contact_aided(
 
 
 @njit(cache=True)
-def update_contact_aided(x: ContactAidedEstimate, innovation: Vector, covariance: Vector, S: float) -> ContactAidedEstimate:
+def update_contact_aided(
+    x: ContactAidedEstimate,
+    innovation: Vector,
+    covariance: Vector,
+    S: float,
+) -> ContactAidedEstimate:
     """Kalman update with a measured position or velocity.
 
     Args:
@@ -471,7 +502,14 @@ def update_contact_aided(x: ContactAidedEstimate, innovation: Vector, covariance
         add(x.position, scale(kp, innovation)),
         add(x.velocity, scale(kv, innovation)),
         add(x.acceleration_error, scale(ka, innovation)),
-        ContactAidedCovariance(pp - kp * cp, pv - kp * cv, pa - kp * ca, vv - kv * cv, va - kv * ca, aa - ka * ca),
+        ContactAidedCovariance(
+            pp - kp * cp,
+            pv - kp * cv,
+            pa - kp * ca,
+            vv - kv * cv,
+            va - kv * ca,
+            aa - ka * ca,
+        ),
     )
 
 
@@ -592,7 +630,13 @@ class ContactAidedEstimator(BaseStateEstimator):
         mount = record(**vars(self._mount))
         self._known = record(**self._legs, config=config, mount=mount, gravity=self._gravity)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         _estimate_base_state(
             posterior,
             last,

@@ -1,4 +1,4 @@
-"""Friction estimators as diagrams: what a scenario's `estimator` can be, wired from its LeafSystems."""
+"""Friction estimators as diagrams: what a scenario's `estimator` can be."""
 
 from dataclasses import dataclass, field
 
@@ -56,9 +56,11 @@ BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
 
 @dataclass(frozen=True)
 class Fbse:
-    """Foot base sensor estimation: attitude, base state, joint accelerations, link torque, friction.
+    """Foot base sensor estimation.
 
-    The defaults are the best variant of every stage; `scenarios/paper_walk_fbse.yaml` also has the paper's.
+    It goes by attitude, base state, joint accelerations and link torque to the friction. The
+    defaults are the best variant of every stage; `scenarios/paper_walk_fbse.yaml` also has the
+    paper's.
     """
 
     sensor_monitor: SensorMonitorConfig = field(default_factory=SensorMonitorConfig)
@@ -74,7 +76,8 @@ class Fbse:
     friction: FrictionConfig = field(default_factory=ModelAided)
 
 
-EstimatorConfig = NoEstimator | Fbse | TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
+_Reference = TrueFriction | TorqueSensor | DisturbanceObserver | FixedFriction
+EstimatorConfig = NoEstimator | Fbse | _Reference
 
 
 class EstimatorDiagram(Diagram):
@@ -92,9 +95,9 @@ class EstimatorDiagram(Diagram):
         - friction_estimate
         - (one for each channel)
 
-    Inputs are those of the sensors that the estimator needs (`TorqueSensor` has `measured_torque` besides, `TrueFriction` `torque_loss`).
-    `friction_estimate` (n,) [Nm] is that of the tick that ends now. The other outputs are named like the log channels they become, see
-    `channels`.
+    Inputs are those of the sensors that the estimator needs (`TorqueSensor` has `measured_torque`
+    besides, `TrueFriction` `torque_loss`). `friction_estimate` (n,) [Nm] is that of the tick that
+    ends now. The other outputs are named like the log channels they become, see `channels`.
     """
 
     # Log channels, which are also names of output ports, and the shape of one sample.
@@ -115,7 +118,10 @@ class EstimatorDiagram(Diagram):
             self._feed(friction, "measured_torque", "torque_command")
         elif isinstance(config, FixedFriction):
             self._add_monitor(SensorMonitorConfig(), MeasuredSupport(), robot, clock)
-            friction = self._add("friction", FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock))
+            friction = self._add(
+                "friction",
+                FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock),
+            )
             self._join(friction, measurements="sensor_monitor")
         elif isinstance(config, DisturbanceObserver):
             friction = self._add_momentum_observer(config, robot, clock, plan)
@@ -127,12 +133,26 @@ class EstimatorDiagram(Diagram):
         self._builder.BuildInto(self)
         del self._builder
 
-    def _add_fbse(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+    def _add_fbse(
+        self,
+        config: Fbse,
+        robot: Robot,
+        clock: Clock,
+        plan: TaskPlan | None,
+    ) -> RecursiveEstimator:
         self._add_base(config, robot, clock, plan)
-        measurements, attitude, model = (self._type(name) for name in ("sensor_monitor", "attitude", "model"))
+        before = ("sensor_monitor", "attitude", "model")
+        measurements, attitude, model = (self._type(name) for name in before)
         acceleration = self._add(
             "joint_acceleration",
-            JointAccelerationEstimator(config.joint_acceleration, robot, measurements, attitude, model, clock),
+            JointAccelerationEstimator(
+                config.joint_acceleration,
+                robot,
+                measurements,
+                attitude,
+                model,
+                clock,
+            ),
         )
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
         self._connect_model_at_start(acceleration)
@@ -147,15 +167,29 @@ class EstimatorDiagram(Diagram):
                 clock,
             ),
         )
-        self._join(link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration")
+        self._join(
+            link_torque,
+            measurements="sensor_monitor",
+            joint_acceleration="joint_acceleration",
+        )
         self._connect_model_at_start(link_torque)
         self._feed(link_torque, "torque_command")
-        kind = ModelAidedEstimator if isinstance(config.friction, ModelAided) else RecursiveLeastSquaresEstimator
-        friction = self._add("friction", kind(config.friction, robot, measurements, self._type("link_torque"), clock))
+        aided = isinstance(config.friction, ModelAided)
+        kind = ModelAidedEstimator if aided else RecursiveLeastSquaresEstimator
+        friction = self._add(
+            "friction",
+            kind(config.friction, robot, measurements, self._type("link_torque"), clock),
+        )
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
         return friction
 
-    def _add_momentum_observer(self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None) -> RecursiveEstimator:
+    def _add_momentum_observer(
+        self,
+        config: DisturbanceObserver,
+        robot: Robot,
+        clock: Clock,
+        plan: TaskPlan | None,
+    ) -> RecursiveEstimator:
         self._add_base(Fbse(), robot, clock, plan)
         parts = [self._type(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
         friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
@@ -173,18 +207,26 @@ class EstimatorDiagram(Diagram):
     def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
         """Sensor monitor with support, model, attitude and base state."""
         if not robot.has_floating_base or not robot.description.legs:
-            raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
+            raise InputError(
+                "estimator: needs a robot with a floating base and feet (no gantry_height)",
+            )
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._type("sensor_monitor")
         invariant = isinstance(config.base_state, InvariantFilter)
-        model = self._add("model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant))
+        model = self._add(
+            "model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant)
+        )
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
         if isinstance(config.support, PlannedSupport):
             if plan is None:
-                raise InputError("estimator.support: !PlannedSupport needs a planned walk or stand (use !MeasuredSupport)")
+                instead = "needs a planned walk or stand (use !MeasuredSupport)"
+                raise InputError(f"estimator.support: !PlannedSupport {instead}")
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
-            source = self._builder.AddNamedSystem("planned_support", held_signal(support, float(plan.time[1] - plan.time[0])))
+            source = self._builder.AddNamedSystem(
+                "planned_support",
+                held_signal(support, float(plan.time[1] - plan.time[0])),
+            )
             self._builder.Connect(
                 source.get_output_port(),
                 self._systems["sensor_monitor"].GetInputPort("planned_support"),
@@ -194,7 +236,9 @@ class EstimatorDiagram(Diagram):
         add = self._add_invariant_base if invariant else self._add_base_in_stages
         add(config, robot, clock, (float(x), float(y)))
 
-    def _add_invariant_base(self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]) -> None:
+    def _add_invariant_base(
+        self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]
+    ) -> None:
         """Attitude and base state in one."""
         types = (self._type("sensor_monitor"), self._type("model"))
         base = InvariantBaseFilter(config.base_state, config.sensors, robot, *types, clock, origin)
@@ -203,10 +247,14 @@ class EstimatorDiagram(Diagram):
         bias = base.GetOutputPort("last_angular_velocity_bias")
         self._builder.Connect(bias, self._systems["model"].GetInputPort("angular_velocity_bias"))
 
-    def _add_base_in_stages(self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]) -> None:
+    def _add_base_in_stages(
+        self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]
+    ) -> None:
         """Attitude first, then the base state."""
         measurements, model = self._type("sensor_monitor"), self._type("model")
-        attitude = self._add("attitude", AttitudeEstimator(config.attitude, robot, measurements, model, clock))
+        attitude = self._add(
+            "attitude", AttitudeEstimator(config.attitude, robot, measurements, model, clock)
+        )
         self._join(attitude, measurements="sensor_monitor", model="model")
         shared = (robot, measurements, self._type("attitude"), model, clock, origin)
         base_state: BaseStateEstimator
@@ -217,7 +265,13 @@ class EstimatorDiagram(Diagram):
         self._add("base_state", base_state)
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
 
-    def _add_monitor(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock) -> None:
+    def _add_monitor(
+        self,
+        config: SensorMonitorConfig,
+        support: SupportConfig,
+        robot: Robot,
+        clock: Clock,
+    ) -> None:
         monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
         joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
         sizes = {
@@ -240,7 +294,10 @@ class EstimatorDiagram(Diagram):
     def _join(self, system: RecursiveEstimator, **sources: str) -> None:
         """Connects the posteriors of estimators to input ports of these names."""
         for port, source in sources.items():
-            self._builder.Connect(self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port))
+            self._builder.Connect(
+                self._systems[source].GetOutputPort("posterior"),
+                system.GetInputPort(port),
+            )
 
     def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
         self._builder.Connect(
@@ -294,11 +351,17 @@ def make_estimator(
         robot: the model that is believed.
         period: tick [s].
         plan: for the planned support, and for where the feet stand at the start.
-        every_sample: every evaluation at a later time is a tick, whatever the period; for recorded logs.
+        every_sample: every evaluation at a later time is a tick, whatever the period; for recorded
+            logs.
 
     Raises:
         InputError: an estimator that does not fit the robot.
     """
     if isinstance(config, NoEstimator):
         return None
-    return EstimatorDiagram(config, robot, Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)), plan)
+    return EstimatorDiagram(
+        config,
+        robot,
+        Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)),
+        plan,
+    )

@@ -47,7 +47,13 @@ class ImuMount:
 
 
 @njit(cache=True)
-def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector) -> Vector:
+def base_specific_force(
+    specific_force: Vector,
+    w: Vector,
+    w_dot: Vector,
+    R_BI: Rotation,
+    p_BI: Vector,
+) -> Vector:
     """Specific force of the base's origin in base axes [m/s^2].
 
     Args:
@@ -61,7 +67,9 @@ def base_specific_force(specific_force: Vector, w: Vector, w_dot: Vector, R_BI: 
 
 
 @njit(cache=True)
-def _plant_state(state: np.ndarray, measured: np.ndarray, rate_bias: np.ndarray, known: np.ndarray) -> bool:
+def _plant_state(
+    state: np.ndarray, measured: np.ndarray, rate_bias: np.ndarray, known: np.ndarray
+) -> bool:
     """Puts the measured motion into a plant's state, in place; says whether all of it is finite.
 
     Args:
@@ -137,14 +145,13 @@ def _put_terms(
             p[2] -= R_BF[1, k] * J[3 + k, x]
 
 
-@dataclass
-class _Posture:
-    """A plant in a measured posture: the value of a cache entry, which is written anew each time."""
+@dataclass(frozen=True)
+class _Workspace:
+    """Where a tick asks Drake: memory of a context's own, in which nothing lasts but the base."""
 
-    context: Context
-    # [positions, velocities] as measured, and whether all are finite; if not, the context is older.
+    plant_context: Context
+    # [positions, velocities] of the plant.
     state: np.ndarray
-    finite: bool = False
 
 
 class FloatingBaseModel(RecursiveEstimator):
@@ -162,10 +169,10 @@ class FloatingBaseModel(RecursiveEstimator):
         - at_step_start
 
     `measurements` is the posterior of a `SensorMonitor`. `angular_velocity_bias` (3,) [rad/s] of
-    the gyro, as it was known a tick ago, is there where somebody estimates it. `posterior` belongs to the present tick;
-    `at_step_start` to the tick before, where the step began whose accelerations and forces are
-    measured now. Velocities are ordered [base angular (3), base linear (3), joints (n)] whatever
-    the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but
+    the gyro, as it was known a tick ago, is there where somebody estimates it. `posterior` belongs
+    to the present tick; `at_step_start` to the tick before, where the step began whose
+    accelerations and forces are measured now. Velocities are ordered [base angular (3), base linear
+    (3), joints (n)] whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but
     those of a foot, which are in its sole frame F:
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
@@ -179,7 +186,9 @@ class FloatingBaseModel(RecursiveEstimator):
         velocity        (v,)       [angular velocity, 0, joint velocities]
     """
 
-    def __init__(self, robot: Robot, measurements: np.dtype, clock: Clock, *, knows_bias: bool = False):
+    def __init__(
+        self, robot: Robot, measurements: np.dtype, clock: Clock, *, knows_bias: bool = False
+    ):
         """Declares ports and state.
 
         Args:
@@ -218,25 +227,19 @@ class FloatingBaseModel(RecursiveEstimator):
         if knows_bias:
             self._bias = self.DeclareVectorInputPort("angular_velocity_bias", 3)
             inputs.append("angular_velocity_bias")
-        self._posture = self.DeclareCacheEntry(
-            "plant in the measured posture",
-            ValueProducer(allocate=self._allocate_posture, calc=self._calc_posture),
-            {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs},
+        # Never computed anew: an entry of the cache is what a context can keep for itself.
+        self._workspace = self.DeclareCacheEntry(
+            "workspace",
+            ValueProducer(self._allocate_workspace, ValueProducer.NoopCalc),
+            {self.nothing_ticket()},
         )
         self._declare_posterior(*inputs)
         self.DeclareStateOutputPort("at_step_start", self._last)
 
-    def _allocate_posture(self) -> AbstractValue:
+    def _allocate_workspace(self) -> AbstractValue:
         upright = self._robot.base_pose_positions(RigidTransform())
         state = np.concatenate([upright, np.zeros(self._plant.num_velocities())])
-        return AbstractValue.Make(_Posture(self._plant.CreateDefaultContext(), state))
-
-    def _calc_posture(self, context: Context, value: AbstractValue) -> None:
-        posture, measured = value.get_mutable_value(), self._measurements.Eval(context)
-        bias = _ORIGIN if self._bias is None else self._bias.Eval(context)
-        posture.finite = _plant_state(posture.state, measured, bias, self._known)
-        if posture.finite:  # Drake would refuse it.
-            self._plant.SetPositionsAndVelocities(posture.context, posture.state)
+        return AbstractValue.Make(_Workspace(self._plant.CreateDefaultContext(), state))
 
     def _tick(
         self,
@@ -245,20 +248,29 @@ class FloatingBaseModel(RecursiveEstimator):
         elapsed: float,  # noqa: ARG002
         posterior: np.ndarray,
     ) -> None:
-        posture = self._posture.Eval(context)
-        if not posture.finite:
-            posterior["velocity"] = math.nan  # So it is not taken.
+        workspace, measured = self._workspace.Eval(context), self._measurements.Eval(context)
+        now, state = workspace.plant_context, workspace.state
+        bias_rate = _ORIGIN if self._bias is None else self._bias.Eval(context)
+        if not _plant_state(state, measured, bias_rate, self._known):
+            posterior["velocity"] = math.nan  # Drake would refuse it; so it is not taken.
             return
-        plant, now, origin = self._plant, posture.context, _ORIGIN
-        world, wrt = self._world, JacobianWrtVariable.kV
+        plant, world, wrt, origin = self._plant, self._world, JacobianWrtVariable.kV, _ORIGIN
+        plant.SetPositionsAndVelocities(now, state)
         feet = tuple(
             [
                 (
                     plant.CalcJacobianSpatialVelocity(now, wrt, sole, origin, world, sole),
-                    plant.CalcBiasSpatialAcceleration(now, wrt, sole, origin, world, sole).get_coeffs(),
+                    plant.CalcBiasSpatialAcceleration(
+                        now,
+                        wrt,
+                        sole,
+                        origin,
+                        world,
+                        sole,
+                    ).get_coeffs(),
                 )
                 for sole in self._soles
             ]
         )
         M, bias = plant.CalcMassMatrix(now), plant.CalcBiasTerm(now)
-        _put_terms(posterior, posture.state, M, bias, feet, self._known)
+        _put_terms(posterior, state, M, bias, feet, self._known)

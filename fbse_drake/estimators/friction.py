@@ -148,11 +148,7 @@ class FrictionRegressor:
         if not self.factors or not len(self.nonlinear):
             return basis
         others = [self.effect.basis(motion, self.nonlinear * f)[0] for f in self.factors]
-        return basis + tuple(
-            other[k] - basis[k]
-            for other in others
-            for k in self._shaped
-        )
+        return basis + tuple(other[k] - basis[k] for other in others for k in self._shaped)
 
     @cached_property
     def _shaped(self) -> list[int]:
@@ -167,7 +163,11 @@ class FrictionRegressor:
 
 
 def recursive_least_squares(
-    parameters: np.ndarray, P: np.ndarray, phi: np.ndarray, measured: np.ndarray, forgetting: float
+    parameters: np.ndarray,
+    P: np.ndarray,
+    phi: np.ndarray,
+    measured: np.ndarray,
+    forgetting: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One tick of (64)-(67) for n joints at once.
 
@@ -278,7 +278,13 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         super().__init__(regressor, robot, measurements, link_torque, clock, 0, **further)
         self._config = config
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         config = self._config
         posterior[...] = last
@@ -310,7 +316,13 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if valid.any():
             forgets = config.forgetting != 1
             forgetting = config.forgetting ** (elapsed / 1e-3) if forgets else 1.0
-            new, P_new, innovation, S = recursive_least_squares(parameters, P, phi, residual, forgetting)
+            new, P_new, innovation, S = recursive_least_squares(
+                parameters,
+                P,
+                phi,
+                residual,
+                forgetting,
+            )
             parameters[valid], P[valid] = new[valid], P_new[valid]
             posterior["innovation"], posterior["innovation_variance"] = innovation * valid, S
         posterior["parameter_variance"] = np.diagonal(P, axis1=1, axis2=2)
@@ -318,7 +330,13 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 
 @njit(cache=True)
-def smooth_velocity(posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float) -> None:
+def smooth_velocity(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    measured: np.ndarray,
+    elapsed: float,
+    time: float,
+) -> None:
     """Low-pass of first order over joint velocities.
 
     Args:
@@ -405,7 +423,9 @@ def _estimate_friction(
                     P[i, k] -= gain * column[k]
             # Differences of innovations show the noise, whatever the model is wrong by ...
             change = innovation - last.innovation[joint]
-            rough = min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
+            rough = (
+                min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
+            )
             noise = max(1.0, noise * (1.0 + learning * (rough - 1.0)))
             # ... and their mean what the model is wrong by, beyond the noise.
             agreement = keep * last.agreement[joint] + (1.0 - keep) * innovation
@@ -479,7 +499,13 @@ class ModelAidedEstimator(FrictionEstimator):
         measures_swing = config.swing == "measurement"
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         if math.isnan(elapsed):
             self._start(posterior, measured)

@@ -49,7 +49,9 @@ def batch_least_squares(phi: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray
     return parameters, deviation
 
 
-def identify(effect: type[JointTorqueEffect], joints: list[str], velocity: np.ndarray, torque: np.ndarray) -> IdentifiedEffect:
+def identify(
+    effect: type[JointTorqueEffect], joints: list[str], velocity: np.ndarray, torque: np.ndarray
+) -> IdentifiedEffect:
     """Fits an effect to friction samples of each joint: the nonlinear least squares (51), (55).
 
     Parameters that enter linearly are solved for at every step of the search over the others (variable projection, Golub and Pereyra 1973),
@@ -64,16 +66,26 @@ def identify(effect: type[JointTorqueEffect], joints: list[str], velocity: np.nd
         InputError: arrays that do not go together, or fewer samples than parameters.
     """
     if velocity.ndim != 2 or velocity.shape != torque.shape or velocity.shape[1] != len(joints):
-        raise InputError(f"expected velocity and torque of shape N x {len(joints)}, found {velocity.shape} and {torque.shape}")
+        raise InputError(
+            f"expected velocity and torque of shape N x {len(joints)}, found {velocity.shape} and {torque.shape}"
+        )
     if len(velocity) <= len(effect.parameters):
-        raise InputError(f"expected more than {len(effect.parameters)} samples for {effect.__name__}, found {len(velocity)}")
+        raise InputError(
+            f"expected more than {len(effect.parameters)} samples for {effect.__name__}, found {len(velocity)}"
+        )
     linear = [name for name, parameter in effect.parameters.items() if parameter.linear]
-    nonlinear = {name: parameter for name, parameter in effect.parameters.items() if not parameter.linear}
+    nonlinear = {
+        name: parameter for name, parameter in effect.parameters.items() if not parameter.linear
+    }
     values = {name: np.empty(len(joints)) for name in effect.parameters}
     deviations = {name: np.empty(len(joints)) for name in effect.parameters}
     rms = np.empty(len(joints))
     bounds = np.array([effect.parameters[name].bounds for name in linear]).T
-    low, high = np.log([parameter.plausible for parameter in nonlinear.values()]).T if nonlinear else (np.zeros(0), np.zeros(0))
+    low, high = (
+        np.log([parameter.plausible for parameter in nonlinear.values()]).T
+        if nonlinear
+        else (np.zeros(0), np.zeros(0))
+    )
     for joint in range(len(joints)):
         motion, measured = JointMotion(velocity[:, joint]), torque[:, joint]
 
@@ -81,7 +93,9 @@ def identify(effect: type[JointTorqueEffect], joints: list[str], velocity: np.nd
             basis, _ = effect.basis(motion, np.exp(logarithms)[:, None])
             return np.stack([np.broadcast_to(b, motion.velocity.shape) for b in basis], axis=1)
 
-        def misfit(logarithms: np.ndarray, measured: np.ndarray = measured, regressors: Any = regressors) -> np.ndarray:
+        def misfit(
+            logarithms: np.ndarray, measured: np.ndarray = measured, regressors: Any = regressors
+        ) -> np.ndarray:
             phi = regressors(logarithms)
             return phi @ _bounded_least_squares(phi, measured, bounds) - measured
 
@@ -92,12 +106,17 @@ def identify(effect: type[JointTorqueEffect], joints: list[str], velocity: np.nd
             chosen = solution.x
             information = solution.jac.T @ solution.jac
             variance = 2 * solution.cost / max(1, len(measured) - len(effect.parameters))
-            uncertainty = np.sqrt(variance * np.abs(np.diag(np.linalg.pinv(information, hermitian=True)))) * np.exp(chosen)
+            uncertainty = np.sqrt(
+                variance * np.abs(np.diag(np.linalg.pinv(information, hermitian=True)))
+            ) * np.exp(chosen)
         phi = regressors(chosen)
         _, deviation = batch_least_squares(phi, measured)
         parameters = _bounded_least_squares(phi, measured, bounds)
         rms[joint] = np.sqrt(np.mean((phi @ parameters - measured) ** 2))
-        for names, numbers, errors in ((linear, parameters, deviation), (list(nonlinear), np.exp(chosen), uncertainty)):
+        for names, numbers, errors in (
+            (linear, parameters, deviation),
+            (list(nonlinear), np.exp(chosen), uncertainty),
+        ):
             for name, number, error in zip(names, numbers, errors, strict=True):
                 values[name][joint], deviations[name][joint] = number, error
     return IdentifiedEffect(effect, joints, values, deviations, rms)

@@ -59,7 +59,10 @@ def minimum_norm(J: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def solve_positive_definite(S: np.ndarray, B: np.ndarray) -> None:
-    """Replaces B (c, m) by S^-1 B, by Cholesky; S (c, c) is symmetric positive definite and is overwritten."""
+    """Replaces B (c, m) by S^-1 B, by Cholesky.
+
+    S (c, c) is symmetric positive definite and is overwritten.
+    """
     c, m = B.shape
     for i in range(c):
         for j in range(i + 1):
@@ -96,7 +99,8 @@ def fuse(
         J: shape (c, v); y: shape (c,), with independent errors of `constraint_variance` (c,).
 
     Returns:
-        The accelerations x (v,), dx/dmeasured (v, v), the innovation y - J measured (c,) and its variance (c,).
+        The accelerations x (v,), dx/dmeasured (v, v), the innovation y - J measured (c,) and its
+        variance (c,).
     """
     c, v = J.shape
     gain, S, innovation, x = np.empty((c, v)), np.zeros((c, c)), y.copy(), measured.copy()
@@ -156,7 +160,12 @@ def measured_acceleration(
 
 
 @njit(cache=True)
-def no_slip_condition(model: np.ndarray, attitude: np.ndarray, stands: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def no_slip_condition(
+    model: np.ndarray,
+    attitude: np.ndarray,
+    stands: np.ndarray,
+    gravity: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
 
     The base's acceleration in `a` is its specific force, so a foot at rest accelerates with minus
@@ -397,7 +406,13 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._model = self._declare_record_input("model_at_step_start", model)
         self._declare_posterior("measurements", "attitude", "model_at_step_start")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         model = self._model.Eval(context)
         if last["status"]:
@@ -419,7 +434,9 @@ class JointAccelerationEstimator(RecursiveEstimator):
 
         They have the joints of the feet that stand from the other sensors.
         """
-        found, stands, J, y, acceleration = _no_slip_problem(posterior, last, elapsed, measured, attitude, model, known)
+        found, stands, J, y, acceleration = _no_slip_problem(
+            posterior, last, elapsed, measured, attitude, model, known
+        )
         if not found:
             return
         sensitivity = np.eye(len(acceleration))

@@ -35,9 +35,12 @@ def as_record(vector: np.ndarray, kind: np.dtype) -> np.ndarray:
 
 def parts(kind: np.dtype) -> dict[str, slice]:
     """Where the fields of a record are in its vector; fields without numbers are left out."""
-    number = np.dtype(float).itemsize
-    ends = {name: (offset, field.itemsize) for name, (field, offset) in kind.fields.items()}
-    return {name: slice(start // number, (start + size) // number) for name, (start, size) in ends.items() if size > 0}
+    found, number = {}, np.dtype(float).itemsize
+    for name, (field, offset) in kind.fields.items():
+        if field.itemsize > 0:
+            start = offset // number
+            found[name] = slice(start, start + size_of(field))
+    return found
 
 
 def record(**values: Any) -> np.ndarray:

@@ -44,7 +44,7 @@ class RecordInput:
 
     def Eval(self, context: Context) -> np.ndarray:
         """The posterior as a record."""
-        return as_record(self.port.Eval(context), self.kind)
+        return np.ndarray((), self.kind, self.port.Eval(context))
 
 
 class RecursiveEstimator(LeafSystem):
@@ -88,13 +88,24 @@ class RecursiveEstimator(LeafSystem):
         tickets = {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs}
         tickets |= {self.time_ticket(), self.xd_ticket()}
         size = size_of(self.posterior_type)
-        self._posterior = self.DeclareVectorOutputPort("posterior", size, self._calc_posterior, tickets)
+        self._posterior = self.DeclareVectorOutputPort(
+            "posterior",
+            size,
+            self._calc_posterior,
+            tickets,
+        )
         for name, part in parts(self.posterior_type).items():
             calc = partial(self._calc_field, part)
             self.DeclareVectorOutputPort(name, part.stop - part.start, calc, tickets)
 
     @abstractmethod
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         """Makes the posterior of this tick.
 
         Args:

@@ -1,4 +1,4 @@
-"""Other ways to have the friction, to be compared with FBSE, whose place in the diagram they take."""
+"""Other ways to have the friction, in the place of FBSE, to be compared with it."""
 
 import math
 from dataclasses import dataclass, field
@@ -115,7 +115,13 @@ class TorqueSensorEstimator(RecursiveEstimator):
         self._last_command = self.DeclareDiscreteState(joints)
         self._declare_posterior("measured_torque")
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         if math.isnan(elapsed):
             posterior[...] = last
             return
@@ -219,7 +225,13 @@ class MomentumObserver(RecursiveEstimator):
         self._last_command = self.DeclareDiscreteState(n)
         self._declare_posterior(*inputs)
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         records = (port.Eval(context) for port in self._inputs)
         measured, attitude, base_state, model, start = records
         R_WB = attitude["rotation"]

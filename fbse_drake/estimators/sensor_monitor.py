@@ -44,7 +44,8 @@ class SensorMonitorConfig:
     def __post_init__(self) -> None:
         require_positive(self, "stuck_after", "lost_after")
         if not 0 <= self.smallest_load_share < 1:
-            raise InputError(f"smallest_load_share: expected a number in [0, 1), found {self.smallest_load_share:g}")
+            found = f"{self.smallest_load_share:g}"
+            raise InputError(f"smallest_load_share: expected a number in [0, 1), found {found}")
 
 
 def _readings(robot: Robot) -> dict[str, tuple[int, ...]]:
@@ -91,7 +92,13 @@ def _watch_channels(
 
 
 @njit(cache=True)
-def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray) -> None:
+def _watch_sensors(
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    sensors: np.ndarray,
+    known: np.ndarray,
+) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
@@ -207,7 +214,13 @@ class SensorMonitor(RecursiveEstimator):
         waiting     (feet,)      see `detect_support`
     """
 
-    def __init__(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock):
+    def __init__(
+        self,
+        config: SensorMonitorConfig,
+        support: SupportConfig,
+        robot: Robot,
+        clock: Clock,
+    ):
         readings = _readings(robot)
         sensors = record_type(**readings)
         legs = robot.description.legs
@@ -237,10 +250,20 @@ class SensorMonitor(RecursiveEstimator):
             limits=config,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
-            thresholds=record(on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce),
+            thresholds=record(
+                on=measured.on * weight,
+                off=measured.off * weight,
+                debounce=measured.debounce,
+            ),
         )
 
-    def _tick(self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray) -> None:
+    def _tick(
+        self,
+        context: Context,
+        last: np.ndarray,
+        elapsed: float,
+        posterior: np.ndarray,
+    ) -> None:
         _watch_sensors(posterior, last, elapsed, self._sensors.Eval(context), self._known)
         if self._planned is not None:
             posterior["support"] = self._planned.Eval(context) > 0

@@ -1,8 +1,10 @@
-"""Three-dimensional vectors, rotations and quaternions as tuples of floats: in compiled code they stay in registers.
+"""Three-dimensional vectors, rotations and quaternions as tuples of floats.
 
-The estimators' numerics are compiled by numba and cached next to the source. A cached function is compiled again when its own file changes,
-not when a function that it calls from another file does: after a change here delete `fbse_drake/estimators/__pycache__` (`make` keeps a
-cache of its own for every state of the sources).
+In compiled code they stay in registers. The estimators' numerics are compiled by numba and cached
+next to the source. A cached function is compiled again when its own file changes, not when a
+function that it calls from another file does: after a change here delete
+`fbse_drake/estimators/__pycache__` (`make` keeps a cache of its own for every state of the
+sources).
 """
 
 import math

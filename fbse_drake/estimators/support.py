@@ -26,7 +26,9 @@ class MeasuredSupport:
 
     def __post_init__(self) -> None:
         if not 0 < self.off <= self.on < 0.5:
-            raise InputError(f"on, off: expected 0 < off <= on < 0.5, found on {self.on:g}, off {self.off:g}")
+            raise InputError(
+                f"on, off: expected 0 < off <= on < 0.5, found on {self.on:g}, off {self.off:g}",
+            )
         require_not_negative(self, "debounce")
 
 
