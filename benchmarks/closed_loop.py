@@ -24,6 +24,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from fbse_drake import Log, Scenario, build_station, load_scenario, simulate
 from fbse_drake.robot.plant import make_robot
+from fbse_drake.sampling import state_views
 from fbse_drake.sensors.errors import held_signal
 from fbse_drake.simulate import add_record, recorded_ports
 
@@ -80,9 +81,12 @@ def closed_loop(scenario: Scenario, *, recorded: bool) -> Timer:
     station = builder.AddSystem(build_station(scenario))
     if recorded:
         add_record(builder, station, recorded_ports(station), scenario.plant.time_step)
-    simulator = Simulator(builder.Build())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
     simulator.Initialize()
-    return lambda begin: advance(simulator, begin)
+    # The views are kept as long as the timer, as `simulate` keeps them.
+    views = state_views(diagram, simulator.get_context())
+    return lambda begin, _views=views: advance(simulator, begin)
 
 
 def advance(simulator: Simulator, begin: float) -> float:

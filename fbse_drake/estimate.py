@@ -13,6 +13,7 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
 from fbse_drake.signals import port_values, signals_of
+from fbse_drake.wiring import release
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,9 @@ def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] 
     Raises:
         InputError: no estimator in the scenario, a log that lacks a channel, other joints or feet than the model's.
     """
-    values, tick_time = Replay(scenario, log).run(progress)
+    replay = Replay(scenario, log)
+    values, tick_time = replay.run(progress)
+    release(replay.estimator)
     kept = {name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")}
     return EstimationResult(replace(log, channels=kept | values), tick_time)
 

@@ -12,7 +12,11 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    ApplyMultibodyPlantConfig,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake import resources, schema
@@ -255,7 +259,7 @@ class Scenario:
             if getattr(self.plant, key) <= 0:
                 raise InputError(f"plant.{key}: expected a number > 0, found {getattr(self.plant, key):g}")
         try:
-            AddMultibodyPlant(self.plant, DiagramBuilder())
+            ApplyMultibodyPlantConfig(self.plant, MultibodyPlant(self.plant.time_step))
         except RuntimeError as error:
             raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:

@@ -24,6 +24,7 @@ from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
 from fbse_drake.station import Station, build_station
 from fbse_drake.walking.reference import Reference
+from fbse_drake.wiring import release
 
 # The run is looked at (fall, progress, interruption) this often in simulated time [s].
 _LOOK_PERIOD = 0.01
@@ -128,7 +129,9 @@ def _simulate(
         meshcat.PublishRecording()
     if failure is not None:
         failure = f"t = {end:.3f} s: {failure}"
-    return SimulationResult(_make_log(scenario, name, station, sink.FindLog(context), failure, fell), failure, wall_time)
+    log = _make_log(scenario, name, station, sink.FindLog(context), failure, fell)
+    release(diagram)
+    return SimulationResult(log, failure, wall_time)
 
 
 def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_height: float) -> str | None:

@@ -281,15 +281,15 @@ def add_controller(
 ) -> PositionLoop:
     """Adds the position loop, which commands the robot; its `friction_estimate` stays open."""
     config, names = scenario.control, robot.robot.description
-    system = PositionLoop(config, names, scenario.plant.time_step)
-    controller = builder.AddNamedSystem("controller", system)
-    builder.Connect(ports["measured_joint_state"], controller.GetInputPort("estimated_state"))
     wanted = ["desired_state", "enabled"]
     if config.feedforward:
         wanted.append("feedforward_torque")
-    for name in wanted:
-        if name in ports:
-            builder.Connect(ports[name], controller.GetInputPort(name))
+    given = {name: ports[name] for name in wanted if name in ports}
+    system = PositionLoop(config, names, scenario.plant.time_step, given)
+    controller = builder.AddNamedSystem("controller", system)
+    builder.Connect(ports["measured_joint_state"], controller.GetInputPort("estimated_state"))
+    for name, port in given.items():
+        builder.Connect(port, controller.GetInputPort(name))
     builder.Connect(controller.get_output_port(), robot.torque_command)
     return controller
 

@@ -1,8 +1,8 @@
-"""Systems of a diagram are wired by name: a port goes where an input of its name is."""
+"""Systems of a diagram are wired by name, a port goes where an input of its name is; and let go."""
 
 from collections.abc import Mapping
 
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
 from fbse_drake.errors import InputError
 
@@ -30,3 +30,15 @@ def outputs_by_name(system: System) -> dict[str, OutputPort]:
     """The output ports of a system."""
     ports = [system.get_output_port(i) for i in range(system.num_output_ports())]
     return {port.get_name(): port for port in ports}
+
+
+def release(system: System) -> None:
+    """Lets go of a system that is done with, and of all in it; none of them can be used any more.
+
+    What Python knows of a system refers to its diagram and back, and Python's collector does not
+    see through such cycles where a system is written in Python: without this, none is ever freed.
+    """
+    if isinstance(system, Diagram):
+        for inner in system.GetSystems():
+            release(inner)
+    vars(system).clear()

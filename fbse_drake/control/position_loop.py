@@ -1,6 +1,6 @@
 """Joint position control (paper eq. 68)."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,17 +78,28 @@ class PositionLoop(LeafSystem):
         output_ports:
         - torque_command
 
-    States are [positions, velocities], shape (2n,) [rad, rad/s]; torques have shape (n,) [Nm]. The command is the position loop's
-    torque plus feed-forward plus friction estimate, within the limits; `feedforward_torque` and `friction_estimate` may be left
-    unconnected and count as zero. `enabled` (n,) is 0 for a drive that is switched off, which commands no torque; unconnected, all are
-    on. At a tick the command is that of the tick's own inputs. Discrete state: the command being held.
+    States are [positions, velocities], shape (2n,) [rad, rad/s]; torques have shape (n,) [Nm]. The
+    command is the position loop's torque plus feed-forward plus friction estimate, within the
+    limits; `friction_estimate` may be left unconnected and counts as zero. `enabled` (n,) is 0 for a
+    drive that is switched off, which commands no torque. A loop may have no `feedforward_torque`,
+    and no `enabled`: then all drives are on. At a tick the command is that of the tick's own
+    inputs. Discrete state: the command being held.
     """
 
-    def __init__(self, config: PositionLoopConfig, names: RobotDescription, time_step: float):
+    def __init__(
+        self,
+        config: PositionLoopConfig,
+        names: RobotDescription,
+        time_step: float,
+        inputs: Collection[str] = ("feedforward_torque", "enabled"),
+    ):
         """Declares ports, state and, where the command must be held, the update.
 
         Args:
-            time_step: the plant's step [s]; if it is the control period, the command never has to be held.
+            time_step: the plant's step [s]; if it is the control period, the command never has to
+                be held.
+            inputs: which of those that it need not have it has. (To ask a port whether it is
+                connected costs a tick half as much as to read it.)
 
         Raises:
             InputError: an unknown joint, or one without a gain.
@@ -101,12 +112,14 @@ class PositionLoop(LeafSystem):
         self._limit = names.per_joint(config.torque_limit, key="control.torque_limit")
         self._estimated_state = self.DeclareVectorInputPort("estimated_state", 2 * n)
         self._desired_state = self.DeclareVectorInputPort("desired_state", 2 * n)
-        # Inputs that may be left unconnected, and what they then count as.
-        self._optional = [
-            (self.DeclareVectorInputPort("feedforward_torque", n), np.zeros(n)),
-            (self.DeclareVectorInputPort("friction_estimate", n), np.zeros(n)),
-            (self.DeclareVectorInputPort("enabled", n), np.ones(n)),
-        ]
+        self._friction_estimate = self.DeclareVectorInputPort("friction_estimate", n)
+        # What inputs count as that are not there.
+        self._zero, self._one = np.zeros(n), np.ones(n)
+        self._feedforward_torque = self._enabled = None
+        if "feedforward_torque" in inputs:
+            self._feedforward_torque = self.DeclareVectorInputPort("feedforward_torque", n)
+        if "enabled" in inputs:
+            self._enabled = self.DeclareVectorInputPort("enabled", n)
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
@@ -118,9 +131,16 @@ class PositionLoop(LeafSystem):
         if self._holds and not is_tick(context.get_time(), self._period):
             output.SetFromVector(context.get_discrete_state(self._held).value())
             return
-        desired, estimated = self._desired_state.Eval(context), self._estimated_state.Eval(context)
-        optional = [port.Eval(context) if port.HasValue(context) else unconnected for port, unconnected in self._optional]
-        _command(output.get_mutable_value(), desired, estimated, *optional, self._kp, self._kd, self._limit)
+        friction, feedforward, enabled = self._zero, self._zero, self._one
+        if self._friction_estimate.HasValue(context):
+            friction = self._friction_estimate.Eval(context)
+        if self._feedforward_torque is not None:
+            feedforward = self._feedforward_torque.Eval(context)
+        if self._enabled is not None:
+            enabled = self._enabled.Eval(context)
+        states = self._desired_state.Eval(context), self._estimated_state.Eval(context)
+        command, gains = output.get_mutable_value(), (self._kp, self._kd, self._limit)
+        _command(command, *states, feedforward, friction, enabled, *gains)
 
     def _hold(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._held).set_value(self.torque_command.Eval(context))

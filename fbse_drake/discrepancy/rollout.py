@@ -19,6 +19,7 @@ from fbse_drake.signals import channels_of
 from fbse_drake.simulate import add_record, simulate
 from fbse_drake.station import build_station
 from fbse_drake.walking.reference import Recorded, RecordedReference
+from fbse_drake.wiring import release
 
 # Where velocities were not measured, that at the start of a stretch is the slope of a parabola through so many samples.
 _STARTING_SAMPLES = 10
@@ -166,7 +167,8 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     station = builder.AddSystem(build_station(exact, recorded=RecordedReference(log)))
     robot = station.robot
     sink = add_record(builder, station, ("measured_joint_state", "torque_command"), time_step)
-    simulator = Simulator(builder.Build())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     effects = scenario.robot.effects_of(SensorEffect, robot.description, key="model")
     state = _first_state(robot, effects, log, scenario.control.period)
@@ -189,6 +191,7 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     motion = np.stack([np.interp(wanted, time, column) for column in rows[:, : 2 * n].T], axis=1)
     command = rows[np.clip(np.searchsorted(time, wanted + 1e-9) - 1, 0, None), 2 * n :]
     channels = channels_of("measured_joint_state", motion, n)
+    release(diagram)
     return channels | channels_of("torque_command", command, n), failure
 
 

@@ -66,18 +66,19 @@ def _loss(
     last: np.ndarray,
     joint_state: np.ndarray,
     net_actuation: np.ndarray,
-    solver: _Solver,
+    damping: np.ndarray,
+    clamp: np.ndarray,
     velocities: int,
 ) -> np.ndarray:
     """Loss in the step that ended: what was explicit and what the solver took, (n,) [Nm]."""
-    n = len(joint_state) // 2
+    n = len(damping)
     explicit = _parts(last, n, velocities).memory[_EXPLICIT]
     loss = np.zeros(n)
     for j in range(n):
         if not math.isnan(explicit[j]):
-            loss[j] = explicit[j] + solver.damping[j] * joint_state[n + j]
-            if solver.clamp[j] >= 0:
-                loss[j] -= net_actuation[solver.clamp[j]]
+            loss[j] = explicit[j] + damping[j] * joint_state[n + j]
+            if clamp[j] >= 0:
+                loss[j] -= net_actuation[clamp[j]]
     return loss
 
 
@@ -200,7 +201,9 @@ class ExplicitTorque(LeafSystem):
     def _calc_loss(self, context: Context, output: BasicVector) -> None:
         last = context.get_discrete_state().value(0)
         ended = (self._joint_state.Eval(context), self._net_actuation.Eval(context))
-        output.SetFromVector(_loss(last, *ended, self._solver, self._velocities))
+        # As a whole the solver's part would take longer to hand over than the sum takes.
+        solver = (self._solver.damping, self._solver.clamp)
+        output.SetFromVector(_loss(last, *ended, *solver, self._velocities))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))

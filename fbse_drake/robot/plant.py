@@ -275,7 +275,8 @@ def make_robot(
         InputError: unknown file, joint, frame, body or pad; point masses that leave a body with an impossible inertia.
     """
     names, path = load_description(description)
-    plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), builder or DiagramBuilder())
+    diagram = builder or DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), diagram)
     with located(f"{path}: "):
         _add_model(plant, names, path)
         _check_names(plant, names)
@@ -297,6 +298,9 @@ def make_robot(
             gravity = plant.mutable_gravity_field()
             gravity.set_gravity_vector(Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector()))
     plant.Finalize()
+    if builder is None:
+        # A builder that never builds is never freed.
+        diagram.Build()
     robot = Robot(plant, names, implicit)
     for side in names.sides:
         for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
