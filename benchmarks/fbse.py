@@ -310,7 +310,7 @@ def print_table(console: Console, title: str, table: Table) -> None:
     for head, cell in zip(table.header, table.rows[0], strict=True):
         shown.add_column(head, justify="left" if isinstance(cell, str) else "right")
     for row in table.rows:
-        shown.add_row(*(cell if isinstance(cell, str) else number(float(cell)) for cell in row))
+        shown.add_row(*(str(cell) if isinstance(cell, (str, int)) else number(float(cell)) for cell in row))
     console.print(shown)
 
 
