@@ -118,8 +118,8 @@ class FrictionRegressor:
     # (n, parameters).
     nonlinear: np.ndarray
     initial: np.ndarray
-    # The nonlinear parameters may be wrong by these factors; each basis torque that they change is
-    # there as its difference for each factor, too, with a weight of zero to start with.
+    # The nonlinear parameters may be wrong by these factors: beside each basis torque that they
+    # change there is its difference for each factor, with a weight of zero to start with.
     factors: tuple[float, ...] = ()
 
     @staticmethod
@@ -136,30 +136,27 @@ class FrictionRegressor:
         """How many linear parameters the model has."""
         return self.initial.shape[1]
 
-    @property
-    def shapes(self) -> int:
-        """How many differences there are besides."""
-        return len(self(np.full(len(self.initial), 0.1))) - self.parameters
+    @cached_property
+    def shaped(self) -> np.ndarray:
+        """Which parameters' basis torques change with the nonlinear parameters."""
+        motion = JointMotion(np.full(len(self.initial), 0.1))
+        basis, other = (self.effect.basis(motion, f * self.nonlinear)[0] for f in (1.0, 2.0))
+        changes = [np.any(x != y) for x, y in zip(basis, other, strict=True)]
+        return np.flatnonzero(changes) if self.factors else np.empty(0, dtype=int)
 
-    def __call__(self, velocity: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Basis torques of the model's parameters, then the differences."""
-        motion = JointMotion(velocity)
-        basis = tuple(self.effect.basis(motion, self.nonlinear)[0])
-        if not self.factors or not len(self.nonlinear):
-            return basis
-        others = [self.effect.basis(motion, self.nonlinear * f)[0] for f in self.factors]
-        return basis + tuple(other[k] - basis[k] for other in others for k in self._shaped)
+    @property
+    def weights(self) -> int:
+        """How many parameters and differences there are."""
+        return self.parameters + len(self.shaped) * len(self.factors)
 
     @cached_property
-    def _shaped(self) -> list[int]:
-        """Places of the basis torques that the nonlinear parameters change."""
-        motion = JointMotion(np.full(len(self.initial), 0.1 * float(np.max(self.nonlinear))))
-        pairs = zip(
-            self.effect.basis(motion, self.nonlinear)[0],
-            self.effect.basis(motion, 2.0 * self.nonlinear)[0],
-            strict=True,
-        )
-        return [k for k, (one, other) in enumerate(pairs) if np.any(one != other)]
+    def _all_nonlinear(self) -> np.ndarray:
+        return np.hstack([f * self.nonlinear for f in (1.0, *self.factors)])
+
+    def __call__(self, velocity: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Basis torque of each parameter: of all joints as adopted, then with each factor."""
+        motion = JointMotion(np.concatenate([velocity] * (1 + len(self.factors))))
+        return tuple(self.effect.basis(motion, self._all_nonlinear)[0])
 
 
 def recursive_least_squares(
@@ -222,19 +219,18 @@ class FrictionEstimator(RecursiveEstimator):
         Args:
             regressor: of the friction.
             measurements, link_torque: types of the inputs' posteriors.
-            covariance_size: how many states each joint's covariance has besides its parameters.
+            covariance_size: how many states each joint's covariance has.
             further: shapes of further fields of the posterior.
         """
         self._regressor = regressor
         n, m = len(robot.joint_names), self._regressor.parameters
-        size = m + covariance_size
         posterior_type = record_type(
             time=(),
             status=(),
             friction=(n,),
             parameters=(n, m),
             parameter_variance=(n, m),
-            covariance=(n, size, size),
+            covariance=(n, covariance_size, covariance_size),
             innovation=(n,),
             innovation_variance=(n,),
             **further,
@@ -275,7 +271,8 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
     ):
         further = {"filtered": (2, len(robot.joint_names)), "age": ()}
         regressor = FrictionRegressor.of(config.model, robot)
-        super().__init__(regressor, robot, measurements, link_torque, clock, 0, **further)
+        size = regressor.parameters
+        super().__init__(regressor, robot, measurements, link_torque, clock, size, **further)
         self._config = config
 
     def _tick(
@@ -360,6 +357,7 @@ def _estimate_friction(
     measured: np.ndarray,
     link_torque: np.ndarray,
     phi: tuple[np.ndarray, ...],
+    shaped: np.ndarray,
     known: np.ndarray,
 ) -> None:
     """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint.
@@ -367,13 +365,14 @@ def _estimate_friction(
     Fills the posterior but for its `velocity`.
 
     Args:
-        phi: the model's regressors and its differences, m of shape (n,).
+        phi, shaped: see `FrictionRegressor`.
         known: record with the numbers of `ModelAided` as `config`; `joint_leg` (n,), which leg each
             joint belongs to; `measures_swing`, whether the measurement counts while the leg swings.
     """
     posterior, last, known = posterior[()], last[()], known[()]
     measured, link, config = measured[()], link_torque[()], known.config
-    support, m, n = measured.support, len(phi), len(known.joint_leg)
+    support, n, parameters = measured.support, len(known.joint_leg), len(phi)
+    m = posterior.weights.shape[1]
     size = m + 2
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
@@ -384,8 +383,15 @@ def _estimate_friction(
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
         # Weights of the model and disturbance, whose regressor is one.
-        for k in range(m):
-            regressor[k], x[k] = phi[k][joint], last.weights[joint, k]
+        for k in range(parameters):
+            regressor[k] = phi[k][joint]
+        k, other = parameters, n + joint
+        while k < m:
+            for at in shaped:
+                regressor[k] = phi[at][other] - phi[at][joint]
+                k += 1
+            other += n
+        x[:m] = last.weights[joint]
         x[m] = last.disturbance[joint]
         P, noise = posterior.covariance[joint], last.noise[joint]
         impulse_uncertainty = P[0, 0]
@@ -445,7 +451,7 @@ def _estimate_friction(
                 variance += regressor[i] * regressor[k] * P[1 + i, 1 + k]
         for k in range(m):
             posterior.weights[joint, k] = x[k]
-        for k in range(posterior.parameters.shape[1]):
+        for k in range(parameters):
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
@@ -491,9 +497,9 @@ class ModelAidedEstimator(FrictionEstimator):
         further = ("disturbance", "impulse", "velocity", "last_velocity", "friction_std")
         further += ("noise", "agreement")
         shapes = dict.fromkeys(further, (n,))
-        shapes["weights"] = (n, regressor.parameters + regressor.shapes)
+        shapes["weights"] = (n, regressor.weights)
         super().__init__(
-            regressor, robot, measurements, link_torque, clock, regressor.shapes + 2, **shapes
+            regressor, robot, measurements, link_torque, clock, regressor.weights + 2, **shapes
         )
         self._config, self._smoothing = config, float(config.velocity_smoothing)
         measures_swing = config.swing == "measurement"
@@ -512,12 +518,15 @@ class ModelAidedEstimator(FrictionEstimator):
             return
         smooth_velocity(posterior, last, measured, elapsed, self._smoothing)
         phi = self._regressor(posterior["velocity"])
-        _estimate_friction(posterior, last, elapsed, measured, link_torque, phi, self._known)
+        shaped = self._regressor.shaped
+        _estimate_friction(
+            posterior, last, elapsed, measured, link_torque, phi, shaped, self._known
+        )
 
     def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
         config, m = self._config, self._regressor.parameters
         uncertainty = [config.parameter_uncertainty**2] * m
-        uncertainty += [config.shape_uncertainty**2] * self._regressor.shapes
+        uncertainty += [config.shape_uncertainty**2] * (self._regressor.weights - m)
         posterior[...] = np.zeros((), self.posterior_type)
         posterior["status"] = measured["trust"].max()
         posterior["parameters"] = posterior["weights"][:, :m] = self._regressor.initial
