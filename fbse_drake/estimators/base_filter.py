@@ -43,7 +43,6 @@ from fbse_drake.estimators.spatial import (
     skew,
     subtract,
     vector,
-    yaw_of,
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
@@ -185,7 +184,13 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 @njit(cache=True)
 def _predict(
-    x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known
+    x: np.ndarray,
+    P: np.ndarray,
+    w: Vector,
+    f: Vector,
+    rate_variance: float,
+    T: float,
+    known: np.ndarray,
 ) -> None:
     """The step that ends now, in place.
 
@@ -480,9 +485,8 @@ def _listen_to_forces(
 
 @njit(cache=True)
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
-    """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
-    to be."""
-    config, sensors, P = known.config, known.sensors, x.error_covariance
+    """The first posterior: upright by the accelerometer, looking ahead, soles where they should be."""
+    sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
