@@ -13,6 +13,7 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -46,11 +47,8 @@ _UNKNOWN_RATE = 0.3
 
 @dataclass(frozen=True)
 class AttitudeConfig:
-    """Noise as the filters believe it, and what they estimate besides the attitude."""
+    """What the filters believe of the motion, and what they estimate besides the attitude."""
 
-    # Standard deviation of white noise per axis and sample [m/s^2], [rad/s].
-    acceleration_noise: float = 0.02
-    angular_velocity_noise: float = 1.0e-3
     # The trunk's linear acceleration: its size [m/s^2] and how long it keeps its direction [s].
     motion_acceleration: float = 0.5
     motion_time: float = 0.3
@@ -72,12 +70,11 @@ class AttitudeConfig:
             self,
             "acceleration_bias",
             "angular_velocity_bias",
-            "angular_velocity_noise",
             "standing_time",
             "standing_acceleration",
             "level_feet",
         )
-        require_positive(self, "acceleration_noise", "motion_acceleration", "motion_time", "stance_time")
+        require_positive(self, "motion_acceleration", "motion_time", "stance_time")
 
 
 class GravityEstimate(NamedTuple):
@@ -299,8 +296,8 @@ def _estimate_attitude(
     """One tick of `AttitudeEstimator`; fills the posterior.
 
     Args:
-        known: record with the values of `AttitudeConfig`, the rotation of the IMU, and the
-            quaternion of the base in its axes.
+        known: record with the numbers of `AttitudeConfig` and `SensorBeliefs`, the rotation of the
+            IMU, and the quaternion of the base in its axes.
     """
     if math.isnan(elapsed) and measured[()].trust[1] > 0:
         posterior[()] = last[()]
@@ -309,8 +306,8 @@ def _estimate_attitude(
     posterior, last, known = posterior[()], last[()], known[()]
     measured, model = measured[()], model[()]
     config, R_BI, q_IB = known.config, rotation(known.R_BI), quaternion(known.q_IB)
-    motion_time, rate_noise = config.motion_time, config.angular_velocity_noise
-    acceleration_noise = config.acceleration_noise
+    motion_time, rate_noise = config.motion_time, known.sensors.angular_velocity_noise
+    acceleration_noise = known.sensors.acceleration_noise
     first, trust = math.isnan(elapsed), measured.trust[1]
     f, w = vector(measured.specific_force), vector(measured.angular_velocity)
     age = 0.0 if first else last.age + elapsed
@@ -427,6 +424,7 @@ class AttitudeEstimator(RecursiveEstimator):
     def __init__(
         self,
         config: AttitudeConfig,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         model: np.dtype,
@@ -460,7 +458,7 @@ class AttitudeEstimator(RecursiveEstimator):
         super().__init__(posterior_type, clock)
         R_BI = ImuMount(robot).R_BI
         q_IB = RotationMatrix(R_BI.T).ToQuaternion().wxyz()
-        self._known = record(config=config, R_BI=R_BI, q_IB=q_IB)
+        self._known = record(config=config, sensors=sensors, R_BI=R_BI, q_IB=q_IB)
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")

@@ -4,35 +4,18 @@
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context, State
 
-from fbse_drake.errors import require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
 _NOT_FINITE = float(Status.NOT_FINITE)
-
-
-@dataclass(frozen=True)
-class LinkTorqueConfig:
-    """Noise of the sensors as it is believed, for the variance of the measured friction."""
-
-    # Standard deviation of white noise per axis and sample: accelerometer [m/s^2], gyro [rad/s],
-    # joint velocity [rad/s], pad force [N].
-    acceleration_noise: float = 0.02
-    angular_velocity_noise: float = 1.0e-3
-    joint_velocity_noise: float = 5.0e-4
-    force_noise: float = 0.5
-
-    def __post_init__(self) -> None:
-        require_positive(self, "acceleration_noise", "angular_velocity_noise")
-        require_positive(self, "joint_velocity_noise", "force_noise")
 
 
 @njit(cache=True)
@@ -60,7 +43,7 @@ def _estimate_link_torque(
 
     Args:
         torque_command: where the tick began, shape (n,) [Nm].
-        known: record with the values of `LinkTorqueConfig` as `noise`; `pads`, see `FootPads`;
+        known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2];
             `smallest_load` (feet,) that counts [N]; and `joint_leg` (n,), which leg each joint
             belongs to.
@@ -114,6 +97,13 @@ def _estimate_link_torque(
         posterior.valid[i] = acceleration.known[i] if trusted else 0.0
 
 
+def _wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
+    """Of the noise in a foot's measured wrench [moment, force], (6,) [(Nm)^2, N^2]."""
+    if robot.description.legs[side].corners:
+        return np.repeat([sensors.moment_noise**2, sensors.force_noise**2], 3)
+    return sensors.force_noise**2 * (grasp_map(robot.pad_positions(side)) ** 2).sum(axis=1)
+
+
 class LinkTorqueEstimator(RecursiveEstimator):
     """Link torque by the reduced model, and the friction measured with it.
 
@@ -150,7 +140,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
 
     def __init__(
         self,
-        config: LinkTorqueConfig,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         model: np.dtype,
@@ -173,13 +163,13 @@ class LinkTorqueEstimator(RecursiveEstimator):
             valid=(n,),
         )
         super().__init__(posterior_type, clock)
-        grasp, pads = [grasp_map(robot.pad_positions(side)) for side in legs], FootPads(robot)
-        force_noise = config.force_noise
+        pads = FootPads(robot)
+        variance = np.array([_wrench_variance(sensors, robot, side) for side in legs])
         self._known = record(
-            noise=config,
+            noise=sensors,
             pads=record(position=pads.position, foot=pads.foot),
-            wrench_variance=np.array([force_noise**2 * (G**2).sum(axis=1) for G in grasp]),
-            smallest_load=np.array([force_noise * math.sqrt(len(leg.pads)) for leg in legs.values()]),
+            wrench_variance=variance,
+            smallest_load=np.sqrt(variance[:, 5]),
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)

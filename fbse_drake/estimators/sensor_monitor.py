@@ -33,7 +33,7 @@ class SensorMonitorConfig:
     """When a sensor is not trusted."""
 
     # A channel that repeats itself to the last bit for this long is stuck [s]. Joint angles, which
-    # are counted, may.
+    # are counted, may, and velocities that are differences of such.
     stuck_after: float = 0.05
     # Feet lose their trust when together they show less than this share of the weight ...
     smallest_load_share: float = 0.8
@@ -97,13 +97,14 @@ def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sens
     Args:
         sensors: their readings, see `SensorMonitor`.
         known: record with the values of `SensorMonitorConfig`; the mass that the feet carry [kg], 0
-            where they need not; which foot each pad belongs to; the thresholds of `detect_support`.
+            where they need not; which foot each pad belongs to; the thresholds of `detect_support`;
+            whether joint velocities are `counted`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
     feet, after = len(posterior.support), known.limits.stuck_after
     trust[:] = _OK
-    # Joint angles may repeat themselves.
+    # Joint angles may repeat themselves, and so may their differences.
     trust[0] = _watch_channels(
         trust[0],
         posterior.joint_position,
@@ -122,7 +123,7 @@ def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sens
         last.joint_velocity,
         was_idle.joint_velocity,
         elapsed,
-        after,
+        math.inf if known.counted else after,
     )
     trust[1] = _watch_channels(
         trust[1],
@@ -207,7 +208,20 @@ class SensorMonitor(RecursiveEstimator):
         waiting     (feet,)      see `detect_support`
     """
 
-    def __init__(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock):
+    def __init__(
+        self,
+        config: SensorMonitorConfig,
+        support: SupportConfig,
+        robot: Robot,
+        clock: Clock,
+        *,
+        counted: bool = False,
+    ):
+        """Declares ports and state.
+
+        Args:
+            counted: joint velocities are differences of counted angles.
+        """
         readings = _readings(robot)
         sensors = record_type(**readings)
         legs = robot.description.legs
@@ -235,6 +249,7 @@ class SensorMonitor(RecursiveEstimator):
         weight = 9.81 * mass
         self._known = record(
             limits=config,
+            counted=counted,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
             thresholds=record(on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce),
