@@ -243,6 +243,8 @@ def _estimate(options: argparse.Namespace) -> int:
     estimated = replace(result.log, meta=result.log.meta | {"estimator_scenario": dump_scenario(scenario, name)})
     metrics = run_metrics(estimated, float(result.tick_time.sum()), result.tick_time)
     _write_results(console, out, name, scenario, estimated, metrics)
+    for remark in result.remarks:
+        console.print(remark, highlight=False, markup=False, soft_wrap=True)
     return DONE
 
 

@@ -7,12 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.estimator import make_estimator
+from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.estimator import Fbse, make_estimator
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
 from fbse_drake.signals import port_values, signals_of
+from fbse_drake.walking.plan import TaskPlan
+from fbse_drake.walking.reference import Recorded
 from fbse_drake.wiring import release
 
 
@@ -22,13 +25,18 @@ class EstimationResult:
 
     log: Log
     tick_time: np.ndarray
+    # For the reader: what the sensors are believed to be, and what could not be estimated.
+    remarks: tuple[str, ...] = ()
 
 
-def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None) -> EstimationResult:
+def estimate(
+    scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None
+) -> EstimationResult:
     """Runs the scenario's estimator over a log, sample by sample, with the very LeafSystems that run in the station.
 
     Only sensor channels are used; `time` is what the log says, so samples may be missing or late. On the log of a simulation with the same
-    scenario the estimates are those of the simulation. Without `joint/velocity` the angles are differentiated and smoothed.
+    scenario the estimates are those of the simulation. Without `joint/velocity` the angles are differentiated and smoothed. Without
+    `joint/torque_command` an `Fbse` estimates all but the friction.
 
     Args:
         progress: called with the log's time [s] as the work goes on.
@@ -39,8 +47,10 @@ def estimate(scenario: Scenario, log: Log, *, progress: Callable[[float], None] 
     replay = Replay(scenario, log)
     values, tick_time = replay.run(progress)
     release(replay.estimator)
-    kept = {name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")}
-    return EstimationResult(replace(log, channels=kept | values), tick_time)
+    kept = {
+        name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")
+    }
+    return EstimationResult(replace(log, channels=kept | values), tick_time, replay.remarks)
 
 
 def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:
@@ -54,6 +64,22 @@ def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]
     return inputs
 
 
+def _plan(scenario: Scenario, robot: Robot) -> TaskPlan | None:
+    """What the motion was planned from; nobody knows it of a recorded one."""
+    if isinstance(scenario.reference, Recorded):
+        return None
+    return planned_reference(scenario, robot).plan
+
+
+def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
+    """As `Scenario.believed_sensors`; velocities that the log lacks are differences."""
+    sensors = scenario.sensors
+    if "joint/velocity" not in log:
+        encoders = replace(sensors.encoders, velocity="differenced")
+        scenario = replace(scenario, sensors=replace(sensors, encoders=encoders))
+    return scenario.believed_sensors
+
+
 class Replay:
     """A scenario's estimator and a log that it runs over; see `estimate`."""
 
@@ -61,9 +87,16 @@ class Replay:
         with located("model: "):
             robot = build_robot(scenario.believed)
         inputs = _inputs(scenario, robot, log)
-        plan = planned_reference(scenario, robot).plan
-        period = float(log.meta["period"])
-        estimator = make_estimator(scenario.estimator, robot, period=period, plan=plan, every_sample=True)
+        sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
+        estimator = make_estimator(
+            scenario.estimator,
+            robot,
+            period=float(log.meta["period"]),
+            plan=_plan(scenario, robot),
+            every_sample=True,
+            sensors=sensors,
+            knows_torque=knows_torque,
+        )
         if estimator is None:
             raise InputError("estimator: the scenario has none (estimator: !Fbse {})")
         for i in range(estimator.num_input_ports()):
@@ -73,16 +106,26 @@ class Replay:
                 where = f"the estimator's input {name} ({channels})"
                 raise InputError(f"the log has no channel for {where}")
         self.estimator, self.time = estimator, log.time
+        self.remarks: tuple[str, ...] = ()
+        if isinstance(scenario.estimator, Fbse):
+            self.remarks = (sensors.text,)
+        if not estimator.knows_friction:
+            self.remarks += ("The friction is not known: the log has no joint/torque_command.",)
         self.context = estimator.CreateDefaultContext()
         # Takes the update of every tick.
         self._next_context = estimator.CreateDefaultContext()
         self._next = self._next_context.get_mutable_state()
         self._next_values = self._next_context.get_discrete_state()
-        self._views = [*state_views(estimator, self.context), *state_views(estimator, self._next_context)]
+        self._views = [
+            *state_views(estimator, self.context),
+            *state_views(estimator, self._next_context),
+        ]
         self._sources = []
         for i in range(estimator.num_input_ports()):
             port = estimator.get_input_port(i)
-            self._sources.append((port.FixValue(self.context, inputs[port.get_name()][0]), inputs[port.get_name()]))
+            self._sources.append(
+                (port.FixValue(self.context, inputs[port.get_name()][0]), inputs[port.get_name()])
+            )
 
     def feed(self, sample: int) -> None:
         """Sets time and inputs to a sample of the log."""
@@ -95,17 +138,20 @@ class Replay:
         self.estimator.CalcForcedUnrestrictedUpdate(self.context, self._next)
         self.context.SetDiscreteState(self._next_values)
 
-    def run(self, progress: Callable[[float], None] | None = None) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def run(
+        self, progress: Callable[[float], None] | None = None
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Estimates by channel, each (N, ...), and the time that each tick took [s], shape (N,)."""
         estimator, context = self.estimator, self.context
         outputs = {name: estimator.GetOutputPort(name) for name in estimator.channels}
         values = {name: np.empty((len(self.time), port.size())) for name, port in outputs.items()}
         tick_time = np.empty(len(self.time))
-        friction = estimator.GetOutputPort("friction_estimate")
+        # The end of the chain, which makes all the others tick.
+        last = estimator.GetOutputPort(list(estimator.channels)[-1])
         for k, now in enumerate(self.time):
             self.feed(k)
             start = clock.perf_counter()
-            friction.Eval(context)
+            last.Eval(context)
             evaluated = clock.perf_counter() - start
             for name, port in outputs.items():
                 values[name][k] = port.Eval(context)
@@ -114,4 +160,7 @@ class Replay:
             tick_time[k] = evaluated + clock.perf_counter() - start
             if progress is not None and k % 100 == 0:
                 progress(float(now))
-        return {name: value.reshape(len(self.time), *estimator.channels[name]) for name, value in values.items()}, tick_time
+        return {
+            name: value.reshape(len(self.time), *estimator.channels[name])
+            for name, value in values.items()
+        }, tick_time

@@ -26,7 +26,8 @@ from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
-from fbse_drake.estimators.estimator import EstimatorConfig, Fbse
+from fbse_drake.estimators.beliefs import SensorBeliefs, beliefs_of
+from fbse_drake.estimators.estimator import EstimatorConfig, Fbse, believed_sensors
 from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.implicit import ImplicitTorque
@@ -295,6 +296,13 @@ class Scenario:
         """The fewest whole steps of the plant that last a millisecond [s]."""
         steps = math.ceil(_USUAL_PERIOD / self.plant.time_step - 1e-6)
         return steps * self.plant.time_step
+
+    @property
+    def believed_sensors(self) -> SensorBeliefs:
+        """What the estimator believes of the sensors."""
+        sensors = self.sensors
+        usual = beliefs_of(sensors.encoders, sensors.imu, sensors.foot_force)
+        return believed_sensors(self.estimator, usual)
 
     @property
     def believed(self) -> RobotConfig:

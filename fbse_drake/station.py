@@ -102,6 +102,7 @@ class Station(Diagram):
             self.model,
             period=scenario.control.period,
             plan=self.reference.plan,
+            sensors=scenario.believed_sensors,
         )
         ports |= add_estimator(builder, self.estimator, ports)
         add_compensation(builder, scenario, self.robot.description, controller, ports)

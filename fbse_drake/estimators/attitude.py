@@ -13,6 +13,7 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -46,11 +47,8 @@ _UNKNOWN_RATE = 0.3
 
 @dataclass(frozen=True)
 class AttitudeConfig:
-    """Noise as the filters believe it, and what they estimate besides the attitude."""
+    """What the filters believe of the motion, and what they estimate besides the attitude."""
 
-    # Standard deviation of white noise per axis and sample [m/s^2], [rad/s].
-    acceleration_noise: float = 0.02
-    angular_velocity_noise: float = 1.0e-3
     # The trunk's linear acceleration: its size [m/s^2] and how long it keeps its direction [s].
     motion_acceleration: float = 0.5
     motion_time: float = 0.3
@@ -74,18 +72,11 @@ class AttitudeConfig:
             self,
             "acceleration_bias",
             "angular_velocity_bias",
-            "angular_velocity_noise",
             "standing_time",
             "standing_acceleration",
             "level_feet",
         )
-        require_positive(
-            self,
-            "acceleration_noise",
-            "motion_acceleration",
-            "motion_time",
-            "stance_time",
-        )
+        require_positive(self, "motion_acceleration", "motion_time", "stance_time")
 
 
 class GravityEstimate(NamedTuple):
@@ -178,9 +169,7 @@ def predict_gravity(
 
 @njit(cache=True)
 def update_gravity(
-    x: GravityEstimate,
-    specific_force: Vector,
-    noise_variance: float,
+    x: GravityEstimate, specific_force: Vector, noise_variance: float
 ) -> GravityEstimate:
     """Kalman update with y = gravity + acceleration + bias + noise."""
     gg, ga, gb, aa, ab, bb = x.covariance
@@ -217,10 +206,7 @@ class QuaternionEstimate(NamedTuple):
 
 @njit(cache=True)
 def predict_quaternion(
-    x: QuaternionEstimate,
-    w: Vector,
-    noise_variance: float,
-    elapsed: float,
+    x: QuaternionEstimate, w: Vector, noise_variance: float, elapsed: float
 ) -> QuaternionEstimate:
     """Turns the quaternion with the gyro, free of its bias.
 
@@ -236,10 +222,7 @@ def predict_quaternion(
 
 @njit(cache=True)
 def update_quaternion(
-    x: QuaternionEstimate,
-    measured: Quaternion,
-    variance: float,
-    correlated: float,
+    x: QuaternionEstimate, measured: Quaternion, variance: float, correlated: float
 ) -> QuaternionEstimate:
     """Extended Kalman update with a measured quaternion.
 
@@ -286,11 +269,7 @@ def stand_still(
     k = bb / (bb + noise_variance + own_rate_variance)
     bias = add(x.bias, scale(k, subtract(w, x.bias)))
     return QuaternionEstimate(
-        measured,
-        bias,
-        (tilt_variance, 0.0, bb - k * bb),
-        x.innovation,
-        x.innovation_variance,
+        measured, bias, (tilt_variance, 0.0, bb - k * bb), x.innovation, x.innovation_variance
     )
 
 
@@ -342,8 +321,8 @@ def _estimate_attitude(
     """One tick of `AttitudeEstimator`; fills the posterior.
 
     Args:
-        known: record with the values of `AttitudeConfig`, the rotation of the IMU, and the
-            quaternion of the base in its axes.
+        known: record with the numbers of `AttitudeConfig` and `SensorBeliefs`, the rotation of the
+            IMU, and the quaternion of the base in its axes.
     """
     if math.isnan(elapsed) and measured[()].trust[1] > 0:
         # Nothing to start from.
@@ -353,18 +332,15 @@ def _estimate_attitude(
     posterior, last, known = posterior[()], last[()], known[()]
     measured, model = measured[()], model[()]
     config, R_BI, q_IB = known.config, rotation(known.R_BI), quaternion(known.q_IB)
-    motion_time, rate_noise = config.motion_time, config.angular_velocity_noise
-    acceleration_noise = config.acceleration_noise
+    motion_time, rate_noise = config.motion_time, known.sensors.angular_velocity_noise
+    acceleration_noise = known.sensors.acceleration_noise
     first, trust = math.isnan(elapsed), measured.trust[1]
     f, w = vector(measured.specific_force), vector(measured.angular_velocity)
     age = 0.0 if first else last.age + elapsed
     feet_innovation, feet_variance = (0.0, 0.0, 0.0), 0.0
     if first:
         x = start_gravity(
-            f,
-            config.standing_acceleration**2,
-            config.acceleration_bias**2,
-            acceleration_noise**2,
+            f, config.standing_acceleration**2, config.acceleration_bias**2, acceleration_noise**2
         )
         q = quaternion_from_gravity(x.gravity, 0.0)
         # The base looks ahead, however the IMU sits on it.
@@ -412,18 +388,11 @@ def _estimate_attitude(
                 if use_feet:
                     by_feet = quaternion_from_gravity(up_I, yaw_of(y.q))
                     z = update_quaternion(
-                        y,
-                        by_feet,
-                        level_variance,
-                        2.0 * config.stance_time / elapsed,
+                        y, by_feet, level_variance, 2.0 * config.stance_time / elapsed
                     )
                     feet_innovation, feet_variance = z.innovation, z.innovation_variance
                     y = QuaternionEstimate(
-                        z.q,
-                        z.bias,
-                        z.covariance,
-                        y.innovation,
-                        y.innovation_variance,
+                        z.q, z.bias, z.covariance, y.innovation, y.innovation_variance
                     )
     q_WB = quaternion_product(y.q, q_IB)
     posterior.status = trust
@@ -482,6 +451,7 @@ class AttitudeEstimator(RecursiveEstimator):
     def __init__(
         self,
         config: AttitudeConfig,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         model: np.dtype,
@@ -515,17 +485,13 @@ class AttitudeEstimator(RecursiveEstimator):
         super().__init__(posterior_type, clock)
         R_BI = ImuMount(robot).R_BI
         q_IB = RotationMatrix(R_BI.T).ToQuaternion().wxyz()
-        self._known = record(config=config, R_BI=R_BI, q_IB=q_IB)
+        self._known = record(config=config, sensors=sensors, R_BI=R_BI, q_IB=q_IB)
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
 
     def _tick(
-        self,
-        context: Context,
-        last: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         measured, model = self._measurements.Eval(context), self._model.Eval(context)
         _estimate_attitude(posterior, last, elapsed, measured, model, self._known)

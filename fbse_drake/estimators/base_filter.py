@@ -485,7 +485,7 @@ def _listen_to_forces(
 
 @njit(cache=True)
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
-    """The first posterior: upright by the accelerometer, looking ahead, soles where they should be."""
+    """The first posterior: upright by the accelerometer, looking ahead, on its soles' place."""
     sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
@@ -631,7 +631,7 @@ def _conclude(
             zmp_x, zmp_y, total = zmp_x + load * centre[0], zmp_y + load * centre[1], total + load
     if total > 0:
         put(x.zmp, (zmp_x / total, zmp_y / total))
-    # The group's errors of velocity and position turn with the attitude's: v - v_hat = xi_v + phi x v.
+    # The group's errors turn with the attitude's: v - v_hat = xi_v + phi x v.
     for i in range(3):
         x.attitude_std[i] = math.sqrt(max(0.0, P[_ATTITUDE + i, _ATTITUDE + i]))
         x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[_GYRO_BIAS + i, _GYRO_BIAS + i]))
@@ -666,8 +666,9 @@ class InvariantBaseFilter(RecursiveEstimator):
         - (one for each field)
         - last_angular_velocity_bias
 
-    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias` (3,)
+    [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the
+    start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB
@@ -686,9 +687,9 @@ class InvariantBaseFilter(RecursiveEstimator):
         error_covariance       (n, n)  of the errors [attitude, velocity, position, gyro bias,
                                        accelerometer bias, (position, orientation) of each foot] on
                                        the group, n = 15 + 6 feet
-        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's position,
-                                       orientation, velocity and angular velocity; the variance is
-                                       the mean over the axes
+        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's
+                                       position, orientation, velocity and angular velocity; the
+                                       variance is the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base

@@ -16,7 +16,7 @@ from fbse_drake.estimators.base_state import (
     ContactAided,
     ContactAidedEstimator,
 )
-from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.friction import (
     FrictionConfig,
@@ -28,7 +28,7 @@ from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
-from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.records import parts
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.reference_methods import (
@@ -67,11 +67,11 @@ class Fbse:
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
     # !ContactAided or the paper's !AdaptiveLipm.
     base_state: BaseStateConfig = field(default_factory=InvariantFilter)
+    # What is not given follows from the scenario's `sensors`.
     sensors: SensorBeliefs = field(default_factory=SensorBeliefs)
     # !MeasuredSupport or the paper's !PlannedSupport.
     support: SupportConfig = field(default_factory=MeasuredSupport)
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
-    link_torque: LinkTorqueConfig = field(default_factory=LinkTorqueConfig)
     # !ModelAided or the paper's !RecursiveLeastSquares.
     friction: FrictionConfig = field(default_factory=ModelAided)
 
@@ -95,23 +95,38 @@ class EstimatorDiagram(Diagram):
         - friction_estimate
         - (one for each channel)
 
-    Inputs are those of the sensors that the estimator needs (`TorqueSensor` has `measured_torque`
-    besides, `TrueFriction` `torque_loss`). `friction_estimate` (n,) [Nm] is that of the tick that
-    ends now. The other outputs are named like the log channels they become, see `channels`.
+    Inputs are those of the sensors that the estimator needs (`TorqueSensor` has `measured_torque` besides, `TrueFriction` `torque_loss`).
+    `friction_estimate` (n,) [Nm] is that of the tick that ends now. The other outputs are named like the log channels they become, see
+    `channels`. An `Fbse` that is not told the torque commands has neither `torque_command` nor
+    `friction_estimate`.
     """
 
     # Log channels, which are also names of output ports, and the shape of one sample.
     channels: dict[str, tuple[int, ...]]
+    # Whether it estimates the friction.
+    knows_friction: bool
 
-    def __init__(self, config: EstimatorConfig, robot: Robot, clock: Clock, plan: TaskPlan | None):
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        robot: Robot,
+        clock: Clock,
+        plan: TaskPlan | None,
+        sensors: SensorBeliefs,
+        *,
+        knows_torque: bool = True,
+    ):
+        """Wires the estimator, see `make_estimator`."""
         super().__init__()
+        self.knows_friction = knows_torque or not isinstance(config, Fbse)
+        self._sensors = sensors
         self.channels = {}
         self._builder = DiagramBuilder()
         self._systems: dict[str, RecursiveEstimator] = {}
         self._split: dict[str, Demultiplexer] = {}
         n = len(robot.joint_names)
         if isinstance(config, TrueFriction):
-            friction: RecursiveEstimator = self._add("friction", TrueFrictionSource(n, clock))
+            friction = self._add("friction", TrueFrictionSource(n, clock))
             self._feed(friction, "torque_loss")
         elif isinstance(config, TorqueSensor):
             friction = self._add("friction", TorqueSensorEstimator(config, n, clock))
@@ -119,77 +134,49 @@ class EstimatorDiagram(Diagram):
         elif isinstance(config, FixedFriction):
             self._add_monitor(SensorMonitorConfig(), MeasuredSupport(), robot, clock)
             friction = self._add(
-                "friction",
-                FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock),
+                "friction", FixedFrictionModel(config, robot, self._type("sensor_monitor"), clock)
             )
             self._join(friction, measurements="sensor_monitor")
         elif isinstance(config, DisturbanceObserver):
-            friction = self._add_momentum_observer(config, robot, clock, plan)
+            self._add_momentum_observer(config, robot, clock, plan)
         elif isinstance(config, Fbse):
-            friction = self._add_fbse(config, robot, clock, plan)
+            self._add_fbse(config, robot, clock, plan)
         else:
             raise TypeError(f"no estimator: {config}")
         self._export(n)
         self._builder.BuildInto(self)
         del self._builder
 
-    def _add_fbse(
-        self,
-        config: Fbse,
-        robot: Robot,
-        clock: Clock,
-        plan: TaskPlan | None,
-    ) -> RecursiveEstimator:
+    def _add_fbse(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
         self._add_base(config, robot, clock, plan)
-        before = ("sensor_monitor", "attitude", "model")
-        measurements, attitude, model = (self._type(name) for name in before)
+        chain = ("sensor_monitor", "attitude", "model")
+        measurements, attitude, model = (self._type(name) for name in chain)
+        sensors, kinds = self._sensors, (measurements, attitude, model)
         acceleration = self._add(
             "joint_acceleration",
-            JointAccelerationEstimator(
-                config.joint_acceleration,
-                robot,
-                measurements,
-                attitude,
-                model,
-                clock,
-            ),
+            JointAccelerationEstimator(config.joint_acceleration, sensors, robot, *kinds, clock),
         )
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
         self._connect_model_at_start(acceleration)
-        link_torque = self._add(
-            "link_torque",
-            LinkTorqueEstimator(
-                config.link_torque,
-                robot,
-                measurements,
-                model,
-                self._type("joint_acceleration"),
-                clock,
-            ),
-        )
+        if not self.knows_friction:
+            return
+        kinds = (measurements, model, self._type("joint_acceleration"))
+        link_torque = self._add("link_torque", LinkTorqueEstimator(sensors, robot, *kinds, clock))
         self._join(
-            link_torque,
-            measurements="sensor_monitor",
-            joint_acceleration="joint_acceleration",
+            link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration"
         )
         self._connect_model_at_start(link_torque)
         self._feed(link_torque, "torque_command")
-        aided = isinstance(config.friction, ModelAided)
-        kind = ModelAidedEstimator if aided else RecursiveLeastSquaresEstimator
-        friction = self._add(
-            "friction",
-            kind(config.friction, robot, measurements, self._type("link_torque"), clock),
-        )
+        kind = RecursiveLeastSquaresEstimator
+        if isinstance(config.friction, ModelAided):
+            kind = ModelAidedEstimator
+        kinds = (measurements, self._type("link_torque"))
+        friction = self._add("friction", kind(config.friction, robot, *kinds, clock))
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
-        return friction
 
     def _add_momentum_observer(
-        self,
-        config: DisturbanceObserver,
-        robot: Robot,
-        clock: Clock,
-        plan: TaskPlan | None,
-    ) -> RecursiveEstimator:
+        self, config: DisturbanceObserver, robot: Robot, clock: Clock, plan: TaskPlan | None
+    ) -> None:
         self._add_base(Fbse(), robot, clock, plan)
         parts = [self._type(name) for name in ("sensor_monitor", "attitude", "base_state", "model")]
         friction = self._add("friction", MomentumObserver(config, robot, *parts, clock))
@@ -202,13 +189,12 @@ class EstimatorDiagram(Diagram):
         )
         self._connect_model_at_start(friction)
         self._feed(friction, "torque_command")
-        return friction
 
     def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
         """Sensor monitor with support, model, attitude and base state."""
         if not robot.has_floating_base or not robot.description.legs:
             raise InputError(
-                "estimator: needs a robot with a floating base and feet (no gantry_height)",
+                "estimator: needs a robot with a floating base and feet (no gantry_height)"
             )
         self._add_monitor(config.sensor_monitor, config.support, robot, clock)
         measurements = self._type("sensor_monitor")
@@ -224,8 +210,7 @@ class EstimatorDiagram(Diagram):
                 raise InputError(f"estimator.support: !PlannedSupport {instead}")
             support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
             source = self._builder.AddNamedSystem(
-                "planned_support",
-                held_signal(support, float(plan.time[1] - plan.time[0])),
+                "planned_support", held_signal(support, float(plan.time[1] - plan.time[0]))
             )
             self._builder.Connect(
                 source.get_output_port(),
@@ -241,7 +226,7 @@ class EstimatorDiagram(Diagram):
     ) -> None:
         """Attitude and base state in one."""
         types = (self._type("sensor_monitor"), self._type("model"))
-        base = InvariantBaseFilter(config.base_state, config.sensors, robot, *types, clock, origin)
+        base = InvariantBaseFilter(config.base_state, self._sensors, robot, *types, clock, origin)
         self._systems["attitude"] = self._add("base_state", base)
         self._join(base, measurements="sensor_monitor", model="model")
         bias = base.GetOutputPort("last_angular_velocity_bias")
@@ -252,8 +237,9 @@ class EstimatorDiagram(Diagram):
     ) -> None:
         """Attitude first, then the base state."""
         measurements, model = self._type("sensor_monitor"), self._type("model")
+        kinds = (measurements, model)
         attitude = self._add(
-            "attitude", AttitudeEstimator(config.attitude, robot, measurements, model, clock)
+            "attitude", AttitudeEstimator(config.attitude, self._sensors, robot, *kinds, clock)
         )
         self._join(attitude, measurements="sensor_monitor", model="model")
         shared = (robot, measurements, self._type("attitude"), model, clock, origin)
@@ -266,13 +252,12 @@ class EstimatorDiagram(Diagram):
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
 
     def _add_monitor(
-        self,
-        config: SensorMonitorConfig,
-        support: SupportConfig,
-        robot: Robot,
-        clock: Clock,
+        self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock
     ) -> None:
-        monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
+        counted = bool(self._sensors.joint_velocity_counted)
+        monitor = self._add(
+            "sensor_monitor", SensorMonitor(config, support, robot, clock, counted=counted)
+        )
         joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
         sizes = {
             "measured_joint_state": 2 * joints,
@@ -295,8 +280,7 @@ class EstimatorDiagram(Diagram):
         """Connects the posteriors of estimators to input ports of these names."""
         for port, source in sources.items():
             self._builder.Connect(
-                self._systems[source].GetOutputPort("posterior"),
-                system.GetInputPort(port),
+                self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port)
             )
 
     def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
@@ -328,7 +312,9 @@ class EstimatorDiagram(Diagram):
         return {name: part.stop - part.start for name, part in parts(self._type(system)).items()}
 
     def _export(self, n: int) -> None:
-        self._builder.ExportOutput(self._field_port("friction", "friction"), "friction_estimate")
+        if self.knows_friction:
+            friction = self._field_port("friction", "friction")
+            self._builder.ExportOutput(friction, "friction_estimate")
         for row in estimates():
             size = self._sizes(row.estimator).get(row.field)
             if size is not None:
@@ -344,6 +330,8 @@ def make_estimator(
     period: float,
     plan: TaskPlan | None = None,
     every_sample: bool = False,
+    sensors: SensorBeliefs = USUAL_SENSORS,
+    knows_torque: bool = True,
 ) -> EstimatorDiagram | None:
     """Builds a friction estimator, or None for `NoEstimator`.
 
@@ -351,17 +339,21 @@ def make_estimator(
         robot: the model that is believed.
         period: tick [s].
         plan: for the planned support, and for where the feet stand at the start.
-        every_sample: every evaluation at a later time is a tick, whatever the period; for recorded
-            logs.
+        every_sample: every evaluation at a later time is a tick, whatever the period; for recorded logs.
+        sensors: what is believed of them where the config says nothing.
+        knows_torque: the torque commands are known; without them an `Fbse` estimates no friction.
 
     Raises:
         InputError: an estimator that does not fit the robot.
     """
     if isinstance(config, NoEstimator):
         return None
-    return EstimatorDiagram(
-        config,
-        robot,
-        Clock(period, 1e-9 if every_sample else period * (1 - 1e-6)),
-        plan,
-    )
+    clock = Clock(period, 1e-9 if every_sample else period * (1 - 1e-6))
+    believed = believed_sensors(config, sensors)
+    return EstimatorDiagram(config, robot, clock, plan, believed, knows_torque=knows_torque)
+
+
+def believed_sensors(config: EstimatorConfig, usual: SensorBeliefs) -> SensorBeliefs:
+    """What an estimator believes of its sensors, what it is not told as usual."""
+    given = config.sensors if isinstance(config, Fbse) else SensorBeliefs()
+    return given.completed(usual)

@@ -172,8 +172,8 @@ class FloatingBaseModel(RecursiveEstimator):
     the gyro, as it was known a tick ago, is there where somebody estimates it. `posterior` belongs
     to the present tick; `at_step_start` to the tick before, where the step began whose
     accelerations and forces are measured now. Velocities are ordered [base angular (3), base linear
-    (3), joints (n)] whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f feet, all in base axes but
-    those of a foot, which are in its sole frame F:
+    (3), joints (n)] whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f
+    feet, all in base axes but those of a foot, which are in its sole frame F:
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
         bias            (n,)       joint rows of C v [Nm]

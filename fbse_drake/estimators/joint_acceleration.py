@@ -8,6 +8,7 @@ from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
@@ -29,17 +30,12 @@ _AGREEMENT_TIME = 0.02
 
 @dataclass(frozen=True)
 class JointAccelerationConfig:
-    """How accelerations are had, and the sensors' noise as it is believed."""
+    """How accelerations are had."""
 
     # `minimum_norm`: the paper's (42), (46); `gyro`: the same with the base's angular acceleration
     # from the gyro, which makes the equations square; `fused`: both and the encoders by weighted
     # least squares, which gives the swing leg as well.
     method: str = "fused"
-    # Standard deviation of white noise per axis and sample: accelerometer [m/s^2], gyro [rad/s],
-    # joint velocity [rad/s].
-    acceleration_noise: float = 0.02
-    angular_velocity_noise: float = 1.0e-3
-    joint_velocity_noise: float = 5.0e-4
     # What a standing foot accelerates in spite of all: angular [rad/s^2] and linear [m/s^2].
     foot_angular_acceleration: float = 1.0
     foot_acceleration: float = 0.1
@@ -47,8 +43,6 @@ class JointAccelerationConfig:
     def __post_init__(self) -> None:
         if self.method not in ("minimum_norm", "gyro", "fused"):
             raise InputError(f"method: expected minimum_norm, gyro or fused, found {self.method}")
-        require_positive(self, "acceleration_noise", "angular_velocity_noise")
-        require_positive(self, "joint_velocity_noise")
         require_positive(self, "foot_angular_acceleration", "foot_acceleration")
 
 
@@ -239,7 +233,7 @@ def _foot_variance(
     y: np.ndarray,
     stands: np.ndarray,
     elapsed: float,
-    noise: np.ndarray,
+    config: np.ndarray,
 ) -> np.ndarray:
     """Variance of what standing feet accelerate, one for each row of the no-slip condition.
 
@@ -260,7 +254,7 @@ def _foot_variance(
             for k in range(len(raw)):
                 innovation -= J[row + i, k] * raw[k]
             agreement[i] = keep * last.agreement[foot, i] + (1.0 - keep) * innovation
-        for start, size in ((0, noise.foot_angular_acceleration), (3, noise.foot_acceleration)):
+        for start, size in ((0, config.foot_angular_acceleration), (3, config.foot_acceleration)):
             x, y_, z = agreement[start], agreement[start + 1], agreement[start + 2]
             mean_square = (x * x + y_ * y_ + z * z) / 3.0
             variance[row + start : row + start + 3] = size**2 + count * mean_square
@@ -281,21 +275,21 @@ def _fuse_accelerations(
     """One tick of `JointAccelerationEstimator` by the fused method; fills the posterior.
 
     Args:
-        known: record with the numbers of `JointAccelerationConfig`, `mount`, see `ImuMount`, and
-            `gravity` (3,) [m/s^2].
+        known: record with the numbers of `JointAccelerationConfig` and `SensorBeliefs`, `mount`,
+            see `ImuMount`, and `gravity` (3,) [m/s^2].
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     attitude, model, known = attitude[()], model[()], known[()]
     if not _begin(posterior, elapsed, measured, model, known):
         return
-    noise, stands = known.noise, standing_feet(measured)
+    noise, stands = known.sensors, standing_feet(measured)
     raw = measured_acceleration(last.rate, measured, attitude, model, elapsed, known)
     # Differences of velocities have their noise twice.
     variance = np.full(len(raw), 2 * (noise.joint_velocity_noise / elapsed) ** 2)
     variance[:3] = 2 * (noise.angular_velocity_noise / elapsed) ** 2
     variance[3:6] = noise.acceleration_noise**2
     J, y = no_slip_condition(model, attitude, stands, known.gravity)
-    foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, noise)
+    foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, known.config)
     fused, sensitivity, innovation, innovation_variance = fuse(raw, variance, J, y, foot_variance)
     posterior.base_angular_acceleration[:] = fused[:3]
     posterior.base_specific_force[:] = fused[3:6]
@@ -368,6 +362,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
     def __init__(
         self,
         config: JointAccelerationConfig,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         attitude: np.dtype,
@@ -398,7 +393,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._method = config.method
         mount = record(**vars(ImuMount(robot)))
         gravity = robot.plant.gravity_field().gravity_vector()
-        self._known = record(noise=config, mount=mount, gravity=gravity)
+        self._known = record(config=config, sensors=sensors, mount=mount, gravity=gravity)
         legs = [leg.joints for leg in robot.description.legs.values()]
         self._legs = [np.array([robot.joint_names.index(x) for x in joints]) for joints in legs]
         self._measurements = self._declare_record_input("measurements", measurements)

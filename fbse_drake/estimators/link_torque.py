@@ -4,13 +4,12 @@
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context, State
 
-from fbse_drake.errors import require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot, grasp_map
@@ -19,27 +18,9 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 _NOT_FINITE = float(Status.NOT_FINITE)
 
 
-# How long it takes to learn that foot forces are noisier than believed [s], and how much of that one
-# tick may tell.
+# How long it takes to learn that foot forces are noisier than believed [s], and how much of that
+# one tick may tell.
 _NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
-
-
-@dataclass(frozen=True)
-class LinkTorqueConfig:
-    """Noise of the sensors as it is believed, for the variance of the measured friction."""
-
-    # Standard deviation of white noise per axis and sample: accelerometer [m/s^2], gyro [rad/s],
-    # joint velocity [rad/s], pad force [N].
-    acceleration_noise: float = 0.02
-    angular_velocity_noise: float = 1.0e-3
-    joint_velocity_noise: float = 5.0e-4
-    force_noise: float = 0.5
-    # Are the foot forces watched for noise that is larger than that?
-    learns_noise: bool = True
-
-    def __post_init__(self) -> None:
-        require_positive(self, "acceleration_noise", "angular_velocity_noise")
-        require_positive(self, "joint_velocity_noise", "force_noise")
 
 
 @njit(cache=True)
@@ -55,31 +36,27 @@ def _clear(posterior: np.ndarray, status: float) -> None:
 
 @njit(cache=True)
 def _watch_forces(
-    posterior: np.ndarray, last: np.ndarray, elapsed: float, measured: np.ndarray, known: np.ndarray
+    posterior: np.ndarray, last: np.ndarray, elapsed: float, wrench: np.ndarray, known: np.ndarray
 ) -> None:
-    """Fills the noise of each foot's forces.
+    """Fills by how much the variance of each foot's wrench is larger than believed.
 
-    It shows in their second differences, to which forces that change smoothly add little; one tick
-    does not tell much, for a foot may just have landed.
+    It shows in second differences, to which forces that change smoothly add little; one tick does
+    not tell much, for a foot may just have landed.
     """
     learning = 1.0 - math.exp(-elapsed / _NOISE_TIME)
-    feet, change = known.pads.foot, posterior.force_change
-    posterior.pad_force[:] = measured.pad_force
-    change[:] = measured.pad_force - last.pad_force
-    posterior.force_noise[:] = last.force_noise
-    if math.isnan(elapsed) or not known.learns_noise or not last.force_noise.all():
-        posterior.force_noise[:] = known.noise.force_noise
-        return
-    for foot in range(len(posterior.force_noise)):
-        total, count = 0.0, 0
-        for pad in range(len(feet)):
-            if feet[pad] == foot:
-                for i in range(3):
-                    total += (change[pad, i] - last.force_change[pad, i]) ** 2 / 6.0
-                    count += 1
-        share = min(_LARGEST_SHARE, total / count / last.force_noise[foot] ** 2)
-        learnt = last.force_noise[foot] * math.sqrt(1.0 + learning * (share - 1.0))
-        posterior.force_noise[foot] = max(known.noise.force_noise, learnt)
+    posterior.wrench[:] = wrench
+    posterior.wrench_change[:] = wrench - last.wrench
+    for foot in range(len(wrench)):
+        excess = last.force_noise[foot]
+        if math.isnan(elapsed) or not known.learns_noise or excess == 0.0:
+            posterior.force_noise[foot] = 1.0
+            continue
+        share = 0.0
+        for i in range(6):
+            bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
+            share += bend * bend / (36.0 * excess * known.wrench_variance[foot, i])
+        learnt = excess * (1.0 + learning * (min(_LARGEST_SHARE, share) - 1.0))
+        posterior.force_noise[foot] = max(1.0, learnt)
 
 
 @njit(cache=True)
@@ -97,25 +74,25 @@ def _estimate_link_torque(
 
     Args:
         torque_command: where the tick began, shape (n,) [Nm].
-        known: record with the values of `LinkTorqueConfig` as `noise`; `pads`, see `FootPads`;
-            `wrench_variance` (feet, 6) of each foot's measured wrench [m^2, 1] and `smallest_load`
-            (feet,) that counts [1], per noise of one pad; `joint_leg` (n,), which leg each joint
-            belongs to; and `learns_noise`.
+        known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
+            `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
+            `joint_leg` (n,), which leg each joint belongs to; and `learns_noise`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     model, acceleration, known = model[()], acceleration[()], known[()]
-    _watch_forces(posterior, last, elapsed, measured, known)
+    pads, feet = known.pads, len(known.wrench_variance)
+    wrench = foot_wrenches(measured.pad_force, pads.position, pads.foot, feet)
+    _watch_forces(posterior, last, elapsed, wrench, known)
     if not np.isfinite(torque_command).all():
         _clear(posterior, _NOT_FINITE)
         return
     if math.isnan(elapsed):
         _clear(posterior, measured.trust.max())
         return
-    noise, pads, trust = known.noise, known.pads, measured.trust
-    n, feet, sensitivity = len(torque_command), len(known.smallest_load), acceleration.sensitivity
+    noise, trust, sensitivity = known.noise, measured.trust, acceleration.sensitivity
+    n = len(torque_command)
     v = 6 + n
     posterior.status = trust.max()
-    wrench = foot_wrenches(measured.pad_force, pads.position, pads.foot, feet)
     a, to_sensors = np.empty(v), np.empty(v)
     a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
     a[6:] = acceleration.joint_acceleration
@@ -139,19 +116,25 @@ def _estimate_link_torque(
             else:
                 impulse_variance += (to_sensors[j] * noise.joint_velocity_noise) ** 2
         for foot in range(feet):
-            force_noise = posterior.force_noise[foot]
-            if wrench[foot, 5] > force_noise * known.smallest_load[foot]:
+            variance = posterior.force_noise[foot] * known.wrench_variance[foot]
+            if wrench[foot, 5] > math.sqrt(variance[5]):
                 for k in range(6):
                     lever = model.foot_jacobian[foot, k, 6 + i]
                     link_torque -= wrench[foot, k] * lever
-                    wrench_variance = force_noise**2 * known.wrench_variance[foot, k]
-                    torque_variance += wrench_variance * lever * lever
+                    torque_variance += variance[k] * lever * lever
         trusted = trust[0] == 0 and trust[1] == 0 and trust[2 + known.joint_leg[i]] == 0
         posterior.link_torque[i] = link_torque
         posterior.residual[i] = torque_command[i] - link_torque
         posterior.torque_variance[i] = torque_variance
         posterior.impulse_variance[i] = impulse_variance
         posterior.valid[i] = acceleration.known[i] if trusted else 0.0
+
+
+def _wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
+    """Of the noise in a foot's measured wrench [moment, force], (6,) [(Nm)^2, N^2]."""
+    if robot.description.legs[side].corners:
+        return np.repeat([sensors.moment_noise**2, sensors.force_noise**2], 3)
+    return sensors.force_noise**2 * (grasp_map(robot.pad_positions(side)) ** 2).sum(axis=1)
 
 
 class LinkTorqueEstimator(RecursiveEstimator):
@@ -185,15 +168,15 @@ class LinkTorqueEstimator(RecursiveEstimator):
                            differentiated [(Nm s)^2]
         valid              1 where all that the residual needs was known
 
-    and `force_noise` (feet,) [N] of each pad of a foot, at least what is believed; `pad_force` and
-    its last change `force_change` (pads, 3) [N].
+    and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
+    believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
     A foot that shows less load than its sensors' noise counts as unloaded.
     """
 
     def __init__(
         self,
-        config: LinkTorqueConfig,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         model: np.dtype,
@@ -215,17 +198,17 @@ class LinkTorqueEstimator(RecursiveEstimator):
             impulse_variance=(n,),
             valid=(n,),
             force_noise=(len(legs),),
-            pad_force=(len(pads.foot), 3),
-            force_change=(len(pads.foot), 3),
+            wrench=(len(legs), 6),
+            wrench_change=(len(legs), 6),
         )
         super().__init__(posterior_type, clock)
-        grasp = [grasp_map(robot.pad_positions(side)) for side in legs]
+        pads = FootPads(robot)
+        variance = np.array([_wrench_variance(sensors, robot, side) for side in legs])
         self._known = record(
-            noise=config,
+            noise=sensors,
             pads=record(position=pads.position, foot=pads.foot),
-            wrench_variance=np.array([(G**2).sum(axis=1) for G in grasp]),
-            smallest_load=np.array([math.sqrt(len(leg.pads)) for leg in legs.values()]),
-            learns_noise=config.learns_noise,
+            wrench_variance=variance,
+            learns_noise=sensors.learns_force_noise,
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -236,11 +219,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         self._declare_posterior("measurements", "model_at_step_start", "joint_acceleration")
 
     def _tick(
-        self,
-        context: Context,
-        last: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         _estimate_link_torque(
             posterior,

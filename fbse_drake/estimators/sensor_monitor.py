@@ -33,7 +33,7 @@ class SensorMonitorConfig:
     """When a sensor is not trusted."""
 
     # A channel that repeats itself to the last bit for this long is stuck [s]. Joint angles, which
-    # are counted, may.
+    # are counted, may, and velocities that are differences of such.
     stuck_after: float = 0.05
     # Feet lose their trust when together they show less than this share of the weight ...
     smallest_load_share: float = 0.8
@@ -93,24 +93,21 @@ def _watch_channels(
 
 @njit(cache=True)
 def _watch_sensors(
-    posterior: np.ndarray,
-    last: np.ndarray,
-    elapsed: float,
-    sensors: np.ndarray,
-    known: np.ndarray,
+    posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray
 ) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
         sensors: their readings, see `SensorMonitor`.
         known: record with the values of `SensorMonitorConfig`; the mass that the feet carry [kg], 0
-            where they need not; which foot each pad belongs to; the thresholds of `detect_support`.
+            where they need not; which foot each pad belongs to; the thresholds of `detect_support`;
+            whether joint velocities are `counted`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
     feet, after = len(posterior.support), known.limits.stuck_after
     trust[:] = _OK
-    # Joint angles may repeat themselves.
+    # Joint angles may repeat themselves, and so may their differences.
     trust[0] = _watch_channels(
         trust[0],
         posterior.joint_position,
@@ -129,7 +126,7 @@ def _watch_sensors(
         last.joint_velocity,
         was_idle.joint_velocity,
         elapsed,
-        after,
+        math.inf if known.counted else after,
     )
     trust[1] = _watch_channels(
         trust[1],
@@ -220,7 +217,14 @@ class SensorMonitor(RecursiveEstimator):
         support: SupportConfig,
         robot: Robot,
         clock: Clock,
+        *,
+        counted: bool = False,
     ):
+        """Declares ports and state.
+
+        Args:
+            counted: joint velocities are differences of counted angles.
+        """
         readings = _readings(robot)
         sensors = record_type(**readings)
         legs = robot.description.legs
@@ -248,21 +252,16 @@ class SensorMonitor(RecursiveEstimator):
         weight = 9.81 * mass
         self._known = record(
             limits=config,
+            counted=counted,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
             thresholds=record(
-                on=measured.on * weight,
-                off=measured.off * weight,
-                debounce=measured.debounce,
+                on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce
             ),
         )
 
     def _tick(
-        self,
-        context: Context,
-        last: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         _watch_sensors(posterior, last, elapsed, self._sensors.Eval(context), self._known)
         if self._planned is not None:
