@@ -43,7 +43,6 @@ from fbse_drake.estimators.spatial import (
     skew,
     subtract,
     vector,
-    yaw_of,
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
@@ -185,7 +184,13 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 @njit(cache=True)
 def _predict(
-    x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known
+    x: np.ndarray,
+    P: np.ndarray,
+    w: Vector,
+    f: Vector,
+    rate_variance: float,
+    T: float,
+    known: np.ndarray,
 ) -> None:
     """The step that ends now, in place.
 
@@ -287,10 +292,11 @@ def _update(
         for j in range(3):
             for k in range(3):
                 S[i, j] += PH[i, first + k] * A[3 * j + k] + PH[i, second + k] * B[3 * j + k]
+    # Errors that last mostly point one way, so the sum over the axes counts, not their mean.
     count, excess = (1.0 + keep) / (1.0 - keep), 0.0
     for i in range(3):
         agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
-        excess += (count * agreement[i] ** 2 - _AGREEMENT * S[i, i]) / 3.0
+        excess += count * agreement[i] ** 2 - _AGREEMENT * S[i, i] / 3.0
     W = _inverse(S)
     distance = dot(vector(innovation), rotate(W, vector(innovation)))
     widening = max(0.0, excess)
@@ -499,7 +505,7 @@ def _listen_to_forces(
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
-    config, sensors, P = known.config, known.sensors, x.error_covariance
+    sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
@@ -683,7 +689,8 @@ class InvariantBaseFilter(RecursiveEstimator):
         - last_angular_velocity_bias
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the
+    start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB
