@@ -147,7 +147,7 @@ def test_residual_does_not_know_the_attitude():
 def test_joint_accelerations_keep_standing_feet_where_they_are(method: str):
     """All methods solve the no-slip condition, the fused one as far as it believes in it."""
     generator = np.random.default_rng(8)
-    moving = {"joint_velocity": generator.normal(scale=0.1, size=12), "angular_velocity": generator.normal(scale=0.1, size=3)}
+    moving = {"joint_velocity": generator.normal(scale=0.01, size=12), "angular_velocity": generator.normal(scale=0.01, size=3)}
     terms = BASE.model_of(**moving)
     config = JointAccelerationConfig(method=method, foot_angular_acceleration=1e-6, foot_acceleration=1e-6)
     rig = Rig(accelerations(config))
