@@ -196,7 +196,8 @@ def test_velocity_with_sensor_errors(run: Run, what: str):
 
 def test_feet_are_anchored_where_they_land(run: Run):
     log = run("paper_walk", "duration=3", noise=False)
-    replay = Replay(diagram(Fbse(), scenario("paper_walk", "duration=3", noise=False)))
+    walk = scenario("paper_walk", "duration=3", noise=False)
+    replay = Replay(diagram(Fbse(base_state=ContactAided()), walk))
     values = replay.run(log.time, inputs_of(log), "estimate/support", "base_state.anchor")
     support, anchors = values["estimate/support"] > 0, values["base_state.anchor"].reshape(-1, 2, 3)
     for k, side in enumerate(log.sides):

@@ -202,20 +202,21 @@ def _predict(
     """
     config, gravity = known.config, vector(known.gravity)
     _propagate(P, x, gravity, T)
-    # Noise of the gyro turns attitude, and by the group all that turns with it.
-    sources = (_ATTITUDE, _VELOCITY, _POSITION)
+    # Noise of the gyro turns attitude, and by the group all that turns with it: also feet, or what
+    # is known of the legs would depend on how far from the world's origin they are.
     v, p = vector(x.imu_velocity), vector(x.imu_position)
+    G = np.zeros((len(P), 3))
+    put(G[_ATTITUDE:_VELOCITY], _IDENTITY)
+    put(G[_VELOCITY:_POSITION], skew(v))
+    put(G[_POSITION:_GYRO_BIAS], skew(p))
+    for foot in range(len(x.foot_standing)):
+        if x.foot_standing[foot] > 0:
+            start = _FEET + 6 * foot
+            put(G[start : start + 3], skew(vector(x.foot_position[foot])))
     q = rate_variance * T * T
-    lever = (_IDENTITY, skew(v), skew(p))
-    for a in range(3):
-        for b in range(3):
-            A, B = lever[a], lever[b]
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for k in range(3):
-                        total += A[3 * i + k] * B[3 * j + k]
-                    P[sources[a] + i, sources[b] + j] += q * total
+    for i in range(len(P)):
+        for j in range(len(P)):
+            P[i, j] += q * (G[i, 0] * G[j, 0] + G[i, 1] * G[j, 1] + G[i, 2] * G[j, 2])
     _add_noise(P, _GYRO_BIAS, config.gyro_walk**2 * T)
     _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
     for foot in range(len(x.foot_standing)):
@@ -291,10 +292,11 @@ def _update(
         for j in range(3):
             for k in range(3):
                 S[i, j] += PH[i, first + k] * A[3 * j + k] + PH[i, second + k] * B[3 * j + k]
+    # Errors that last mostly point one way, so the sum over the axes counts, not their mean.
     count, excess = (1.0 + keep) / (1.0 - keep), 0.0
     for i in range(3):
         agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
-        excess += (count * agreement[i] ** 2 - _AGREEMENT * S[i, i]) / 3.0
+        excess += count * agreement[i] ** 2 - _AGREEMENT * S[i, i] / 3.0
     W = _inverse(S)
     distance = dot(vector(innovation), rotate(W, vector(innovation)))
     widening = max(0.0, excess)
@@ -319,14 +321,29 @@ def _update(
 
 
 @njit(cache=True)
+def _moved(phi: Vector, a: Vector, xi: Vector) -> Vector:
+    """Where the group's exponential takes a: Exp(phi) a + J xi, J the left Jacobian of rotations.
+
+    To first order it would be Exp(phi) a + xi; but far from the world's origin, where both parts
+    are large and cancel each other, that is not enough.
+    """
+    angle = math.sqrt(dot(phi, phi))
+    once, twice = 0.5, 1.0 / 6.0
+    if angle > 1e-4:
+        once = (1.0 - math.cos(angle)) / angle**2
+        twice = (angle - math.sin(angle)) / angle**3
+    across = cross(phi, xi)
+    shift = add(xi, add(scale(once, across), scale(twice, cross(phi, across))))
+    return add(rotate(rotation_matrix(rotation_vector_to_quaternion(phi)), a), shift)
+
+
+@njit(cache=True)
 def _correct(x: np.ndarray, error: np.ndarray) -> None:
     """Moves the estimate along the group by an error (n,)."""
-    turn = rotation_vector_to_quaternion(vector(error[_ATTITUDE:_VELOCITY]))
-    R = rotation_matrix(turn)
-    _turn(x, quaternion_product(turn, quaternion(x.orientation)))
-    v, p = rotate(R, vector(x.imu_velocity)), rotate(R, vector(x.imu_position))
-    put(x.imu_velocity, add(v, vector(error[_VELOCITY:_POSITION])))
-    put(x.imu_position, add(p, vector(error[_POSITION:_GYRO_BIAS])))
+    phi = vector(error[_ATTITUDE:_VELOCITY])
+    _turn(x, quaternion_product(rotation_vector_to_quaternion(phi), quaternion(x.orientation)))
+    for part, start in ((x.imu_velocity, _VELOCITY), (x.imu_position, _POSITION)):
+        put(part, _moved(phi, vector(part), vector(error[start : start + 3])))
     for i in range(3):
         x.gyro_bias_B[i] += error[_GYRO_BIAS + i]
         x.accelerometer_bias_B[i] += error[_ACCELEROMETER_BIAS + i]
@@ -334,20 +351,21 @@ def _correct(x: np.ndarray, error: np.ndarray) -> None:
         if not x.foot_standing[foot] > 0:
             continue
         start = _FEET + 6 * foot
-        p = rotate(R, vector(x.foot_position[foot]))
-        put(x.foot_position[foot], add(p, vector(error[start : start + 3])))
+        part = x.foot_position[foot]
+        put(part, _moved(phi, vector(part), vector(error[start : start + 3])))
         turn = rotation_vector_to_quaternion(vector(error[start + 3 : start + 6]))
         q = quaternion_product(turn, quaternion(x.foot_orientation[foot]))
         put(x.foot_orientation[foot], normalized(q))
 
 
 @njit(cache=True)
-def _land(P: np.ndarray, foot: int) -> None:
-    """The errors of a foot that lands are those of the base."""
+def _land(P: np.ndarray, correction: np.ndarray, foot: int) -> None:
+    """The errors of a foot that lands are those of the base, as is what is known of them."""
     for part, source in ((0, _POSITION), (3, _ATTITUDE)):
         start = _FEET + 6 * foot + part
         P[start : start + 3] = P[source : source + 3]
         P[:, start : start + 3] = P[:, source : source + 3]
+        correction[start : start + 3] = correction[source : source + 3]
 
 
 @njit(cache=True)
@@ -495,8 +513,12 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
     base = subtract(vector(known.origin), rotate(R, middle))
     put(x.imu_position, add(base, rotate(R, p_BI)))
-    for i in range(2):  # Yaw and place are what they are said to be.
+    for i in range(2):  # Yaw is what it is said to be ...
         P[_ATTITUDE + i, _ATTITUDE + i] = known.start.tilt**2
+    # ... and so is the place of the soles, about which the error of the tilt turns the base.
+    about = skew(vector(known.origin))
+    _add_product(P, _POSITION, about, P, _ATTITUDE)
+    _add_product(P.T, _POSITION, about, P.T, _ATTITUDE)
     _add_noise(P, _VELOCITY, known.start.velocity**2)
     _add_noise(P, _GYRO_BIAS, sensors.angular_velocity_bias**2 + 1e-12)
     _add_noise(P, _ACCELEROMETER_BIAS, sensors.acceleration_bias**2 + 1e-12)
@@ -570,13 +592,12 @@ def _estimate_base(
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
-            _land(P, foot)
+            _land(P, correction, foot)
             p_IF = subtract(vector(model.foot_position[foot]), p_BI)
             put(x.foot_position[foot], add(vector(x.imu_position), rotate(R, p_IF)))
             q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
             put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
             x.foot_agreement[foot] = 0.0
-            # It stands when the tick is over: what was just set it cannot correct.
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
             _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)

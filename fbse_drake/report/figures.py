@@ -55,7 +55,7 @@ _ZMP = "#2f8f6b"
 TRUTH = "#c81e1e"
 ESTIMATE = "#0b7a86"
 _SWING = "#8a9199"
-_PART_COLORS = (ESTIMATE, "#d65f1a", _COM, "#8a8f14")
+_PART_COLORS = (ESTIMATE, "#d65f1a", _COM, "#8a8f14", "#7b3fa0", "#5c5c5c", "#b8436f", "#3f6fb8")
 # Estimate and truth mostly agree: a broad pale line shows beside a thin one on top of it.
 _BROAD = {"linewidth": 1.9, "alpha": 0.55}
 _THIN = {"color": TRUTH, "linestyle": (0, (4, 1.5)), "linewidth": 0.8}
@@ -235,7 +235,8 @@ def run_figures(
             "Consistency of the filters",
             f"Normalised innovation squared (NIS), averaged over the components and a sliding window of {_NIS_WINDOW:g} s. About 1: the "
             "filter's surprises are as large as it expects. Below, it trusts its measurements too little, above too much. The band holds "
-            "95 % of white innovations; those that last, as of a trunk that accelerates, leave it.",
+            "95 % of white innovations; those that last, as of a trunk that accelerates, leave it. Feet are far below: what they do in "
+            "spite of all lasts, and the filter takes it for white noise that leaves as much over many ticks.",
             bool(innovations.keys() - {"friction"})
             and any(_has_updates(parts) for name, parts in innovations.items() if name != "friction"),
             lambda: filter_consistency(log),
@@ -449,12 +450,19 @@ def friction(log: Log) -> Figure:
 
 
 def estimated_friction(log: Log) -> Figure:
-    """Estimated and, where known, true friction torque, a panel for each joint, with the leg's swings shaded (as the paper's Fig. 6)."""
+    """Estimated and, where known, true friction torque, a panel for each joint, with the leg's swings shaded (as the paper's Fig. 6).
+
+    A band is twice the estimate's standard deviation.
+    """
     figure, panels = _joint_grid(log, "friction torque [Nm]", own_swing=True)
-    estimate = log["estimate/joint/friction_torque"]
+    estimate, deviation = log["estimate/joint/friction_torque"], log.get("estimate/joint/friction_torque_std")
     truth = ended_step(log["truth/joint/friction_torque"]) if "truth/joint/friction_torque" in log else None
     for joint, axes in panels.items():
         _plot(axes, log, estimate[:, joint], **_joint_style(log, joint, "estimated"), **_BROAD)
+        if deviation is not None:
+            thin = _stride(log)
+            edges = (estimate[thin, joint] + sign * deviation[thin, joint] for sign in (-2, 2))
+            axes.fill_between(log.time[thin], *edges, color=_joint_color(log, joint), alpha=0.2, linewidth=0, label="± 2 std")
         if truth is not None:
             _plot(axes, log, truth[:, joint], **_THIN, label="true friction")
     _limit(log, panels, estimate, whole=truth, span=_FRICTION_SPAN)

@@ -248,7 +248,9 @@ def normalised_innovations(log: Log) -> dict[str, dict[str, np.ndarray]]:
     """
     result = {}
     for name in ("attitude", "base_state", "joint_acceleration", "friction"):
-        channels = (f"estimate/{name}/innovation", f"estimate/{name}/innovation_variance")
+        of_feet = f"estimate/{name}/foot_innovation" in log
+        innovation_name = f"estimate/{name}/{'foot_' * of_feet}innovation"
+        channels = (innovation_name, f"{innovation_name}_variance")
         if not all(channel in log for channel in channels):
             continue
         innovation, variance = (log[channel] for channel in channels)
@@ -291,12 +293,19 @@ def _measurement_parts(log: Log, name: str, components: int) -> list[str]:
     """What the innovation of a filter is of, in order; parts have equally many components."""
     parts = {
         "attitude": ["gravity", "attitude by gravity", "attitude by level feet"],
-        # Of the filter on legs and IMU, or of that on the LIPM, axis by axis.
-        "base_state": ["position", "velocity"] if components == 6 else ["ZMP x", "ZMP y"],
+        "base_state": _base_state_parts(log, components),
         "joint_acceleration": [f"{side} foot, {kind}" for side in log.sides for kind in ("angular", "linear")],
         "friction": log.joints,
     }[name]
     return parts if parts and components % len(parts) == 0 else [str(number) for number in range(1, components + 1)]
+
+
+def _base_state_parts(log: Log, components: int) -> list[str]:
+    """Of the filter with the feet in its state, of that on legs and IMU, or of that on the LIPM, axis by axis."""
+    if "estimate/base_state/foot_innovation" in log:
+        kinds = ("position", "orientation", "velocity", "angular velocity")
+        return [f"{side} foot, {kind}" for side in log.sides for kind in kinds]
+    return ["position", "velocity"] if components == 6 else ["ZMP x", "ZMP y"]
 
 
 def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, float]]:
