@@ -304,12 +304,13 @@ def tables(results: Results, robust: Results) -> dict[str, Table]:
     }
 
 
-def _print(console: Console, title: str, table: Table) -> None:
+def print_table(console: Console, title: str, table: Table) -> None:
+    """Prints a table, texts to the left and numbers to the right."""
     shown = ConsoleTable(title=title, title_justify="left")
-    for head in table.header:
-        shown.add_column(head, justify="left" if head in ("leg in", table.header[0]) else "right")
+    for head, cell in zip(table.header, table.rows[0], strict=True):
+        shown.add_column(head, justify="left" if isinstance(cell, str) else "right")
     for row in table.rows:
-        shown.add_row(*(cell if isinstance(cell, str) else number(float(cell)) for cell in row))
+        shown.add_row(*(str(cell) if isinstance(cell, (str, int)) else number(float(cell)) for cell in row))
     console.print(shown)
 
 
@@ -334,7 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             robust.add(figures)
     made = tables(results, robust)
     for title, table in made.items():
-        _print(console, title, table)
+        print_table(console, title, table)
     write_text(
         options.out / "figures.json",
         json.dumps({title: {"header": table.header, "rows": table.rows} for title, table in made.items()}, indent=1, default=float) + "\n",
