@@ -48,7 +48,7 @@ from fbse_drake.estimators.spatial import (
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
-_NOT_FINITE = float(Status.NOT_FINITE)
+_NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
 # its orientation.
 _ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = range(0, 18, 3)
@@ -65,6 +65,19 @@ _GATE = 18.5
 # For how long innovations must agree to be no white noise [s], and how much larger than white noise
 # leaves it their mean square must be.
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# Over which times accelerations are compared [s], and after how long without contradiction the
+# sensors are believed again.
+_BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
+# By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
+# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
+# long it takes to learn what they always do [s].
+_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 1.0
+# The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
+_ROLLING, _FIRM_SHARE = 0.4, 0.3
+# A reading counts at most as much [m/s^2], so that it is soon forgotten.
+_LARGEST_ACCELERATION = 50.0
+# What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
+_FOOT_RATE_ERROR, _FOOT_ACCELERATION_ERROR = 0.05, 0.3
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -475,6 +488,123 @@ def _listen_to_forces(
 
 
 @njit(cache=True)
+def _clipped(a: Vector, limit: float) -> Vector:
+    return (
+        min(max(a[0], -limit), limit),
+        min(max(a[1], -limit), limit),
+        min(max(a[2], -limit), limit),
+    )
+
+
+@njit(cache=True)
+def _norm(a: Vector) -> float:
+    return math.sqrt(dot(a, a))
+
+
+@njit(cache=True)
+def _cross_check(
+    x: np.ndarray,
+    f_raw: Vector,
+    relative: Vector,
+    push: Vector,
+    load: np.ndarray,
+    rolling: Vector,
+    elapsed: float,
+) -> None:
+    """Compares IMU, joints and foot forces, and says whom to doubt.
+
+    The accelerometer shows, with the joints' motion, how the centre of mass accelerates, and so do
+    the foot forces. The gyro shows, with the joints' motion, that a standing foot rests. Where they
+    contradict each other whoever changed more is doubted.
+
+    Args:
+        x: record of `check`, see `InvariantBaseFilter`.
+        f_raw, relative, push: acceleration of the IMU, of the centre of mass relative to it, and
+            by the foot forces, in base axes [m/s^2].
+        load: the feet's forces by the robot's mass, (feet, 3) [m/s^2].
+        rolling: angular velocity of a standing foot, zero if there is none [rad/s].
+    """
+    limit = _LARGEST_ACCELERATION
+    a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
+    if x.age == 0.0:
+        for span in range(2):
+            put(x.mean[span, 0], a)
+            put(x.mean[span, 1], (0.0, 0.0, 0.0))
+            put(x.mean[span, 2], c)
+            for foot in range(len(load)):
+                put(x.load[span, foot], _clipped(vector(load[foot]), limit))
+        x.spread, x.rolling[:], x.doubt[:], x.agreed = 0.0, 0.0, 0.0, 0.0
+    brief, long = 1.0 - math.exp(-elapsed / _BRIEF), 1.0 - math.exp(-elapsed / _LONG)
+    x.age += elapsed
+    changes = 0.0
+    for i in range(3):
+        changes += min((a[i] - x.mean[0, 0, i]) ** 2 + (c[i] - x.mean[0, 2, i]) ** 2, 400.0)
+    x.spread += brief * (changes - x.spread)
+    for span in range(2):
+        gain = brief if span == 0 else long
+        for i in range(3):
+            x.mean[span, 0, i] += gain * (a[i] - x.mean[span, 0, i])
+            x.mean[span, 1, i] += gain * (b[i] - x.mean[span, 1, i])
+            x.mean[span, 2, i] += gain * (c[i] - x.mean[span, 2, i])
+            for foot in range(len(load)):
+                reading = min(max(load[foot, i], -limit), limit)
+                x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
+    for i in range(3):
+        x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
+    z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
+    excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
+    turns = _norm(vector(x.rolling)) > _ROLLING
+    if x.age < _LONG:
+        return
+    if not turns and excess < _CONTRADICTION:
+        x.agreed += elapsed
+    else:
+        x.agreed = 0.0
+        if x.doubt.max() == 0:
+            _blame(x, turns)
+    if x.agreed > _AGREED:
+        x.doubt[:] = 0.0
+    if x.doubt.max() == 0:
+        x.habit_age += elapsed
+        gain = elapsed / min(_HABIT_TIME, x.habit_age)
+        for i in range(3):
+            x.habit[i] += gain * (z[i] - x.habit[i])
+
+
+@njit(cache=True)
+def _blame(x: np.ndarray, turns: bool) -> None:
+    """Sets who is doubted: the IMU, or the feet whose forces changed most."""
+    change = np.zeros(4)
+    for k in range(3):
+        change[k] = _norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
+    if turns or change[0] + change[1] > change[2]:
+        x.doubt[0] = 1.0
+        return
+    feet, largest = len(x.doubt) - 1, 0.0
+    for foot in range(feet):
+        moved = _norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
+        x.doubt[1 + foot] = moved
+        largest = max(largest, moved)
+    for foot in range(feet):
+        x.doubt[1 + foot] = 1.0 if x.doubt[1 + foot] >= 0.5 * largest else 0.0
+
+
+@njit(cache=True)
+def _rolling(stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray) -> tuple[bool, Vector]:
+    """Angular velocity of the standing foot that carries most, in base axes [rad/s]."""
+    best = -1
+    for foot in range(len(stands)):
+        if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
+            best = foot
+    if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
+        return False, (0.0, 0.0, 0.0)
+    J, w_F = model.foot_jacobian[best], (0.0, 0.0, 0.0)
+    for j in range(6, J.shape[1]):
+        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
+    return True, add(w, rotate(rotation(model.foot_rotation[best]), w_F))
+
+
+@njit(cache=True)
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
@@ -532,19 +662,27 @@ def _estimate_base(
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
     f_raw = rotate(R_BI, vector(measured.specific_force))
+    wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
+    weight = known.mass * 9.81
+    w = subtract(w_raw, vector(x.gyro_bias_B))
+    rests, rolling = _rolling(x.foot_standing, wrench, weight, w, model)
     if first:
         _start(x, measured, model, known)
     else:
-        w, f = subtract(w_raw, vector(x.gyro_bias_B)), subtract(f_raw, vector(x.accelerometer_bias_B))
+        f = subtract(f_raw, vector(x.accelerometer_bias_B))
         rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
         if trust[1] > 0:
-            w, f = (0.0, 0.0, 0.0), rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
+            f = rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
             rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
+            if rests and trust[0] == 0 and trust[2:].max() == 0:
+                w, rate_noise = subtract(w, rolling), _FOOT_RATE_ERROR
+            else:
+                w = (0.0, 0.0, 0.0)
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
         _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
     R = rotation(x.rotation)
-    wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
-    weight, force, carried = known.mass * 9.81, (0.0, 0.0, 0.0), 0.0
+    force, carried = (0.0, 0.0, 0.0), 0.0
+    load_by_mass = np.empty((feet, 3))
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
@@ -563,17 +701,30 @@ def _estimate_base(
             _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
-        force = add(force, rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load)))
+        foot_force = rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load))
+        force = add(force, foot_force)
+        put(load_by_mass[foot], scale(1.0 / known.mass, foot_force))
         carried += load
     # Velocity of the centre of mass relative to the IMU.
     w = subtract(w_raw, vector(x.gyro_bias_B))
     away = subtract(vector(model.com_velocity), cross(w, p_BI))
     was_known = last.away_known > 0 and not first
+    is_fresh = trust[0] == 0
+    for sensor in range(1, len(trust)):
+        is_fresh = is_fresh and (trust[sensor] == 0 or trust[sensor] == _IMPLAUSIBLE)
+    if was_known and is_fresh:
+        relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
+        relative = add(relative, cross(w, away))
+        push = scale(1.0 / known.mass, force)
+        _cross_check(x.check, f_raw, relative, push, load_by_mass, rolling, elapsed)
+    elif not is_fresh:
+        x.check.age = 0.0
+        x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
         _listen_to_forces(x, P, correction, force, f_raw, w, away, before, elapsed, known)
     put(x.away, away)
-    x.away_known = 1.0 if trust[0] == 0 and trust[1] == 0 else 0.0
+    x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
     _conclude(x, w_raw, wrench, measured, model, known)
 
@@ -646,9 +797,11 @@ class InvariantBaseFilter(RecursiveEstimator):
         - posterior
         - (one for each field)
         - last_angular_velocity_bias
+        - last_doubt
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+    (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the IMU
+    and the feet that contradict the rest. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB
@@ -672,6 +825,10 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
+        check                  what `_cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
+                               feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
+                               50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
+                               contradicts; `age`, `habit_age` and `agreed` [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
                                        axes [m/s], and whether it was measured
     """
@@ -708,6 +865,13 @@ class InvariantBaseFilter(RecursiveEstimator):
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
         self.DeclareVectorOutputPort("last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()})
+
+        feet = len(robot.description.sides)
+        self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, {self.xd_ticket()})
+
+    def _calc_last_doubt(self, context: Context, output: BasicVector) -> None:
+        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        output.SetFromVector(last["check"]["doubt"])
 
     def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)
@@ -759,4 +923,15 @@ def base_filter_type(robot: Robot) -> np.dtype:
         foot_innovation=(feet, _TOLD, 3),
         foot_innovation_variance=(feet, _TOLD),
         error_covariance=(n, n),
+        check=record_type(
+            doubt=(1 + feet,),
+            mean=(2, 3, 3),
+            load=(2, feet, 3),
+            rolling=(3,),
+            habit=(3,),
+            spread=(),
+            age=(),
+            habit_age=(),
+            agreed=(),
+        ),
     )

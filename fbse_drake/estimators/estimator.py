@@ -174,9 +174,11 @@ class EstimatorDiagram(Diagram):
         """Sensor monitor with support, model, attitude and base state."""
         if not robot.has_floating_base or not robot.description.legs:
             raise InputError("estimator: needs a robot with a floating base and feet (no gantry_height)")
-        self._add_monitor(config.sensor_monitor, config.support, robot, clock)
-        measurements = self._type("sensor_monitor")
         invariant = isinstance(config.base_state, InvariantFilter)
+        self._add_monitor(
+            config.sensor_monitor, config.support, robot, clock, config.sensors, invariant
+        )
+        measurements = self._type("sensor_monitor")
         model = self._add("model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant))
         self._join(model, measurements="sensor_monitor")
         sides = robot.description.sides
@@ -202,6 +204,8 @@ class EstimatorDiagram(Diagram):
         self._join(base, measurements="sensor_monitor", model="model")
         bias = base.GetOutputPort("last_angular_velocity_bias")
         self._builder.Connect(bias, self._systems["model"].GetInputPort("angular_velocity_bias"))
+        doubt = base.GetOutputPort("last_doubt")
+        self._builder.Connect(doubt, self._systems["sensor_monitor"].GetInputPort("doubt"))
 
     def _add_base_in_stages(self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]) -> None:
         """Attitude first, then the base state."""
@@ -217,8 +221,17 @@ class EstimatorDiagram(Diagram):
         self._add("base_state", base_state)
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
 
-    def _add_monitor(self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock) -> None:
-        monitor = self._add("sensor_monitor", SensorMonitor(config, support, robot, clock))
+    def _add_monitor(
+        self,
+        config: SensorMonitorConfig,
+        support: SupportConfig,
+        robot: Robot,
+        clock: Clock,
+        beliefs: SensorBeliefs | None = None,
+        hears_doubt: bool = False,
+    ) -> None:
+        watch = SensorMonitor(config, support, robot, clock, beliefs, hears_doubt=hears_doubt)
+        monitor = self._add("sensor_monitor", watch)
         joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
         sizes = {
             "measured_joint_state": 2 * joints,

@@ -101,6 +101,10 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 # For how long innovations must agree to be no noise [s], and how much larger than noise leaves it
 # their mean square must be then.
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# An innovation counts as little as makes it just likely beyond so many standard deviations, ...
+_GATE = 5.0
+# ... and of what the model does not explain nobody knows more than this share.
+_DOUBT = 0.5
 # How long it takes to learn that the sensors are noisier than believed [s], and how much of that
 # one tick may tell.
 _NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
@@ -395,8 +399,10 @@ def _estimate_friction(
         S = column[0] + noise * link.impulse_variance[joint]
         impulse = innovation
         if valid:
+            likely = min(1.0, _GATE * math.sqrt(S) / max(abs(innovation), 1e-300))
+            S_gate = S / likely**2
             for i in range(size):
-                gain = column[i] / S
+                gain = column[i] / S_gate
                 if i == 0:
                     impulse -= gain * innovation
                 else:
@@ -408,13 +414,14 @@ def _estimate_friction(
             rough = min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
             noise = max(1.0, noise * (1.0 + learning * (rough - 1.0)))
             # ... and their mean what the model is wrong by, beyond the noise.
-            agreement = keep * last.agreement[joint] + (1.0 - keep) * innovation
+            agreement = keep * last.agreement[joint] + (1.0 - keep) * likely * innovation
             posterior.agreement[joint] = agreement
             if count * agreement * agreement > _AGREEMENT * S:
                 unexplained = column[0] / S * agreement / elapsed
                 P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
         else:
             # A joint that is not measured is left to its model.
+            P[size - 1, size - 1] += x[m] ** 2
             x[m] = impulse = posterior.agreement[joint] = 0.0
             P[0, :] = 0.0
             P[:, 0] = 0.0
@@ -429,7 +436,8 @@ def _estimate_friction(
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
-        posterior.friction_std[joint] = math.sqrt(max(0.0, variance))
+        doubt = (_DOUBT * x[m]) ** 2
+        posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt)
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
         posterior.innovation[joint] = innovation if valid else 0.0
         posterior.innovation_variance[joint] = S
