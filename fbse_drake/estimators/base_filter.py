@@ -74,6 +74,11 @@ _BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
 _CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 1.0
 # The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
 _ROLLING, _FIRM_SHARE = 0.4, 0.3
+# A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
+# that foot rests again [rad/s], or for so long [s].
+_RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
+# Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
+_MEMORY = 0.1
 # A reading counts at most as much [m/s^2], so that it is soon forgotten.
 _LARGEST_ACCELERATION = 50.0
 # What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
@@ -508,7 +513,9 @@ def _cross_check(
     relative: Vector,
     push: Vector,
     load: np.ndarray,
+    rests: bool,
     rolling: Vector,
+    rate: Vector,
     elapsed: float,
 ) -> None:
     """Compares IMU, joints and foot forces, and says whom to doubt.
@@ -522,7 +529,9 @@ def _cross_check(
         f_raw, relative, push: acceleration of the IMU, of the centre of mass relative to it, and
             by the foot forces, in base axes [m/s^2].
         load: the feet's forces by the robot's mass, (feet, 3) [m/s^2].
-        rolling: angular velocity of a standing foot, zero if there is none [rad/s].
+        rests: is there a foot that stands firmly?
+        rolling: its angular velocity, else zero [rad/s].
+        rate: the gyro's reading [rad/s].
     """
     limit = _LARGEST_ACCELERATION
     a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
@@ -534,6 +543,7 @@ def _cross_check(
             for foot in range(len(load)):
                 put(x.load[span, foot], _clipped(vector(load[foot]), limit))
         x.spread, x.rolling[:], x.doubt[:], x.agreed = 0.0, 0.0, 0.0, 0.0
+        x.was_firm = x.stepped = 0.0
     brief, long = 1.0 - math.exp(-elapsed / _BRIEF), 1.0 - math.exp(-elapsed / _LONG)
     x.age += elapsed
     changes = 0.0
@@ -551,9 +561,20 @@ def _cross_check(
                 x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
     for i in range(3):
         x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
+    turned = _norm(subtract(rate, vector(x.last_rate)))
+    rolled = _norm(subtract(rolling, vector(x.last_rolling)))
+    if rests and x.was_firm > 0 and min(turned, rolled) > _RATE_STEP and x.stepped == 0:
+        x.doubt[:], x.doubt[0], x.stepped = 0.0, 1.0, elapsed
+    elif x.stepped > 0:
+        x.stepped += elapsed
+    x.was_firm = 1.0 if rests else 0.0
+    put(x.last_rate, rate)
+    put(x.last_rolling, rolling)
     z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
     excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
-    turns = _norm(vector(x.rolling)) > _ROLLING
+    is_late = 0.0 < x.stepped < _PATIENCE
+    turns = _norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
+    turns = turns or (is_late and not rests)
     if x.age < _LONG:
         return
     if not turns and excess < _CONTRADICTION:
@@ -563,7 +584,7 @@ def _cross_check(
         if x.doubt.max() == 0:
             _blame(x, turns)
     if x.agreed > _AGREED:
-        x.doubt[:] = 0.0
+        x.doubt[:], x.stepped = 0.0, 0.0
     if x.doubt.max() == 0:
         x.habit_age += elapsed
         gain = elapsed / min(_HABIT_TIME, x.habit_age)
@@ -716,7 +737,7 @@ def _estimate_base(
         relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
-        _cross_check(x.check, f_raw, relative, push, load_by_mass, rolling, elapsed)
+        _cross_check(x.check, f_raw, relative, push, load_by_mass, rests, rolling, w, elapsed)
     elif not is_fresh:
         x.check.age = 0.0
         x.check.doubt[:] = 0.0
@@ -726,7 +747,28 @@ def _estimate_base(
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
+    _remember_biases(x, trust, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
+
+
+@njit(cache=True)
+def _remember_biases(x: np.ndarray, trust: np.ndarray, first: bool, elapsed: float) -> None:
+    """While a sensor is not trusted the IMU's biases are those from before it began to fail."""
+    kept = x.kept_biases
+    if first:
+        for age in range(2):
+            kept[age, 0], kept[age, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+        x.kept_for = 0.0
+    elif trust.max() > 0 or x.check.doubt.max() > 0:
+        kept[1] = kept[0]
+        x.gyro_bias_B[:], x.accelerometer_bias_B[:] = kept[0, 0], kept[0, 1]
+        x.kept_for = 0.0
+    else:
+        x.kept_for += elapsed
+        if x.kept_for > _MEMORY:
+            kept[0] = kept[1]
+            kept[1, 0], kept[1, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+            x.kept_for = 0.0
 
 
 @njit(cache=True)
@@ -828,7 +870,12 @@ class InvariantBaseFilter(RecursiveEstimator):
         check                  what `_cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
                                feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
                                50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
-                               contradicts; `age`, `habit_age` and `agreed` [s]
+                               contradicts; `last_rate`, `last_rolling` (3,) and `was_firm` of
+                               the tick before; `stepped`, `age`, `habit_age` and `agreed`, for how
+                               long the gyro is doubted for its step, all is watched, the habit is
+                               learned, and nothing contradicts [s]
+        kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
+                               base axes, and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
                                        axes [m/s], and whether it was measured
     """
@@ -923,12 +970,18 @@ def base_filter_type(robot: Robot) -> np.dtype:
         foot_innovation=(feet, _TOLD, 3),
         foot_innovation_variance=(feet, _TOLD),
         error_covariance=(n, n),
+        kept_biases=(2, 2, 3),
+        kept_for=(),
         check=record_type(
             doubt=(1 + feet,),
             mean=(2, 3, 3),
             load=(2, feet, 3),
             rolling=(3,),
             habit=(3,),
+            last_rate=(3,),
+            last_rolling=(3,),
+            was_firm=(),
+            stepped=(),
             spread=(),
             age=(),
             habit_age=(),

@@ -103,8 +103,8 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
 # An innovation counts as little as makes it just likely beyond so many standard deviations, ...
 _GATE = 5.0
-# ... and of what the model does not explain nobody knows more than this share.
-_DOUBT = 0.5
+# ... and what the model does not explain, or a tick adds to it, is not known for so long [s].
+_DOUBT_TIME = 0.1
 # How long it takes to learn that the sensors are noisier than believed [s], and how much of that
 # one tick may tell.
 _NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
@@ -364,7 +364,7 @@ def _estimate_friction(
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
-    keep = math.exp(-elapsed / _AGREEMENT_TIME)
+    keep, keep_doubt = math.exp(-elapsed / _AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / _NOISE_TIME)
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
@@ -436,8 +436,9 @@ def _estimate_friction(
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
-        doubt = (_DOUBT * x[m]) ** 2
-        posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt)
+        doubt = max(abs(x[m]), keep_doubt * last.doubt[joint])
+        posterior.doubt[joint] = doubt
+        posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt**2)
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
         posterior.innovation[joint] = innovation if valid else 0.0
         posterior.innovation_variance[joint] = S
@@ -463,7 +464,7 @@ class ModelAidedEstimator(FrictionEstimator):
     [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
     shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
     the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
-    the running mean of the innovation [Nm s].
+    the running mean of the innovation [Nm s]; `doubt` (n,) the largest disturbance of late [Nm].
     """
 
     def __init__(
@@ -477,7 +478,7 @@ class ModelAidedEstimator(FrictionEstimator):
         n = len(robot.joint_names)
         regressor = FrictionRegressor.of(config.model, robot, config.factors)
         further = ("disturbance", "impulse", "velocity", "last_velocity", "friction_std")
-        further += ("noise", "agreement")
+        further += ("noise", "agreement", "doubt")
         shapes = dict.fromkeys(further, (n,))
         shapes["weights"] = (n, regressor.parameters + regressor.shapes)
         super().__init__(

@@ -31,6 +31,8 @@ _STUCK, _LOST = float(Status.STUCK), float(Status.LOST)
 _IMPLAUSIBLE = float(Status.IMPLAUSIBLE)
 # What is doubted of a joint: its angle, which jumped; its velocity, or nobody knows which; both.
 _ANGLE, _VELOCITY, _BOTH = 1.0, 2.0, 3.0
+# The fastest that a trunk's acceleration [m/s^3] and rate [rad/s^2] change, impacts included.
+_LARGEST_JERK, _LARGEST_ROTATION = 2.0e4, 200.0
 # Over how long a joint's velocity is compared with its angle [s].
 _PAIR_TIME = 0.02
 # Standard deviations that no honest reading is off by: once in 5e8.
@@ -297,6 +299,12 @@ def _watch_sensors(
         elapsed,
         after,
     )
+    for i in range(3):
+        jerk = abs(posterior.specific_force[i] - last.specific_force[i])
+        turn = abs(posterior.angular_velocity[i] - last.angular_velocity[i])
+        # Not so at the first tick, which has no elapsed time.
+        if trust[1] == _OK and (jerk > _LARGEST_JERK * elapsed or turn > _LARGEST_ROTATION * elapsed):
+            trust[1] = _IMPLAUSIBLE
     for pad in range(len(known.pad_foot)):
         sensor = 2 + known.pad_foot[pad]
         trust[sensor] = _watch_channels(
