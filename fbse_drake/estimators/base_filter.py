@@ -71,7 +71,7 @@ _BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
 # By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
 # off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
 # long it takes to learn what they always do [s].
-_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 1.0
+_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
 # The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
 _ROLLING, _FIRM_SHARE = 0.4, 0.3
 # A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
@@ -79,6 +79,9 @@ _ROLLING, _FIRM_SHARE = 0.4, 0.3
 _RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
 # Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
 _MEMORY = 0.1
+# They stay within so many of the standard deviations that they had so long ago [s]: they hardly
+# walk, and a sensor that drifts faster is at fault. A deviation is at least so many random walks.
+_LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
 # A reading counts at most as much [m/s^2], so that it is soon forgotten.
 _LARGEST_ACCELERATION = 50.0
 # What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
@@ -747,8 +750,33 @@ def _estimate_base(
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
+    _leash_biases(x, first, elapsed, known.config)
     _remember_biases(x, trust, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
+
+
+@njit(cache=True)
+def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray) -> None:
+    """Keeps the IMU's biases where they can be by what was known of them."""
+    leash, P = x.leash, x.error_covariance
+    x.leashed_for = 0.0 if first else x.leashed_for + elapsed
+    if first or x.leashed_for > _LEASH_TIME:
+        x.leashed_for = 0.0
+        leash[0] = leash[1]
+        for i in range(3):
+            leash[1, 0, i], leash[1, 1, i] = x.gyro_bias_B[i], x.accelerometer_bias_B[i]
+            for sensor in range(2):
+                at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
+                walk = config.gyro_walk if sensor == 0 else config.accelerometer_walk
+                least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
+                leash[1, 2 + sensor, i] = math.sqrt(max(P[at, at], least**2))
+        if first:
+            leash[0] = leash[1]
+    for sensor in range(2):
+        bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
+        for i in range(3):
+            middle, reach = leash[0, sensor, i], _LEASH * leash[0, 2 + sensor, i]
+            bias[i] = min(max(bias[i], middle - reach), middle + reach)
 
 
 @njit(cache=True)
@@ -876,6 +904,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                learned, and nothing contradicts [s]
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
+        leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
+                               and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
                                        axes [m/s], and whether it was measured
     """
@@ -972,6 +1002,8 @@ def base_filter_type(robot: Robot) -> np.dtype:
         error_covariance=(n, n),
         kept_biases=(2, 2, 3),
         kept_for=(),
+        leash=(2, 4, 3),
+        leashed_for=(),
         check=record_type(
             doubt=(1 + feet,),
             mean=(2, 3, 3),

@@ -401,14 +401,17 @@ def _estimate_friction(
         if valid:
             likely = min(1.0, _GATE * math.sqrt(S) / max(abs(innovation), 1e-300))
             S_gate = S / likely**2
+            # From what it cannot explain the model learns nothing, the disturbance all.
+            learns = count * last.agreement[joint] ** 2 <= _GATE**2 * S
             for i in range(size):
-                gain = column[i] / S_gate
+                gain, is_weight = column[i] / S_gate, 0 < i <= m
                 if i == 0:
                     impulse -= gain * innovation
-                else:
+                elif learns or not is_weight:
                     x[i - 1] += gain * innovation
                 for k in range(size):
-                    P[i, k] -= gain * column[k]
+                    if learns or not (is_weight and 0 < k <= m):
+                        P[i, k] -= gain * column[k]
             # Differences of innovations show the noise, whatever the model is wrong by ...
             change = innovation - last.innovation[joint]
             rough = min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
