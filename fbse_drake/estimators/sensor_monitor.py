@@ -44,9 +44,11 @@ _ROUGHEST, _ROUGHNESS_TIME, _LARGEST_SHARE = 25.0, 0.3, 9.0
 _RETURNED = 0.01
 # ... give or take this share of its way, ...
 _GAIN_ERROR = 2e-3
+# ... (a mismatch counts for so many times its tolerance at most) ...
+_MOST = 5.0
 # ... or for so long [s] in accord with the velocity: had it only jumped, had it been wrong in other
 # ways, too, had both jumped; other joints are believed after the last of them.
-_ADOPTED, _MENDED, _BOTH_MENDED, _AGREED = 2.0, 0.1, 0.3, 0.02
+_ADOPTED, _MENDED, _BOTH_MENDED, _AGREED = 0.3, 0.1, 0.3, 0.02
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,8 @@ def _watch_joints(
     for i in range(len(x.angle)):
         q, v = sensors.joint_position[i], sensors.joint_velocity[i]
         has_angle, has_velocity = math.isfinite(q), math.isfinite(v)
-        x.is_pair[i] = 1.0 if has_angle and has_velocity else 0.0
+        is_stuck = v != 0 and posterior.unchanged.joint_velocity[i] > known.limits.stuck_after
+        x.is_pair[i] = 1.0 if has_angle and has_velocity and not is_stuck else 0.0
         x.angle[i] = q if has_angle else was.angle[i]
         x.velocity[i] = v if has_velocity else was.velocity[i]
         doubt = 0.0 if is_first else was.doubt[i]
@@ -161,16 +164,18 @@ def _watch_joints(
             continue
         way = 0.5 * T * (v + was.velocity[i])
         jump = q - was.angle[i] - way
-        step = abs(v - was.velocity[i])
+        step = max(abs(v - was.velocity[i]), keep * was.step[i])
         slow = keep * was.slow_velocity[i] + (1.0 - keep) * v
         mismatch, rough = keep * was.mismatch[i] + jump, math.sqrt(was.roughness[i])
         slack = known.limits.velocity_delay * abs(v - slow)
         tolerance = _GATE * rough * math.sqrt(variance) + slack
         agrees = abs(mismatch) < tolerance
         least_jump = _GATE * rough * math.sqrt(step_variance)
-        jumps = abs(jump) > least_jump + 0.5 * T * (step + was.step[i])
+        # Nor does an angle jump that a velocity which has just jumped is wrong about.
+        jumps = abs(jump) > least_jump + 1.5 * T * step
         x.other[i] = was.other[i] + way
-        x.allowance[i] = was.allowance[i] + _GAIN_ERROR * abs(way)
+        late = known.limits.velocity_delay * abs(v - was.velocity[i])
+        x.allowance[i] = was.allowance[i] + _GAIN_ERROR * abs(way) + late
         x.agreed[i] = was.agreed[i] + T if agrees else 0.0
         x.returned[i], x.is_mixed[i] = 0.0, was.is_mixed[i]
         if doubt == 0 and (jumps or not agrees):
@@ -210,6 +215,8 @@ def _watch_joints(
         # What jumped is not what the joint does.
         rate = v if jumps else (q - was.angle[i]) / T
         x.slow_rate[i] = 0.5 * (1.0 + keep) * was.slow_rate[i] + 0.5 * (1.0 - keep) * rate
+        if doubt > 0:  # So that it is soon forgotten.
+            mismatch = min(max(mismatch, -_MOST * tolerance), _MOST * tolerance)
         x.mismatch[i], x.slow_velocity[i], x.step[i], x.doubt[i] = mismatch, slow, step, doubt
         if doubt == _ANGLE:
             posterior.joint_position[i] = x.other[i]
@@ -228,7 +235,9 @@ def _pause(x: np.ndarray, was: np.ndarray, i: int, is_first: bool) -> None:
     x.mismatch[i] = x.step[i] = x.agreed[i] = x.returned[i] = 0.0
     x.slow_velocity[i] = x.slow_rate[i] = x.velocity[i]
     x.roughness[i] = _ROUGHEST if is_first else was.roughness[i]
-    x.doubt[i] = 0.0 if is_first else was.doubt[i]
+    # Without the velocity nobody knows where the angle has gone.
+    is_lost = x.is_pair[i] == 0 and was.doubt[i] > 0
+    x.doubt[i] = 0.0 if is_first else (_VELOCITY if is_lost else was.doubt[i])
     x.is_mixed[i] = 0.0 if is_first else was.is_mixed[i]
     x.allowance[i] = 0.0 if is_first else was.allowance[i]
     x.other[i] = x.angle[i] if is_first else was.other[i]
@@ -325,7 +334,8 @@ def _watch_sensors(
         # What the feet must carry together: mass times specific force, or gravity where the IMU
         # says nothing.
         fx, fy, fz = vector(posterior.specific_force)
-        weight = known.weighed_mass * max(5.0, math.sqrt(fx * fx + fy * fy + fz * fz))
+        force = math.sqrt(fx * fx + fy * fy + fz * fz) if trust[1] == _OK else 9.81
+        weight = known.weighed_mass * max(5.0, force)
         if load.sum() < known.limits.smallest_load_share * weight:
             light = last.light + elapsed
         if light > known.limits.lost_after:
@@ -373,7 +383,8 @@ class SensorMonitor(RecursiveEstimator):
         support     (feet,)      1 for a foot that stands, else 0
         waiting     (feet,)      see `detect_support`
         joint                    of each joint, all (n,): `angle` and `velocity` as read; `is_pair`:
-                                 both are numbers; `step` of the velocity [rad/s]; `mismatch`, how
+                                 both are numbers; `step`, the largest of the velocity of late
+                                 [rad/s]; `mismatch`, how
                                  far the angle went beyond the velocity's integral in the last time
                                  [rad]; `slow_velocity`, `slow_rate`, means of velocity and of the
                                  angle's rate [rad/s]; `roughness`, by how much the variance of the
