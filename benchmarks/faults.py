@@ -15,9 +15,9 @@ is
 
 An estimator that states no `estimate/joint/friction_torque_std` is judged by the rms of its error
 without faults, joint by joint. A torque command that is wrong by a little cannot be told from
-friction; its faults are counted with the rest, and summed up by themselves. --only keeps the faults whose `group: kind` has this text. Prints
-counts and the faults that are silent, not recovered or not finite, and writes DIR/faults.json.
-It is one process; a fault takes half a second or more.
+friction; its faults are counted with the rest, and summed up by themselves. --only keeps the faults
+whose `group: kind` has this text. Prints counts and the faults that are silent, not recovered or
+not finite, and writes DIR/faults.json. It is one process; a fault takes half a second or more.
 """
 
 import argparse

@@ -106,13 +106,16 @@ def test_estimator_survives(walk: Log, before: Callable[..., tuple], name: str, 
     status, faulty = result["estimate/sensors/status"], END - START
     noticed = round(delay / TICK) + 1
     assert (status[noticed:faulty, place] == expected).all()
-    assert (status[faulty:] == 0).all()
+    # What is compared over some time takes as long to agree again.
+    over = faulty + (100 if kind == "stuck" else 0)
+    assert (status[over:] == 0).all()
     others = [k for k in range(4) if k != place and (kind != "lost" or k == 1)]
     assert (status[:, others] == 0).all()
     # Each stage says so whose inputs are concerned.
     concerned = {"friction": sensor == "joints" if name == "fixed" else True}
     if name != "fixed":
-        concerned |= {"base_state": True, "attitude": sensor == "imu"}
+        # By default the base's filter estimates the attitude, too.
+        concerned |= {"base_state": True, "attitude": sensor == "imu" or name != "paper"}
     if name in ("best", "paper"):
         concerned |= {"joint_acceleration": place < 2, "link_torque": True}
     for stage, is_concerned in concerned.items():
@@ -120,7 +123,7 @@ def test_estimator_survives(walk: Log, before: Callable[..., tuple], name: str, 
     # It leaves no trace.
     after, healed, velocity, vertical = TOLERANCE[name]
     difference = np.abs(result["friction_estimate"] - undisturbed["friction_estimate"])
-    assert difference[faulty:].max() < after
+    assert difference[over:].max() < after
     assert difference[HEALED - START :].max() < healed
     if velocity is not None:
         moved = result["estimate/base/velocity"] - undisturbed["estimate/base/velocity"]
@@ -169,6 +172,7 @@ def test_wrong_reading_is_noticed(walk: Log, before: Callable[..., tuple], kind:
     status, faulty = result["estimate/sensors/status"], END - START
     assert (status[:50, place] == Status.IMPLAUSIBLE).any()
     assert (status[:faulty, place] == Status.IMPLAUSIBLE).mean() > 0.2
+    # Joints of which both readings jumped back are believed last.
     assert (status[faulty + 350 :] == 0).all()
     deviation = undisturbed["estimate/joint/friction_torque_std"]
     moved = np.abs(result["friction_estimate"] - undisturbed["friction_estimate"])
@@ -289,7 +293,7 @@ def test_each_system_alone_survives_what_is_no_number(walk: Log, name: str):
     """
     ticks, bad = 90, range(50, 55)
     _, systems = recorded(walk, ESTIMATORS[name], ticks)
-    assert len(systems) == {"best": 7, "paper": 7, "observer": 5, "fixed": 2}[name]
+    assert len(systems) == {"best": 6, "paper": 7, "observer": 4, "fixed": 2}[name]
     for system, inputs in systems.items():
         good = Rig(system)
         for k in range(ticks):

@@ -43,7 +43,6 @@ from fbse_drake.estimators.spatial import (
     skew,
     subtract,
     vector,
-    yaw_of,
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
@@ -205,7 +204,15 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 
 @njit(cache=True)
-def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known) -> None:
+def _predict(
+    x: np.ndarray,
+    P: np.ndarray,
+    w: Vector,
+    f: Vector,
+    rate_variance: float,
+    T: float,
+    known: np.ndarray,
+) -> None:
     """The step that ends now, in place.
 
     Args:
@@ -614,8 +621,14 @@ def _blame(x: np.ndarray, turns: bool) -> None:
 
 
 @njit(cache=True)
-def _rolling(stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray) -> tuple[bool, Vector]:
-    """Angular velocity of the standing foot that carries most, in base axes [rad/s]."""
+def _rolling(
+    stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray
+) -> tuple[bool, Vector]:
+    """Angular velocity of the standing foot that carries most, in base axes [rad/s].
+
+    Returns:
+        Does it carry enough to stand firmly? If not, the velocity is zero.
+    """
     best = -1
     for foot in range(len(stands)):
         if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
@@ -632,7 +645,7 @@ def _rolling(stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, m
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
-    config, sensors, P = known.config, known.sensors, x.error_covariance
+    sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
@@ -870,8 +883,9 @@ class InvariantBaseFilter(RecursiveEstimator):
         - last_doubt
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the IMU
-    and the feet that contradict the rest. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+    (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the
+    IMU and the feet that contradict the rest. World axes unless said. Yaw and place are those of the
+    start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB
@@ -890,9 +904,9 @@ class InvariantBaseFilter(RecursiveEstimator):
         error_covariance       (n, n)  of the errors [attitude, velocity, position, gyro bias,
                                        accelerometer bias, (position, orientation) of each foot] on
                                        the group, n = 15 + 6 feet
-        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's position,
-                                       orientation, velocity and angular velocity; the variance is
-                                       the mean over the axes
+        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's
+                                       position, orientation, velocity and angular velocity; the
+                                       variance is the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
         check                  what `_cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
@@ -944,7 +958,8 @@ class InvariantBaseFilter(RecursiveEstimator):
         self.DeclareVectorOutputPort("last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()})
 
         feet = len(robot.description.sides)
-        self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, {self.xd_ticket()})
+        state = {self.xd_ticket()}
+        self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, state)
 
     def _calc_last_doubt(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)

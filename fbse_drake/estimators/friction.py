@@ -6,7 +6,6 @@ times.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -152,11 +151,7 @@ class FrictionRegressor:
         if not self.factors or not len(self.nonlinear):
             return basis
         others = [self.effect.basis(motion, self.nonlinear * f)[0] for f in self.factors]
-        return basis + tuple(
-            other[k] - basis[k]
-            for other in others
-            for k in self._shaped
-        )
+        return basis + tuple(other[k] - basis[k] for other in others for k in self._shaped)
 
     @cached_property
     def _shaped(self) -> list[int]:

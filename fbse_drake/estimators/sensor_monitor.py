@@ -311,8 +311,9 @@ def _watch_sensors(
     for i in range(3):
         jerk = abs(posterior.specific_force[i] - last.specific_force[i])
         turn = abs(posterior.angular_velocity[i] - last.angular_velocity[i])
-        # Not so at the first tick, which has no elapsed time.
-        if trust[1] == _OK and (jerk > _LARGEST_JERK * elapsed or turn > _LARGEST_ROTATION * elapsed):
+        # The first tick has no elapsed time, and passes.
+        leaps = jerk > _LARGEST_JERK * elapsed or turn > _LARGEST_ROTATION * elapsed
+        if leaps and trust[1] == _OK:
             trust[1] = _IMPLAUSIBLE
     for pad in range(len(known.pad_foot)):
         sensor = 2 + known.pad_foot[pad]
@@ -327,7 +328,7 @@ def _watch_sensors(
             after,
         )
     for sensor in range(1, len(trust)):
-        if trust[sensor] == _OK and doubt[sensor - 1] > 0:
+        if trust[sensor] == _OK and doubt[sensor - 1] != 0:
             trust[sensor] = _IMPLAUSIBLE
     light, load = 0.0, vertical_loads(posterior.pad_force, known.pad_foot, feet)
     if known.weighed_mass > 0 and not math.isnan(elapsed):
@@ -372,9 +373,9 @@ class SensorMonitor(RecursiveEstimator):
 
     `sensors` holds what is read, side by side: `joint_position` (n,), `joint_velocity` (n,),
     `specific_force` (3,), `angular_velocity` (3,), `pad_force` (P, 3). `planned_support` (feet,) is
-    there for `PlannedSupport` only; a foot stands where it is positive. `doubt` (1 + feet,) is there
-    where somebody knows better: positive for the IMU and the feet that contradict the rest. Fields
-    of the posterior:
+    there for `PlannedSupport` only; a foot stands where it is positive. `doubt` (1 + feet,) is
+    there where somebody knows better: positive for the IMU and the feet that contradict the rest.
+    Fields of the posterior:
 
         trust       (2 + feet,)  status of joints, IMU and every foot
         ...                      the readings, the last good one where there is none now
