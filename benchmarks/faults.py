@@ -14,9 +14,10 @@ is
 - not finite if any estimate ever is.
 
 An estimator that states no `estimate/joint/friction_torque_std` is judged by the rms of its error
-without faults, joint by joint. --only keeps the faults whose `group: kind` has this text. Prints
-counts and the faults that are silent, not recovered or not finite, and writes DIR/faults.json.
-It is one process; a fault takes half a second or more.
+without faults, joint by joint. A torque command that is wrong by a little cannot be told from
+friction; its faults are counted with the rest, and summed up by themselves. --only keeps the faults
+whose `group: kind` has this text. Prints counts and the faults that are silent, not recovered or
+not finite, and writes DIR/faults.json. It is one process; a fault takes half a second or more.
 """
 
 import argparse
@@ -330,6 +331,8 @@ class Outcome(StrEnum):
     NOT_FINITE = "not finite"
 
 
+# Groups of faults that nothing but the friction shows have this in their name.
+_UNTOLD = "torque command"
 _BAD = (Outcome.SILENT, Outcome.NOT_RECOVERED, Outcome.NOT_FINITE)
 
 
@@ -444,6 +447,16 @@ def count_table(verdicts: Sequence[Verdict], by: str) -> Table:
     return Table((by.capitalize(), *Outcome), tuple(rows))
 
 
+def summary(name: str, verdicts: Sequence[Verdict]) -> str:
+    """Shares of faults that are stated while they last, and over in time after them."""
+    number = max(1, len(verdicts))
+    lasting = (Outcome.NOT_RECOVERED, Outcome.NOT_FINITE)
+    stated = sum(verdict.outcome not in _BAD for verdict in verdicts) / number
+    healed = sum(verdict.outcome not in lasting for verdict in verdicts) / number
+    shares = f"{100 * stated:.1f} % harmless, covered or flagged; {100 * healed:.1f} % recovered"
+    return f"{name}: {len(verdicts)} faults, {shares}"
+
+
 def bad_table(verdicts: Sequence[Verdict]) -> Table:
     """The faults that nobody is told of or that last, worst first."""
     bad = [verdict for verdict in verdicts if verdict.outcome in _BAD]
@@ -479,6 +492,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print_table(console, "Silent, not recovered or not finite", bad)
     for by in ("group", "kind", "support"):
         print_table(console, f"Sensor faults by {by}", count_table(verdicts, by))
+    untold = [verdict for verdict in verdicts if _UNTOLD in verdict.group]
+    console.print(summary("Sensors", [v for v in verdicts if v not in untold]))
+    console.print(summary("Torque commands", untold))
     console.print(f"Friction's standard deviation without faults ({source}): {spread}")
     console.print(f"Flagged without a fault: {100 * alarms:.2f} % of the time")
     counts = Counter(verdict.outcome for verdict in verdicts)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log
 from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
-from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
 from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.records import as_record
@@ -47,7 +47,7 @@ class Filter(Rig):
         super().__init__(
             InvariantBaseFilter(
                 config or InvariantFilter(),
-                sensors or SensorBeliefs(),
+                sensors or USUAL_SENSORS,
                 BASE.robot,
                 *types,
                 CLOCK,
@@ -434,7 +434,7 @@ def stand(
     rig: Filter, seconds: float, gyro: np.ndarray, accelerometer: np.ndarray, seed: int = 5
 ) -> np.ndarray:
     """Posteriors of a robot that stands still, its IMU with noise as believed and these biases."""
-    generator, noise, found = np.random.default_rng(seed), SensorBeliefs(), []
+    generator, noise, found = np.random.default_rng(seed), USUAL_SENSORS, []
     for _ in range(round(seconds / TICK)):
         w = gyro + generator.normal(scale=noise.angular_velocity_noise, size=3)
         f = accelerometer - GRAVITY + generator.normal(scale=noise.acceleration_noise, size=3)
@@ -447,7 +447,7 @@ GYRO_BIAS, ACCELEROMETER_BIAS = np.array([0.02, -0.03, 0.01]), np.array([0.05, -
 
 def test_biases_are_found_while_it_stands():
     """What each measurement alone would leave of a constant, in closed form."""
-    beliefs, time = SensorBeliefs(), 2.0
+    beliefs, time = USUAL_SENSORS, 2.0
     rates = dataclasses.replace(SILENT, foot_rate=0.015, gyro_walk=0.0)
     last = stand(Filter(rates), time, GYRO_BIAS, ACCELEROMETER_BIAS)[-1]
     # Two feet, whose error lasts for `foot_time`.
@@ -485,7 +485,7 @@ def test_all_together_find_biases_better():
 @pytest.mark.parametrize("other_stands", [True, False])
 def test_a_slipping_foot(other_stands: bool):
     """The left foot slips by 5 cm/s for 0.2 s under a robot that rests, with noise as believed."""
-    generator, noise, rig = np.random.default_rng(6), SensorBeliefs(), Filter()
+    generator, noise, rig = np.random.default_rng(6), USUAL_SENSORS, Filter()
     J = LEVEL["foot_jacobian"][0, :, 6:12]
     speed, slipped, found, told, doubt = np.array([0.05, 0.0, 0.0]), np.zeros(3), [], [], []
     for k in range(1500):

@@ -1,4 +1,7 @@
-"""Sensors that fail: what is not a number, what repeats itself, what shows no load. Nothing of it may reach the estimates."""
+"""Sensors that fail: what is not a number, repeats itself, shows no load, contradicts the others.
+
+Nothing of it may reach the estimates.
+"""
 
 from collections.abc import Callable
 
@@ -103,13 +106,16 @@ def test_estimator_survives(walk: Log, before: Callable[..., tuple], name: str, 
     status, faulty = result["estimate/sensors/status"], END - START
     noticed = round(delay / TICK) + 1
     assert (status[noticed:faulty, place] == expected).all()
-    assert (status[faulty:] == 0).all()
+    # What is compared over some time takes as long to agree again.
+    over = faulty + (100 if kind == "stuck" else 0)
+    assert (status[over:] == 0).all()
     others = [k for k in range(4) if k != place and (kind != "lost" or k == 1)]
     assert (status[:, others] == 0).all()
     # Each stage says so whose inputs are concerned.
     concerned = {"friction": sensor == "joints" if name == "fixed" else True}
     if name != "fixed":
-        concerned |= {"base_state": True, "attitude": sensor == "imu"}
+        # By default the base's filter estimates the attitude, too.
+        concerned |= {"base_state": True, "attitude": sensor == "imu" or name != "paper"}
     if name in ("best", "paper"):
         concerned |= {"joint_acceleration": place < 2, "link_torque": True}
     for stage, is_concerned in concerned.items():
@@ -117,12 +123,74 @@ def test_estimator_survives(walk: Log, before: Callable[..., tuple], name: str, 
     # It leaves no trace.
     after, healed, velocity, vertical = TOLERANCE[name]
     difference = np.abs(result["friction_estimate"] - undisturbed["friction_estimate"])
-    assert difference[faulty:].max() < after
+    assert difference[over:].max() < after
     assert difference[HEALED - START :].max() < healed
     if velocity is not None:
         moved = result["estimate/base/velocity"] - undisturbed["estimate/base/velocity"]
         assert np.abs(moved[HEALED - START :]).max() < velocity
         assert np.abs(tilt(result) - tilt(undisturbed))[HEALED - START :].max() < vertical
+
+
+# What is finite and wrong: port, channels, places in the status that may tell, and what is read.
+KNEE = 9
+WRONG = {
+    "angle jumps": ("measured_joint_state", slice(KNEE, KNEE + 1), 0, lambda x: x + 0.02),
+    "angle doubled": ("measured_joint_state", slice(KNEE, KNEE + 1), 0, lambda x: 2 * x),
+    "angle spikes": (
+        "measured_joint_state",
+        slice(KNEE, KNEE + 1),
+        0,
+        lambda x: x + np.where(np.arange(len(x)) % 50 == 0, 1.5, 0.0)[:, None],
+    ),
+    "velocity at full scale": (
+        "measured_joint_state",
+        slice(12 + KNEE, 13 + KNEE),
+        0,
+        lambda x: np.full_like(x, 20.0),
+    ),
+    "velocity off": ("measured_joint_state", slice(12 + KNEE, 13 + KNEE), 0, lambda x: x + 0.1),
+    "joints flipped": ("measured_joint_state", slice(0, 24), 0, lambda x: -x),
+    "accelerometer off": ("measured_imu", slice(0, 1), 1, lambda x: x + 1.5),
+    "gyro off": ("measured_imu", slice(3, 6), 1, lambda x: x + 0.1),
+    "IMU at full scale": ("measured_imu", slice(0, 6), 1, lambda x: np.full_like(x, 35.0)),
+    "foot doubled": ("measured_pad_force", slice(0, 12), 2, lambda x: 2 * x),
+    "pad off": ("measured_pad_force", slice(2, 3), 2, lambda x: x + 150.0),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_wrong_reading_is_noticed(walk: Log, before: Callable[..., tuple], kind: str):
+    """Within 50 ms, as long as it lasts, and never after; the friction is soon what it was."""
+    replay, undisturbed = before("best")
+    port, part, place, wrong = WRONG[kind]
+    inputs = inputs_of(walk)
+    inputs[port] = inputs[port].copy()
+    inputs[port][START:END, part] = wrong(inputs[port][START:END, part])
+    result = replay.fork().run(walk.time[START:LAST], from_start(inputs))
+    for channel, values in result.items():
+        assert np.isfinite(values).all(), channel
+    status, faulty = result["estimate/sensors/status"], END - START
+    assert (status[:50, place] == Status.IMPLAUSIBLE).any()
+    assert (status[:faulty, place] == Status.IMPLAUSIBLE).mean() > 0.2
+    # Joints of which both readings jumped back are believed last.
+    assert (status[faulty + 350 :] == 0).all()
+    deviation = undisturbed["estimate/joint/friction_torque_std"]
+    moved = np.abs(result["friction_estimate"] - undisturbed["friction_estimate"])
+    assert (moved < 3 * deviation)[HEALED - START :].all()
+
+
+def test_unexplained_friction_is_doubted(walk: Log, before: Callable[..., tuple]):
+    """A wrong torque command looks like friction; that it moves the estimate is stated."""
+    replay, undisturbed = before("best")
+    inputs = inputs_of(walk)
+    inputs["torque_command"] = inputs["torque_command"].copy()
+    inputs["torque_command"][START:END, KNEE] += 10.0
+    result = replay.fork().run(walk.time[START:LAST], from_start(inputs))
+    moved = np.abs(result["friction_estimate"] - undisturbed["friction_estimate"])[:, KNEE]
+    stated = result["estimate/joint/friction_torque_std"][:, KNEE]
+    assert moved.max() > 5.0
+    assert (moved < 3 * np.maximum(stated, 0.1)).all()
+    assert moved[HEALED - START :].max() < 0.3
 
 
 @pytest.mark.parametrize("name", ["best", "observer"])
@@ -164,8 +232,27 @@ def test_nothing_to_start_from(walk: Log, name: str):
 def test_healthy_sensors_are_trusted(run: Run):
     """No false alarm, neither in a walk with noise nor without: a sensor that is exact may rest at zero."""
     for log in (run("paper_walk_fbse", "duration=3"), run("paper_walk", "duration=3", noise=False)):
-        fixed = Replay(diagram(FixedFriction(), scenario("paper_walk", "duration=3")))
-        assert (fixed.run(log.time, inputs_of(log), "estimate/sensors/status")["estimate/sensors/status"] == 0).all()
+        for config in (FixedFriction(), Fbse()):
+            replay = Replay(diagram(config, scenario("paper_walk", "duration=3")))
+            channel = "estimate/sensors/status"
+            assert (replay.run(log.time, inputs_of(log), channel)[channel] == 0).all()
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("reference.single_support=0.4", "reference.double_support=0.3"),
+        ("ground.slope=[0.0, 0.0349]",),
+        ("ground.stiffness=1.0e5",),
+    ],
+    ids=["fast", "slope", "soft"],
+)
+def test_hard_walks_are_trusted(run: Run, overrides: tuple[str, ...]):
+    """No false alarm where feet land hard and roll."""
+    log = run("paper_walk_fbse", "duration=2", *overrides)
+    replay = Replay(diagram(Fbse(), scenario("paper_walk_fbse", "duration=2", *overrides)))
+    channel = "estimate/sensors/status"
+    assert (replay.run(log.time, inputs_of(log), channel)[channel] == 0).all()
 
 
 def recorded(walk: Log, config: EstimatorConfig, ticks: int) -> tuple[Replay, dict[RecursiveEstimator, dict[str, np.ndarray]]]:
@@ -206,7 +293,7 @@ def test_each_system_alone_survives_what_is_no_number(walk: Log, name: str):
     """
     ticks, bad = 90, range(50, 55)
     _, systems = recorded(walk, ESTIMATORS[name], ticks)
-    assert len(systems) == {"best": 7, "paper": 7, "observer": 5, "fixed": 2}[name]
+    assert len(systems) == {"best": 6, "paper": 7, "observer": 4, "fixed": 2}[name]
     for system, inputs in systems.items():
         good = Rig(system)
         for k in range(ticks):

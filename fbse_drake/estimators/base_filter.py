@@ -47,7 +47,7 @@ from fbse_drake.estimators.spatial import (
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
-_NOT_FINITE = float(Status.NOT_FINITE)
+_NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
 # its orientation.
 _ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = range(0, 18, 3)
@@ -64,6 +64,27 @@ _GATE = 18.5
 # For how long innovations must agree to be no white noise [s], and how much larger than white noise
 # leaves it their mean square must be.
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# Over which times accelerations are compared [s], and after how long without contradiction the
+# sensors are believed again.
+_BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
+# By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
+# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
+# long it takes to learn what they always do [s].
+_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
+# The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
+_ROLLING, _FIRM_SHARE = 0.4, 0.3
+# A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
+# that foot rests again [rad/s], or for so long [s].
+_RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
+# Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
+_MEMORY = 0.1
+# They stay within so many of the standard deviations that they had so long ago [s]: they hardly
+# walk, and a sensor that drifts faster is at fault. A deviation is at least so many random walks.
+_LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
+# A reading counts at most as much [m/s^2], so that it is soon forgotten.
+_LARGEST_ACCELERATION = 50.0
+# What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
+_FOOT_RATE_ERROR, _FOOT_ACCELERATION_ERROR = 0.05, 0.3
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -502,8 +523,148 @@ def _listen_to_forces(
 
 
 @njit(cache=True)
+def _clipped(a: Vector, limit: float) -> Vector:
+    return (
+        min(max(a[0], -limit), limit),
+        min(max(a[1], -limit), limit),
+        min(max(a[2], -limit), limit),
+    )
+
+
+@njit(cache=True)
+def _norm(a: Vector) -> float:
+    return math.sqrt(dot(a, a))
+
+
+@njit(cache=True)
+def _cross_check(
+    x: np.ndarray,
+    f_raw: Vector,
+    relative: Vector,
+    push: Vector,
+    load: np.ndarray,
+    rests: bool,
+    rolling: Vector,
+    rate: Vector,
+    elapsed: float,
+) -> None:
+    """Compares IMU, joints and foot forces, and says whom to doubt.
+
+    The accelerometer shows, with the joints' motion, how the centre of mass accelerates, and so do
+    the foot forces. The gyro shows, with the joints' motion, that a standing foot rests. Where they
+    contradict each other whoever changed more is doubted.
+
+    Args:
+        x: record of `check`, see `InvariantBaseFilter`.
+        f_raw, relative, push: acceleration of the IMU, of the centre of mass relative to it, and
+            by the foot forces, in base axes [m/s^2].
+        load: the feet's forces by the robot's mass, (feet, 3) [m/s^2].
+        rests: is there a foot that stands firmly?
+        rolling: its angular velocity, else zero [rad/s].
+        rate: the gyro's reading [rad/s].
+    """
+    limit = _LARGEST_ACCELERATION
+    a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
+    if x.age == 0.0:
+        for span in range(2):
+            put(x.mean[span, 0], a)
+            put(x.mean[span, 1], (0.0, 0.0, 0.0))
+            put(x.mean[span, 2], c)
+            for foot in range(len(load)):
+                put(x.load[span, foot], _clipped(vector(load[foot]), limit))
+        x.spread, x.rolling[:], x.doubt[:], x.agreed = 0.0, 0.0, 0.0, 0.0
+        x.was_firm = x.stepped = 0.0
+    brief, long = 1.0 - math.exp(-elapsed / _BRIEF), 1.0 - math.exp(-elapsed / _LONG)
+    x.age += elapsed
+    changes = 0.0
+    for i in range(3):
+        changes += min((a[i] - x.mean[0, 0, i]) ** 2 + (c[i] - x.mean[0, 2, i]) ** 2, 400.0)
+    x.spread += brief * (changes - x.spread)
+    for span in range(2):
+        gain = brief if span == 0 else long
+        for i in range(3):
+            x.mean[span, 0, i] += gain * (a[i] - x.mean[span, 0, i])
+            x.mean[span, 1, i] += gain * (b[i] - x.mean[span, 1, i])
+            x.mean[span, 2, i] += gain * (c[i] - x.mean[span, 2, i])
+            for foot in range(len(load)):
+                reading = min(max(load[foot, i], -limit), limit)
+                x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
+    for i in range(3):
+        x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
+    turned = _norm(subtract(rate, vector(x.last_rate)))
+    rolled = _norm(subtract(rolling, vector(x.last_rolling)))
+    if rests and x.was_firm > 0 and min(turned, rolled) > _RATE_STEP and x.stepped == 0:
+        x.doubt[:], x.doubt[0], x.stepped = 0.0, 1.0, elapsed
+    elif x.stepped > 0:
+        x.stepped += elapsed
+    x.was_firm = 1.0 if rests else 0.0
+    put(x.last_rate, rate)
+    put(x.last_rolling, rolling)
+    z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
+    excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
+    is_late = 0.0 < x.stepped < _PATIENCE
+    turns = _norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
+    turns = turns or (is_late and not rests)
+    if x.age < _LONG:
+        return
+    if not turns and excess < _CONTRADICTION:
+        x.agreed += elapsed
+    else:
+        x.agreed = 0.0
+        if x.doubt.max() == 0:
+            _blame(x, turns)
+    if x.agreed > _AGREED:
+        x.doubt[:], x.stepped = 0.0, 0.0
+    if x.doubt.max() == 0:
+        x.habit_age += elapsed
+        gain = elapsed / min(_HABIT_TIME, x.habit_age)
+        for i in range(3):
+            x.habit[i] += gain * (z[i] - x.habit[i])
+
+
+@njit(cache=True)
+def _blame(x: np.ndarray, turns: bool) -> None:
+    """Sets who is doubted: the IMU, or the feet whose forces changed most."""
+    change = np.zeros(4)
+    for k in range(3):
+        change[k] = _norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
+    if turns or change[0] + change[1] > change[2]:
+        x.doubt[0] = 1.0
+        return
+    feet, largest = len(x.doubt) - 1, 0.0
+    for foot in range(feet):
+        moved = _norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
+        x.doubt[1 + foot] = moved
+        largest = max(largest, moved)
+    for foot in range(feet):
+        x.doubt[1 + foot] = 1.0 if x.doubt[1 + foot] >= 0.5 * largest else 0.0
+
+
+@njit(cache=True)
+def _rolling(
+    stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray
+) -> tuple[bool, Vector]:
+    """Angular velocity of the standing foot that carries most, in base axes [rad/s].
+
+    Returns:
+        Does it carry enough to stand firmly? If not, the velocity is zero.
+    """
+    best = -1
+    for foot in range(len(stands)):
+        if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
+            best = foot
+    if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
+        return False, (0.0, 0.0, 0.0)
+    J, w_F = model.foot_jacobian[best], (0.0, 0.0, 0.0)
+    for j in range(6, J.shape[1]):
+        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
+    return True, add(w, rotate(rotation(model.foot_rotation[best]), w_F))
+
+
+@njit(cache=True)
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
-    """The first posterior: upright by the accelerometer, looking ahead, on its soles' place."""
+    """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
+    to be."""
     sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
@@ -567,25 +728,27 @@ def _estimate_base(
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
     f_raw = rotate(R_BI, vector(measured.specific_force))
+    wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
+    weight = known.mass * 9.81
+    w = subtract(w_raw, vector(x.gyro_bias_B))
+    rests, rolling = _rolling(x.foot_standing, wrench, weight, w, model)
     if first:
         _start(x, measured, model, known)
     else:
-        w, f = (
-            subtract(w_raw, vector(x.gyro_bias_B)),
-            subtract(f_raw, vector(x.accelerometer_bias_B)),
-        )
+        f = subtract(f_raw, vector(x.accelerometer_bias_B))
         rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
         if trust[1] > 0:
-            w, f = (
-                (0.0, 0.0, 0.0),
-                rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity))),
-            )
+            f = rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
             rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
+            if rests and trust[0] == 0 and trust[2:].max() == 0:
+                w, rate_noise = subtract(w, rolling), _FOOT_RATE_ERROR
+            else:
+                w = (0.0, 0.0, 0.0)
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
         _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
     R = rotation(x.rotation)
-    wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
-    weight, force, carried = known.mass * 9.81, (0.0, 0.0, 0.0), 0.0
+    force, carried = (0.0, 0.0, 0.0), 0.0
+    load_by_mass = np.empty((feet, 3))
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
@@ -603,19 +766,78 @@ def _estimate_base(
             _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
-        force = add(force, rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load)))
+        foot_force = rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load))
+        force = add(force, foot_force)
+        put(load_by_mass[foot], scale(1.0 / known.mass, foot_force))
         carried += load
     # Velocity of the centre of mass relative to the IMU.
     w = subtract(w_raw, vector(x.gyro_bias_B))
     away = subtract(vector(model.com_velocity), cross(w, p_BI))
     was_known = last.away_known > 0 and not first
+    is_fresh = trust[0] == 0
+    for sensor in range(1, len(trust)):
+        is_fresh = is_fresh and (trust[sensor] == 0 or trust[sensor] == _IMPLAUSIBLE)
+    if was_known and is_fresh:
+        relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
+        relative = add(relative, cross(w, away))
+        push = scale(1.0 / known.mass, force)
+        _cross_check(x.check, f_raw, relative, push, load_by_mass, rests, rolling, w, elapsed)
+    elif not is_fresh:
+        x.check.age = 0.0
+        x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
         _listen_to_forces(x, P, correction, force, f_raw, w, away, before, elapsed, known)
     put(x.away, away)
-    x.away_known = 1.0 if trust[0] == 0 and trust[1] == 0 else 0.0
+    x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
+    _leash_biases(x, first, elapsed, known.config)
+    _remember_biases(x, trust, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
+
+
+@njit(cache=True)
+def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray) -> None:
+    """Keeps the IMU's biases where they can be by what was known of them."""
+    leash, P = x.leash, x.error_covariance
+    x.leashed_for = 0.0 if first else x.leashed_for + elapsed
+    if first or x.leashed_for > _LEASH_TIME:
+        x.leashed_for = 0.0
+        leash[0] = leash[1]
+        for i in range(3):
+            leash[1, 0, i], leash[1, 1, i] = x.gyro_bias_B[i], x.accelerometer_bias_B[i]
+            for sensor in range(2):
+                at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
+                walk = config.gyro_walk if sensor == 0 else config.accelerometer_walk
+                least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
+                leash[1, 2 + sensor, i] = math.sqrt(max(P[at, at], least**2))
+        if first:
+            leash[0] = leash[1]
+    for sensor in range(2):
+        bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
+        for i in range(3):
+            middle, reach = leash[0, sensor, i], _LEASH * leash[0, 2 + sensor, i]
+            bias[i] = min(max(bias[i], middle - reach), middle + reach)
+
+
+@njit(cache=True)
+def _remember_biases(x: np.ndarray, trust: np.ndarray, first: bool, elapsed: float) -> None:
+    """While a sensor is not trusted the IMU's biases are those from before it began to fail."""
+    kept = x.kept_biases
+    if first:
+        for age in range(2):
+            kept[age, 0], kept[age, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+        x.kept_for = 0.0
+    elif trust.max() > 0 or x.check.doubt.max() > 0:
+        kept[1] = kept[0]
+        x.gyro_bias_B[:], x.accelerometer_bias_B[:] = kept[0, 0], kept[0, 1]
+        x.kept_for = 0.0
+    else:
+        x.kept_for += elapsed
+        if x.kept_for > _MEMORY:
+            kept[0] = kept[1]
+            kept[1, 0], kept[1, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+            x.kept_for = 0.0
 
 
 @njit(cache=True)
@@ -686,9 +908,11 @@ class InvariantBaseFilter(RecursiveEstimator):
         - posterior
         - (one for each field)
         - last_angular_velocity_bias
+        - last_doubt
 
-    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias` (3,)
-    [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
+    (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the
+    IMU and the feet that contradict the rest. World axes unless said. Yaw and place are those of the
     start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
@@ -713,6 +937,17 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance is the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
+        check                  what `_cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
+                               feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
+                               50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
+                               contradicts; `last_rate`, `last_rolling` (3,) and `was_firm` of
+                               the tick before; `stepped`, `age`, `habit_age` and `agreed`, for how
+                               long the gyro is doubted for its step, all is watched, the habit is
+                               learned, and nothing contradicts [s]
+        kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
+                               base axes, and the newer's age [s]
+        leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
+                               and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
                                        axes [m/s], and whether it was measured
     """
@@ -751,6 +986,14 @@ class InvariantBaseFilter(RecursiveEstimator):
         self.DeclareVectorOutputPort(
             "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
         )
+
+        feet = len(robot.description.sides)
+        state = {self.xd_ticket()}
+        self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, state)
+
+    def _calc_last_doubt(self, context: Context, output: BasicVector) -> None:
+        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        output.SetFromVector(last["check"]["doubt"])
 
     def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)
@@ -804,4 +1047,23 @@ def base_filter_type(robot: Robot) -> np.dtype:
         foot_innovation=(feet, _TOLD, 3),
         foot_innovation_variance=(feet, _TOLD),
         error_covariance=(n, n),
+        kept_biases=(2, 2, 3),
+        kept_for=(),
+        leash=(2, 4, 3),
+        leashed_for=(),
+        check=record_type(
+            doubt=(1 + feet,),
+            mean=(2, 3, 3),
+            load=(2, feet, 3),
+            rolling=(3,),
+            habit=(3,),
+            last_rate=(3,),
+            last_rolling=(3,),
+            was_firm=(),
+            stepped=(),
+            spread=(),
+            age=(),
+            habit_age=(),
+            agreed=(),
+        ),
     )

@@ -195,9 +195,10 @@ class EstimatorDiagram(Diagram):
             raise InputError(
                 "estimator: needs a robot with a floating base and feet (no gantry_height)"
             )
-        self._add_monitor(config.sensor_monitor, config.support, robot, clock)
-        measurements = self._type("sensor_monitor")
         invariant = isinstance(config.base_state, InvariantFilter)
+        monitor = (config.sensor_monitor, config.support)
+        self._add_monitor(*monitor, robot, clock, hears_doubt=invariant)
+        measurements = self._type("sensor_monitor")
         model = self._add(
             "model", FloatingBaseModel(robot, measurements, clock, knows_bias=invariant)
         )
@@ -230,6 +231,8 @@ class EstimatorDiagram(Diagram):
         self._join(base, measurements="sensor_monitor", model="model")
         bias = base.GetOutputPort("last_angular_velocity_bias")
         self._builder.Connect(bias, self._systems["model"].GetInputPort("angular_velocity_bias"))
+        doubt = base.GetOutputPort("last_doubt")
+        self._builder.Connect(doubt, self._systems["sensor_monitor"].GetInputPort("doubt"))
 
     def _add_base_in_stages(
         self, config: Fbse, robot: Robot, clock: Clock, origin: tuple[float, float]
@@ -251,12 +254,16 @@ class EstimatorDiagram(Diagram):
         self._join(base_state, measurements="sensor_monitor", attitude="attitude", model="model")
 
     def _add_monitor(
-        self, config: SensorMonitorConfig, support: SupportConfig, robot: Robot, clock: Clock
+        self,
+        config: SensorMonitorConfig,
+        support: SupportConfig,
+        robot: Robot,
+        clock: Clock,
+        *,
+        hears_doubt: bool = False,
     ) -> None:
-        counted = bool(self._sensors.joint_velocity_counted)
-        monitor = self._add(
-            "sensor_monitor", SensorMonitor(config, support, robot, clock, counted=counted)
-        )
+        watch = (config, support, robot, clock, self._sensors)
+        monitor = self._add("sensor_monitor", SensorMonitor(*watch, hears_doubt=hears_doubt))
         joints, pads = len(robot.joint_names), len(FootPads(robot).foot)
         sizes = {
             "measured_joint_state": 2 * joints,

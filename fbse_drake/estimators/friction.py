@@ -100,6 +100,10 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 # For how long innovations must agree to be no noise [s], and how much larger than noise leaves it
 # their mean square must be then.
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# An innovation counts as little as makes it just likely beyond so many standard deviations, ...
+_GATE = 5.0
+# ... and what the model does not explain, or a tick adds to it, is not known for so long [s].
+_DOUBT_TIME = 0.1
 # How long it takes to learn that the sensors are noisier than believed [s], and how much of that
 # one tick may tell.
 _NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
@@ -159,11 +163,7 @@ class FrictionRegressor:
 
 
 def recursive_least_squares(
-    parameters: np.ndarray,
-    P: np.ndarray,
-    phi: np.ndarray,
-    measured: np.ndarray,
-    forgetting: float,
+    parameters: np.ndarray, P: np.ndarray, phi: np.ndarray, measured: np.ndarray, forgetting: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One tick of (64)-(67) for n joints at once.
 
@@ -275,11 +275,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         self._config = config
 
     def _tick(
-        self,
-        context: Context,
-        last: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         config = self._config
@@ -313,11 +309,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
             forgets = config.forgetting != 1
             forgetting = config.forgetting ** (elapsed / 1e-3) if forgets else 1.0
             new, P_new, innovation, S = recursive_least_squares(
-                parameters,
-                P,
-                phi,
-                residual,
-                forgetting,
+                parameters, P, phi, residual, forgetting
             )
             parameters[valid], P[valid] = new[valid], P_new[valid]
             posterior["innovation"], posterior["innovation_variance"] = innovation * valid, S
@@ -327,11 +319,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
 
 @njit(cache=True)
 def smooth_velocity(
-    posterior: np.ndarray,
-    last: np.ndarray,
-    measured: np.ndarray,
-    elapsed: float,
-    time: float,
+    posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
 ) -> None:
     """Low-pass of first order over joint velocities.
 
@@ -376,7 +364,7 @@ def _estimate_friction(
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
-    keep = math.exp(-elapsed / _AGREEMENT_TIME)
+    keep, keep_doubt = math.exp(-elapsed / _AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / _NOISE_TIME)
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
@@ -418,14 +406,19 @@ def _estimate_friction(
         S = column[0] + noise * link.impulse_variance[joint]
         impulse = innovation
         if valid:
+            likely = min(1.0, _GATE * math.sqrt(S) / max(abs(innovation), 1e-300))
+            S_gate = S / likely**2
+            # From what it cannot explain the model learns nothing, the disturbance all.
+            learns = count * last.agreement[joint] ** 2 <= _GATE**2 * S
             for i in range(size):
-                gain = column[i] / S
+                gain, is_weight = column[i] / S_gate, 0 < i <= m
                 if i == 0:
                     impulse -= gain * innovation
-                else:
+                elif learns or not is_weight:
                     x[i - 1] += gain * innovation
                 for k in range(size):
-                    P[i, k] -= gain * column[k]
+                    if learns or not (is_weight and 0 < k <= m):
+                        P[i, k] -= gain * column[k]
             # Differences of innovations show the noise, whatever the model is wrong by ...
             change = innovation - last.innovation[joint]
             rough = (
@@ -433,13 +426,14 @@ def _estimate_friction(
             )
             noise = max(1.0, noise * (1.0 + learning * (rough - 1.0)))
             # ... and their mean what the model is wrong by, beyond the noise.
-            agreement = keep * last.agreement[joint] + (1.0 - keep) * innovation
+            agreement = keep * last.agreement[joint] + (1.0 - keep) * likely * innovation
             posterior.agreement[joint] = agreement
             if count * agreement * agreement > _AGREEMENT * S:
                 unexplained = column[0] / S * agreement / elapsed
                 P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
         else:
             # A joint that is not measured is left to its model.
+            P[size - 1, size - 1] += x[m] ** 2
             x[m] = impulse = posterior.agreement[joint] = 0.0
             P[0, :] = 0.0
             P[:, 0] = 0.0
@@ -454,7 +448,9 @@ def _estimate_friction(
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
-        posterior.friction_std[joint] = math.sqrt(max(0.0, variance))
+        doubt = max(abs(x[m]), keep_doubt * last.doubt[joint])
+        posterior.doubt[joint] = doubt
+        posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt**2)
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
         posterior.innovation[joint] = innovation if valid else 0.0
         posterior.innovation_variance[joint] = S
@@ -480,7 +476,7 @@ class ModelAidedEstimator(FrictionEstimator):
     [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
     shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
     the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
-    the running mean of the innovation [Nm s].
+    the running mean of the innovation [Nm s]; `doubt` (n,) the largest disturbance of late [Nm].
     """
 
     def __init__(
@@ -494,7 +490,7 @@ class ModelAidedEstimator(FrictionEstimator):
         n = len(robot.joint_names)
         regressor = FrictionRegressor.of(config.model, robot, config.factors)
         further = ("disturbance", "impulse", "velocity", "last_velocity", "friction_std")
-        further += ("noise", "agreement")
+        further += ("noise", "agreement", "doubt")
         shapes = dict.fromkeys(further, (n,))
         shapes["weights"] = (n, regressor.weights)
         super().__init__(
@@ -505,11 +501,7 @@ class ModelAidedEstimator(FrictionEstimator):
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
     def _tick(
-        self,
-        context: Context,
-        last: np.ndarray,
-        elapsed: float,
-        posterior: np.ndarray,
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         measured, link_torque = self._measurements.Eval(context), self._link.Eval(context)
         if math.isnan(elapsed):

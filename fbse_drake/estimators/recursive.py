@@ -22,6 +22,8 @@ class Status(IntEnum):
     STUCK = 2
     # A foot's sensors do not show the load that the foot must carry.
     LOST = 3
+    # A sensor contradicts itself or the others.
+    IMPLAUSIBLE = 4
 
 
 @dataclass(frozen=True)

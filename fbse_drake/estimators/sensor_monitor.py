@@ -1,7 +1,8 @@
 """Watches the raw sensors.
 
 So the estimators behind it never see what is not a number, and know whom to trust and which feet
-stand.
+stand. A joint's angle and velocity are measured twice over: one is the other's integral. Where they
+contradict each other, the one that jumped is had from the other.
 """
 
 import math
@@ -11,7 +12,8 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import InputError, require_positive
+from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import vector
@@ -26,6 +28,27 @@ from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
 _OK, _NOT_FINITE = float(Status.OK), float(Status.NOT_FINITE)
 _STUCK, _LOST = float(Status.STUCK), float(Status.LOST)
+_IMPLAUSIBLE = float(Status.IMPLAUSIBLE)
+# What is doubted of a joint: its angle, which jumped; its velocity, or nobody knows which; both.
+_ANGLE, _VELOCITY, _BOTH = 1.0, 2.0, 3.0
+# The fastest that a trunk's acceleration [m/s^3] and rate [rad/s^2] change, impacts included.
+_LARGEST_JERK, _LARGEST_ROTATION = 2.0e4, 200.0
+# Over how long a joint's velocity is compared with its angle [s].
+_PAIR_TIME = 0.02
+# Standard deviations that no honest reading is off by: once in 5e8.
+_GATE = 6.0
+# By how much the noise of angles may be larger than believed until it is known, as variance; how
+# long it takes to learn it [s], and how much of that one tick may tell.
+_ROUGHEST, _ROUGHNESS_TIME, _LARGEST_SHARE = 25.0, 0.3, 9.0
+# A doubted angle is believed again when it is for so long [s] where the velocity says ...
+_RETURNED = 0.01
+# ... give or take this share of its way, ...
+_GAIN_ERROR = 2e-3
+# ... (a mismatch counts for so many times its tolerance at most) ...
+_MOST = 5.0
+# ... or for so long [s] in accord with the velocity: had it only jumped, had it been wrong in other
+# ways, too, had both jumped; other joints are believed after the last of them.
+_ADOPTED, _MENDED, _BOTH_MENDED, _AGREED = 0.3, 0.1, 0.3, 0.02
 
 
 @dataclass(frozen=True)
@@ -40,9 +63,12 @@ class SensorMonitorConfig:
     # ... for longer than this [s]; those that show no load are lost. A foot that is believed for a
     # hundredth of a second more makes 80 Nm of friction out of the weight that it does not show.
     lost_after: float = 0.5e-3
+    # How late a joint's velocity may be against its angle, or early [s].
+    velocity_delay: float = 1.0e-3
 
     def __post_init__(self) -> None:
         require_positive(self, "stuck_after", "lost_after")
+        require_not_negative(self, "velocity_delay")
         if not 0 <= self.smallest_load_share < 1:
             found = f"{self.smallest_load_share:g}"
             raise InputError(f"smallest_load_share: expected a number in [0, 1), found {found}")
@@ -91,17 +117,150 @@ def _watch_channels(
     return status
 
 
+def _joint_watch(n: int) -> np.dtype:
+    """Type of what `SensorMonitor` remembers of each joint, see there."""
+    fields = ("angle", "velocity", "is_pair", "step", "mismatch", "slow_velocity", "slow_rate")
+    fields += ("roughness", "doubt", "agreed", "is_mixed", "returned", "allowance", "other")
+    return record_type(**dict.fromkeys(fields, (n,)))
+
+
+@njit(cache=True)
+def _watch_joints(
+    posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray
+) -> bool:
+    """Compares angles with velocities; where they are doubted, replaces them in the posterior.
+
+    An angle's step less the velocity's integral is noise. Summed up over `_PAIR_TIME` it shows an
+    angle that jumps at once, and a wrong velocity, or an angle that is stuck or late, as soon as it
+    makes a difference. `velocity_delay` is forgiven.
+
+    Returns:
+        Is a joint doubted?
+    """
+    x, was, T = posterior.joint, last.joint, elapsed
+    is_first, beliefs, found = math.isnan(T), known.beliefs, False
+    keep, learning = math.exp(-T / _PAIR_TIME), 1.0 - math.exp(-T / _ROUGHNESS_TIME)
+    # Of an angle's step, and of the sum. Nothing is more exact than the velocity's noise.
+    rate_variance = (T * beliefs.joint_velocity_noise) ** 2 / 2.0
+    step_variance = 2.0 * beliefs.joint_position_noise**2 + rate_variance
+    variance = 1.25 * beliefs.joint_position_noise**2 + rate_variance * _PAIR_TIME / T
+    for i in range(len(x.angle)):
+        q, v = sensors.joint_position[i], sensors.joint_velocity[i]
+        has_angle, has_velocity = math.isfinite(q), math.isfinite(v)
+        is_stuck = v != 0 and posterior.unchanged.joint_velocity[i] > known.limits.stuck_after
+        x.is_pair[i] = 1.0 if has_angle and has_velocity and not is_stuck else 0.0
+        x.angle[i] = q if has_angle else was.angle[i]
+        x.velocity[i] = v if has_velocity else was.velocity[i]
+        doubt = 0.0 if is_first else was.doubt[i]
+        if is_first or x.is_pair[i] == 0 or was.is_pair[i] == 0:
+            # There is no step to look at.
+            _pause(x, was, i, is_first)
+            if not is_first:
+                if doubt in (_ANGLE, _BOTH) or not has_angle:
+                    predicted = last.joint_position[i] + T * last.joint_velocity[i]
+                    posterior.joint_position[i] = predicted
+                if doubt in (_VELOCITY, _BOTH):
+                    posterior.joint_velocity[i] = last.joint_velocity[i]
+            found = found or doubt > 0
+            continue
+        way = 0.5 * T * (v + was.velocity[i])
+        jump = q - was.angle[i] - way
+        step = max(abs(v - was.velocity[i]), keep * was.step[i])
+        slow = keep * was.slow_velocity[i] + (1.0 - keep) * v
+        mismatch, rough = keep * was.mismatch[i] + jump, math.sqrt(was.roughness[i])
+        slack = known.limits.velocity_delay * abs(v - slow)
+        tolerance = _GATE * rough * math.sqrt(variance) + slack
+        agrees = abs(mismatch) < tolerance
+        least_jump = _GATE * rough * math.sqrt(step_variance)
+        # Nor does an angle jump that a velocity which has just jumped is wrong about.
+        jumps = abs(jump) > least_jump + 1.5 * T * step
+        x.other[i] = was.other[i] + way
+        late = known.limits.velocity_delay * abs(v - was.velocity[i])
+        x.allowance[i] = was.allowance[i] + _GAIN_ERROR * abs(way) + late
+        x.agreed[i] = was.agreed[i] + T if agrees else 0.0
+        x.returned[i], x.is_mixed[i] = 0.0, was.is_mixed[i]
+        if doubt == 0 and (jumps or not agrees):
+            if jumps and abs(q - x.other[i]) < x.allowance[i]:
+                mismatch = 0.0  # Back where it came from.
+            else:
+                doubt = _VELOCITY
+                if jumps:
+                    doubt = _BOTH if T * step > least_jump else _ANGLE
+                    mismatch = 0.0
+                    x.other[i], x.allowance[i] = last.joint_position[i] + way, tolerance
+                x.agreed[i] = x.is_mixed[i] = 0.0
+        elif doubt > 0 and jumps:
+            mismatch = 0.0
+        if doubt == _ANGLE:
+            if not agrees and not jumps:
+                x.is_mixed[i] = 1.0
+            if abs(q - x.other[i]) < x.allowance[i] + tolerance:
+                x.returned[i] = was.returned[i] + T
+            patience = _MENDED if x.is_mixed[i] > 0 else _ADOPTED
+            if x.returned[i] > _RETURNED or x.agreed[i] > patience:
+                doubt = 0.0
+        elif doubt == _BOTH:
+            if abs(q - x.other[i]) < x.allowance[i] + tolerance:
+                x.returned[i] = was.returned[i] + T
+            if x.returned[i] > _RETURNED or x.agreed[i] > _BOTH_MENDED:
+                doubt = 0.0
+        elif doubt == _VELOCITY and x.agreed[i] > _AGREED:
+            doubt = 0.0
+        if doubt == 0:
+            if abs(q - x.other[i]) < x.allowance[i] + least_jump:
+                x.other[i], x.allowance[i] = q, 0.0
+            share = min(_LARGEST_SHARE, jump * jump / (step_variance * was.roughness[i]))
+            x.roughness[i] = max(1.0, was.roughness[i] * (1.0 + learning * (share - 1.0)))
+        else:
+            x.roughness[i] = was.roughness[i]
+        # What jumped is not what the joint does.
+        rate = v if jumps else (q - was.angle[i]) / T
+        x.slow_rate[i] = 0.5 * (1.0 + keep) * was.slow_rate[i] + 0.5 * (1.0 - keep) * rate
+        if doubt > 0:  # So that it is soon forgotten.
+            mismatch = min(max(mismatch, -_MOST * tolerance), _MOST * tolerance)
+        x.mismatch[i], x.slow_velocity[i], x.step[i], x.doubt[i] = mismatch, slow, step, doubt
+        if doubt == _ANGLE:
+            posterior.joint_position[i] = x.other[i]
+        elif doubt == _VELOCITY:
+            posterior.joint_velocity[i] = x.slow_rate[i]
+        elif doubt == _BOTH:
+            posterior.joint_velocity[i] = last.joint_velocity[i]
+            x.other[i] = posterior.joint_position[i] = last.joint_position[i]
+        found = found or doubt > 0
+    return found
+
+
+@njit(cache=True)
+def _pause(x: np.ndarray, was: np.ndarray, i: int, is_first: bool) -> None:
+    """What is remembered of a joint in a tick that has no step of both angle and velocity."""
+    x.mismatch[i] = x.step[i] = x.agreed[i] = x.returned[i] = 0.0
+    x.slow_velocity[i] = x.slow_rate[i] = x.velocity[i]
+    x.roughness[i] = _ROUGHEST if is_first else was.roughness[i]
+    # Without the velocity nobody knows where the angle has gone.
+    is_lost = x.is_pair[i] == 0 and was.doubt[i] > 0
+    x.doubt[i] = 0.0 if is_first else (_VELOCITY if is_lost else was.doubt[i])
+    x.is_mixed[i] = 0.0 if is_first else was.is_mixed[i]
+    x.allowance[i] = 0.0 if is_first else was.allowance[i]
+    x.other[i] = x.angle[i] if is_first else was.other[i]
+
+
 @njit(cache=True)
 def _watch_sensors(
-    posterior: np.ndarray, last: np.ndarray, elapsed: float, sensors: np.ndarray, known: np.ndarray
+    posterior: np.ndarray,
+    last: np.ndarray,
+    elapsed: float,
+    sensors: np.ndarray,
+    doubt: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """One tick of `SensorMonitor`; fills the posterior.
 
     Args:
         sensors: their readings, see `SensorMonitor`.
-        known: record with the values of `SensorMonitorConfig`; the mass that the feet carry [kg], 0
-            where they need not; which foot each pad belongs to; the thresholds of `detect_support`;
-            whether joint velocities are `counted`.
+        doubt: of IMU and feet, see there, (1 + feet,).
+        known: record with the values of `SensorMonitorConfig` as `limits` and of `SensorBeliefs` as
+            `beliefs`; the mass that the feet carry [kg], 0 where they need not; which foot each pad
+            belongs to; the thresholds of `detect_support`; whether joint velocities are `counted`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
@@ -123,11 +282,13 @@ def _watch_sensors(
         posterior.joint_velocity,
         idle.joint_velocity,
         sensors.joint_velocity,
-        last.joint_velocity,
+        last.joint.velocity,
         was_idle.joint_velocity,
         elapsed,
         math.inf if known.counted else after,
     )
+    if _watch_joints(posterior, last, elapsed, sensors, known) and trust[0] == _OK:
+        trust[0] = _IMPLAUSIBLE
     trust[1] = _watch_channels(
         trust[1],
         posterior.specific_force,
@@ -148,6 +309,13 @@ def _watch_sensors(
         elapsed,
         after,
     )
+    for i in range(3):
+        jerk = abs(posterior.specific_force[i] - last.specific_force[i])
+        turn = abs(posterior.angular_velocity[i] - last.angular_velocity[i])
+        # The first tick has no elapsed time, and passes.
+        leaps = jerk > _LARGEST_JERK * elapsed or turn > _LARGEST_ROTATION * elapsed
+        if leaps and trust[1] == _OK:
+            trust[1] = _IMPLAUSIBLE
     for pad in range(len(known.pad_foot)):
         sensor = 2 + known.pad_foot[pad]
         trust[sensor] = _watch_channels(
@@ -160,12 +328,16 @@ def _watch_sensors(
             elapsed,
             after,
         )
+    for sensor in range(1, len(trust)):
+        if trust[sensor] == _OK and doubt[sensor - 1] != 0:
+            trust[sensor] = _IMPLAUSIBLE
     light, load = 0.0, vertical_loads(posterior.pad_force, known.pad_foot, feet)
     if known.weighed_mass > 0 and not math.isnan(elapsed):
         # What the feet must carry together: mass times specific force, or gravity where the IMU
         # says nothing.
         fx, fy, fz = vector(posterior.specific_force)
-        weight = known.weighed_mass * max(5.0, math.sqrt(fx * fx + fy * fy + fz * fz))
+        force = math.sqrt(fx * fx + fy * fy + fz * fz) if trust[1] == _OK else 9.81
+        weight = known.weighed_mass * max(5.0, force)
         if load.sum() < known.limits.smallest_load_share * weight:
             light = last.light + elapsed
         if light > known.limits.lost_after:
@@ -195,13 +367,16 @@ class SensorMonitor(RecursiveEstimator):
         input_ports:
         - sensors
         - planned_support
+        - doubt
         output_ports:
         - posterior
         - (one for each field)
 
     `sensors` holds what is read, side by side: `joint_position` (n,), `joint_velocity` (n,),
     `specific_force` (3,), `angular_velocity` (3,), `pad_force` (P, 3). `planned_support` (feet,) is
-    there for `PlannedSupport` only; a foot stands where it is positive. Fields of the posterior:
+    there for `PlannedSupport` only; a foot stands where it is positive. `doubt` (1 + feet,) is
+    there where somebody knows better: positive for the IMU and the feet that contradict the rest.
+    Fields of the posterior:
 
         trust       (2 + feet,)  status of joints, IMU and every foot
         ...                      the readings, the last good one where there is none now
@@ -209,6 +384,18 @@ class SensorMonitor(RecursiveEstimator):
         light       ()           for how long [s] the feet have shown too little
         support     (feet,)      1 for a foot that stands, else 0
         waiting     (feet,)      see `detect_support`
+        joint                    of each joint, all (n,): `angle` and `velocity` as read; `is_pair`:
+                                 both are numbers; `step`, the largest of the velocity of late
+                                 [rad/s]; `mismatch`, how
+                                 far the angle went beyond the velocity's integral in the last time
+                                 [rad]; `slow_velocity`, `slow_rate`, means of velocity and of the
+                                 angle's rate [rad/s]; `roughness`, by how much the variance of the
+                                 angle's noise is larger than believed, at least 1; `doubt`: 1 of
+                                 the angle, 2 of the velocity, 3 of both; `agreed`, `returned`, for
+                                 how long [s] they have not contradicted each other, and the angle
+                                 has been where it is expected; `is_mixed`: since it jumped it was
+                                 wrong in other ways, too; `other`, the angle by the velocity from
+                                 before the last jump on, give or take `allowance` [rad]
     """
 
     def __init__(
@@ -217,13 +404,15 @@ class SensorMonitor(RecursiveEstimator):
         support: SupportConfig,
         robot: Robot,
         clock: Clock,
+        beliefs: SensorBeliefs = USUAL_SENSORS,
         *,
-        counted: bool = False,
+        hears_doubt: bool = False,
     ):
         """Declares ports and state.
 
         Args:
-            counted: joint velocities are differences of counted angles.
+            beliefs: noise of the sensors; of good sensors by default.
+            hears_doubt: has an input `doubt`.
         """
         readings = _readings(robot)
         sensors = record_type(**readings)
@@ -238,12 +427,16 @@ class SensorMonitor(RecursiveEstimator):
             light=(),
             support=feet,
             waiting=feet,
+            joint=_joint_watch(len(robot.joint_names)),
         )
         super().__init__(posterior_type, clock)
         self._sensors = self._declare_record_input("sensors", sensors)
         self._planned = None
         if isinstance(support, PlannedSupport):
             self._planned = self.DeclareVectorInputPort("planned_support", len(legs))
+        self._no_doubt, self._doubt = np.zeros(1 + len(legs)), None
+        if hears_doubt:
+            self._doubt = self.DeclareVectorInputPort("doubt", 1 + len(legs))
         inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
         self._declare_posterior(*(port.get_name() for port in inputs))
         checks_load = bool(legs) and robot.has_floating_base
@@ -252,7 +445,8 @@ class SensorMonitor(RecursiveEstimator):
         weight = 9.81 * mass
         self._known = record(
             limits=config,
-            counted=counted,
+            beliefs=beliefs,
+            counted=bool(beliefs.joint_velocity_counted),
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
             thresholds=record(
@@ -263,6 +457,8 @@ class SensorMonitor(RecursiveEstimator):
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
-        _watch_sensors(posterior, last, elapsed, self._sensors.Eval(context), self._known)
+        doubt = self._no_doubt if self._doubt is None else self._doubt.Eval(context)
+        sensors = self._sensors.Eval(context)
+        _watch_sensors(posterior, last, elapsed, sensors, doubt, self._known)
         if self._planned is not None:
             posterior["support"] = self._planned.Eval(context) > 0
