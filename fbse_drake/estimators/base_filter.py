@@ -65,6 +65,9 @@ _GATE = 18.5
 # For how long innovations must agree to be no white noise [s], and how much larger than white noise
 # leaves it their mean square must be.
 _AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
+# A foot does little in spite of all while the robot rests: this share of what it does from this
+# speed of the robot on [m/s].
+_AT_REST, _WALKING_SPEED = 0.1, 0.03
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -213,12 +216,25 @@ def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: 
     _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            _add_noise(P, _FEET + 6 * foot, config.foot_creep**2 * T)
-            _add_noise(P, _FEET + 6 * foot + 3, config.foot_turning**2 * T)
+            turned = _FEET + 6 * foot + 3
+            _add_noise(P, turned - 3, config.foot_creep**2 * T)
+            for i in range(3):
+                share = _unrest(v) if i == 2 else 1.0
+                P[turned + i, turned + i] += (share * config.foot_turning) ** 2 * T
     acceleration = add(rotate(rotation(x.rotation), f), gravity)
     put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
     put(x.imu_velocity, add(v, scale(T, acceleration)))
     _turn(x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w))))
+
+
+@njit(cache=True)
+def _unrest(v: Vector) -> float:
+    """Share of what a standing foot does in spite of all, for it comes of the robot's motion.
+
+    Args:
+        v: velocity of the IMU [m/s].
+    """
+    return min(1.0, max(_AT_REST, math.sqrt(dot(v, v)) / _WALKING_SPEED))
 
 
 @njit(cache=True)
@@ -383,6 +399,7 @@ def _listen_to_foot(
     start, keep = _FEET + 6 * foot, math.exp(-elapsed / _AGREEMENT_TIME)
     # Errors that last for some time, as white noise that leaves as much over many ticks.
     lasting = max(1.0, 2.0 * config.foot_time / elapsed) * max(1.0, _FIRM_LOAD / share) ** 2
+    held = (_unrest(v) ** 2 - 1.0) * lasting
     angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
@@ -399,6 +416,7 @@ def _listen_to_foot(
     seen = quaternion_product(quaternion(x.orientation), q_BF)
     z = rotation_vector(quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot]))))
     noise = _isotropic(config.foot_orientation**2 * lasting + turning * angle)
+    noise[2, 2] += config.foot_orientation**2 * held
     variance[_FOOT_ORIENTATION] = _update(
         P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
         agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
@@ -420,6 +438,7 @@ def _listen_to_foot(
 
     z = add(w, w_BF)
     noise = _isotropic(config.foot_rate**2 * lasting + turning * rate + gyro)
+    noise[2, 2] += config.foot_rate**2 * held
     variance[_FOOT_RATE] = _update(
         P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
         agreement[_FOOT_RATE], innovation[_FOOT_RATE],
