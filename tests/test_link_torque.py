@@ -98,7 +98,7 @@ def test_link_torque_is_drakes_wherever_the_base_is(seed: int):
     command = generator.normal(scale=50, size=12)
     estimator = Rig(link_torques())
     model = BASE.model_of(**readings)
-    estimator.fix(measurements=BASE.measurements(**readings), model_at_step_start=model, joint_acceleration=known)
+    estimator.fix(measurements=BASE.measurements(**readings), model_over_step=model, joint_acceleration=known)
     estimator.tick(torque_command=command)
     # The command of the next tick is not yet in it.
     posterior = estimator.tick(torque_command=np.full(12, 1e6))
@@ -112,15 +112,15 @@ def residual_with(attitude: Rotation, support: list[float], method: str = "fused
     chain, torque = Rig(accelerations(JointAccelerationConfig(method=method))), Rig(link_torques())
     for rig in (chain, torque):
         rig.tick(
-            **{"measurements": BASE.measurements(), "model_at_step_start": pack(BASE.model)},
+            **{"measurements": BASE.measurements(), "model_over_step": pack(BASE.model)},
             **({"attitude": pack(ATTITUDE, rotation=np.eye(3))} if rig is chain else {}),
             **({"joint_acceleration": pack(accelerations()), "torque_command": np.full(12, 3.0)} if rig is torque else {}),
         )
     moving = {"joint_velocity": generator.normal(size=12), "angular_velocity": generator.normal(size=3)}
     model = BASE.model_of(**moving)
     readings = BASE.measurements(**{name: value + 0.01 for name, value in moving.items()}, support=support)
-    known = chain.tick(measurements=readings, model_at_step_start=model, attitude=pack(ATTITUDE, rotation=attitude.as_matrix()))
-    inputs = {"measurements": readings, "model_at_step_start": model}
+    known = chain.tick(measurements=readings, model_over_step=model, attitude=pack(ATTITUDE, rotation=attitude.as_matrix()))
+    inputs = {"measurements": readings, "model_over_step": model}
     return torque.tick(**inputs, joint_acceleration=known)["residual"]
 
 
@@ -143,8 +143,8 @@ def test_joint_accelerations_keep_standing_feet_where_they_are(method: str):
     rig = Rig(accelerations(config))
     attitude = pack(ATTITUDE, rotation=np.eye(3))
     readings = BASE.measurements()
-    rig.tick(measurements=readings, model_at_step_start=pack(BASE.model), attitude=attitude)
-    x = rig.tick(measurements=BASE.measurements(**moving), model_at_step_start=terms)
+    rig.tick(measurements=readings, model_over_step=pack(BASE.model), attitude=attitude)
+    x = rig.tick(measurements=BASE.measurements(**moving), model_over_step=terms)
     names = ("base_angular_acceleration", "base_specific_force", "joint_acceleration")
     a = np.concatenate([x[name] for name in names]) - np.concatenate([np.zeros(3), [0, 0, GRAVITY], np.zeros(12)])
     feet = terms["foot_jacobian"].reshape(12, 18) @ a + terms["foot_bias"].ravel()

@@ -550,11 +550,13 @@ def _estimate_base(
     x.status = trust.max()
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
-    f_raw = rotate(R_BI, vector(measured.specific_force))
+    f_mean = rotate(R_BI, vector(measured.mean.specific_force))
     if first:
         _start(x, measured, model, known)
     else:
-        w, f = subtract(w_raw, vector(x.gyro_bias_B)), subtract(f_raw, vector(x.accelerometer_bias_B))
+        w = rotate(R_BI, vector(measured.mean.angular_velocity))
+        w = subtract(w, vector(x.gyro_bias_B))
+        f = subtract(f_mean, vector(x.accelerometer_bias_B))
         rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
         if trust[1] > 0:
             w, f = (0.0, 0.0, 0.0), rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
@@ -563,6 +565,8 @@ def _estimate_base(
         _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
     R = rotation(x.rotation)
     wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
+    mean_force = measured.mean.pad_force
+    mean_wrench = foot_wrenches(mean_force, known.pads.position, known.pads.foot, feet)
     weight, force, carried = known.mass * 9.81, (0.0, 0.0, 0.0), 0.0
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
@@ -582,7 +586,8 @@ def _estimate_base(
             _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
-        force = add(force, rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load)))
+        x_F, y_F, z_F = mean_wrench[foot, 3], mean_wrench[foot, 4], mean_wrench[foot, 5]
+        force = add(force, rotate(R_BF, (x_F, y_F, z_F)))
         carried += load
     # Velocity of the centre of mass relative to the IMU.
     w = subtract(w_raw, vector(x.gyro_bias_B))
@@ -590,7 +595,7 @@ def _estimate_base(
     was_known = last.away_known > 0 and not first
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
-        _listen_to_forces(x, P, correction, force, f_raw, w, away, before, elapsed, known)
+        _listen_to_forces(x, P, correction, force, f_mean, w, away, before, elapsed, known)
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] == 0 else 0.0
     _correct(x, correction)

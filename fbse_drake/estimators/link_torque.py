@@ -60,7 +60,7 @@ def _estimate_link_torque(
     n, feet, sensitivity = len(torque_command), len(known.smallest_load), acceleration.sensitivity
     v = 6 + n
     posterior.status = trust.max()
-    wrench = foot_wrenches(measured.pad_force, pads.position, pads.foot, feet)
+    wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     a, to_sensors = np.empty(v), np.empty(v)
     a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
     a[6:] = acceleration.joint_acceleration
@@ -114,7 +114,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         name: LinkTorqueEstimator
         input_ports:
         - measurements
-        - model_at_step_start
+        - model_over_step
         - joint_acceleration
         - torque_command
         output_ports:
@@ -173,11 +173,11 @@ class LinkTorqueEstimator(RecursiveEstimator):
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
-        self._model = self._declare_record_input("model_at_step_start", model)
+        self._model = self._declare_record_input("model_over_step", model)
         self._acceleration = self._declare_record_input("joint_acceleration", acceleration)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
         self.DeclareDiscreteState(n)  # the last command
-        self._declare_posterior("measurements", "model_at_step_start", "joint_acceleration")
+        self._declare_posterior("measurements", "model_over_step", "joint_acceleration")
 
     def _tick(
         self,

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status, start_share
 from fbse_drake.estimators.spatial import vector
 from fbse_drake.estimators.support import (
     MeasuredSupport,
@@ -26,6 +26,10 @@ from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
 _OK, _NOT_FINITE = float(Status.OK), float(Status.NOT_FINITE)
 _STUCK, _LOST = float(Status.STUCK), float(Status.LOST)
+
+
+# The readings whose mean over the tick is told.
+_MEANT = ("specific_force", "angular_velocity", "pad_force")
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sens
         sensors: their readings, see `SensorMonitor`.
         known: record with the values of `SensorMonitorConfig`; the mass that the feet carry [kg], 0
             where they need not; which foot each pad belongs to; the thresholds of `detect_support`;
-            whether joint velocities are `counted`.
+            whether joint velocities are `counted`; and how long a `reading` takes, see `Clock`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
@@ -170,6 +174,15 @@ def _watch_sensors(posterior: np.ndarray, last: np.ndarray, elapsed: float, sens
                 if trust[2 + foot] == _OK and load[foot] < 0.02 * weight:
                     trust[2 + foot] = _LOST
     posterior.light = light
+    share = start_share(elapsed, known.reading) if last.status == _OK else 0.0
+    for i in range(3):
+        now, before = posterior.specific_force[i], last.specific_force[i]
+        posterior.mean.specific_force[i] = now + share * (before - now)
+        now, before = posterior.angular_velocity[i], last.angular_velocity[i]
+        posterior.mean.angular_velocity[i] = now + share * (before - now)
+        for pad in range(len(known.pad_foot)):
+            now, before = posterior.pad_force[pad, i], last.pad_force[pad, i]
+            posterior.mean.pad_force[pad, i] = now + share * (before - now)
     posterior.status = trust.max()
     detect_support(
         posterior.support,
@@ -202,6 +215,7 @@ class SensorMonitor(RecursiveEstimator):
 
         trust       (2 + feet,)  status of joints, IMU and every foot
         ...                      the readings, the last good one where there is none now
+        mean                     those of IMU and forces over the tick
         unchanged                for how long [s] each of their channels has repeated itself
         light       ()           for how long [s] the feet have shown too little
         support     (feet,)      1 for a foot that stands, else 0
@@ -231,6 +245,7 @@ class SensorMonitor(RecursiveEstimator):
             status=(),
             trust=(2 + len(legs),),
             **readings,
+            mean=record_type(**{name: readings[name] for name in _MEANT}),
             unchanged=sensors,
             light=(),
             support=feet,
@@ -250,6 +265,7 @@ class SensorMonitor(RecursiveEstimator):
         self._known = record(
             limits=config,
             counted=counted,
+            reading=clock.reading,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
             thresholds=record(on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce),
