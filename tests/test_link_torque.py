@@ -13,31 +13,37 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log, load_scenario
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.estimator import Fbse
 from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator, fuse, minimum_norm
-from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.scenario import RobotConfig
 
 GRAVITY = 9.81
 BASE = Base.of()
 READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
-ATTITUDE = AttitudeEstimator(AttitudeConfig(), BASE.robot, READINGS, MODEL, CLOCK)
+ATTITUDE = AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK)
 PAPER = load_scenario("paper_walk_fbse", "paper_method").estimator
 # What an estimator believes of sensors without errors.
-EXACT = JointAccelerationConfig(acceleration_noise=1e-6, angular_velocity_noise=1e-9, joint_velocity_noise=1e-9)
+EXACT = SensorBeliefs(
+    acceleration_noise=1e-6,
+    angular_velocity_noise=1e-9,
+    joint_velocity_noise=1e-9,
+    force_noise=1e-3,
+)
 Run = Callable[..., Log]
 
 
 def accelerations(config: JointAccelerationConfig | None = None) -> JointAccelerationEstimator:
     config = config or JointAccelerationConfig()
     types = READINGS, ATTITUDE.posterior_type, MODEL
-    return JointAccelerationEstimator(config, BASE.robot, *types, CLOCK)
+    return JointAccelerationEstimator(config, USUAL_SENSORS, BASE.robot, *types, CLOCK)
 
 
 def link_torques() -> LinkTorqueEstimator:
     types = READINGS, MODEL, accelerations().posterior_type
-    return LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, *types, CLOCK)
+    return LinkTorqueEstimator(USUAL_SENSORS, BASE.robot, *types, CLOCK)
 
 
 def test_minimum_norm_is_the_pseudo_inverse():
@@ -171,7 +177,7 @@ def test_residual_is_the_friction_where_sensors_are_exact(run: Run):
     log = part(run("paper_walk", "duration=3", noise=False), 1.6)
     friction = rms(log["truth/joint/friction_torque"])
     walk = scenario("paper_walk", "duration=3", noise=False)
-    fused = residual_error(log, estimated(log, walk, Fbse(joint_acceleration=EXACT, link_torque=LinkTorqueConfig(force_noise=1e-3))))
+    fused = residual_error(log, estimated(log, walk, Fbse(sensors=EXACT)))
     assert friction > 0.2
     assert np.median(fused) < 2e-3
     assert fused.max() < 1e-2

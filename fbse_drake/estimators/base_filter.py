@@ -43,7 +43,6 @@ from fbse_drake.estimators.spatial import (
     skew,
     subtract,
     vector,
-    yaw_of,
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
@@ -187,7 +186,7 @@ def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
 
 
 @njit(cache=True)
-def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known) -> None:
+def _predict(x: np.ndarray, P: np.ndarray, w: Vector, f: Vector, rate_variance: float, T: float, known: np.ndarray) -> None:
     """The step that ends now, in place.
 
     Args:
@@ -497,7 +496,7 @@ def _listen_to_forces(
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
-    config, sensors, P = known.config, known.sensors, x.error_covariance
+    sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
@@ -672,7 +671,8 @@ class InvariantBaseFilter(RecursiveEstimator):
         - last_angular_velocity_bias
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the start, as far as standing feet hold them. Fields of the posterior:
+    (3,) [rad/s] is that of the tick before. World axes unless said. Yaw and place are those of the
+    start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB

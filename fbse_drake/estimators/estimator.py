@@ -50,7 +50,6 @@ from fbse_drake.sensors.foot_pads import FootPads
 from fbse_drake.signals import estimates
 from fbse_drake.walking.plan import TaskPlan
 
-
 BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
 
 

@@ -23,7 +23,6 @@ from fbse_drake.estimators.spatial import (
 )
 from fbse_drake.robot.plant import Robot
 
-
 # For how long innovations must agree to be no noise [s].
 _AGREEMENT_TIME = 0.02
 
