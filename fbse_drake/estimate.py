@@ -14,6 +14,7 @@ from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
 from fbse_drake.walking.plan import TaskPlan
 from fbse_drake.walking.reference import Recorded
@@ -85,10 +86,11 @@ def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.n
 
 
 def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
-    """As `Scenario.believed_sensors`; velocities that the log lacks are differences."""
+    """As `Scenario.believed_sensors`; velocities that the log lacks are differentiated."""
     sensors = scenario.sensors
     if "joint/velocity" not in log:
-        encoders = replace(sensors.encoders, velocity="differenced")
+        noise = differentiated_noise(sensors.encoders.angle_noise, float(log.meta["period"]))
+        encoders = replace(sensors.encoders, velocity="exact", velocity_noise=noise)
         scenario = replace(scenario, sensors=replace(sensors, encoders=encoders))
     return scenario.believed_sensors
 
