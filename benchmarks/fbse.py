@@ -36,23 +36,16 @@ _OFFLINE_SEED = 1000
 _BIASES = (
     "sensors.imu.acceleration_bias=[0.05, -0.05, 0.05]",
     "sensors.imu.angular_velocity_bias=[0.01, -0.01, 0.01]",
-    "estimator.attitude.angular_velocity_bias=0.01",
 )
 _TORQUE_SENSOR = "sensors.joint_torque={noise: 0.3}"
 _UNFILTERED = "compensation=!FeedforwardCompensation {cutoff: 100000}"
-# What limits the estimate of a joint that hardly moves: sensors with a tenth of the noise, and an estimator that knows it.
+# What limits the estimate of a joint that hardly moves: sensors with a tenth of the noise.
 _FINER = (
     "sensors.encoders.resolution=4.8e-6",
     "sensors.encoders.velocity_noise=5.0e-5",
     "sensors.imu.acceleration_noise=0.002",
     "sensors.imu.angular_velocity_noise=1.0e-4",
     "sensors.foot_force.noise=0.05",
-    *(
-        f"estimator.{stage}.{noise}"
-        for stage in ("joint_acceleration", "link_torque")
-        for noise in ("acceleration_noise=0.002", "angular_velocity_noise=1.0e-4", "joint_velocity_noise=5.0e-5")
-    ),
-    "estimator.link_torque.force_noise=0.05",
 )
 # The errors of the robustness table, by what a scenario says of them; the trunk's, see `_model_override`.
 _DISTURBED = {

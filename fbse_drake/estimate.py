@@ -9,10 +9,12 @@ import numpy as np
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Fbse, make_estimator
+from fbse_drake.estimators.recursive import start_share
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
 from fbse_drake.walking.plan import TaskPlan
 from fbse_drake.walking.reference import Recorded
@@ -59,6 +61,9 @@ def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]
         raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
     values = {port: port_values(port, log) for port in ("torque_command", "torque_loss")}
     inputs = {port: value for port, value in values.items() if value is not None}
+    if "torque_command" in inputs:
+        torque = inputs["torque_command"]
+        inputs["torque_command"] = _torque_over_ticks(scenario, log, torque)
     for sensor in scenario.sensors.by_name.values():
         inputs |= sensor.readings(robot, log)
     return inputs
@@ -71,11 +76,27 @@ def _plan(scenario: Scenario, robot: Robot) -> TaskPlan | None:
     return planned_reference(scenario, robot).plan
 
 
+def _reading_time(scenario: Scenario) -> float:
+    """What a log's reading of accelerometer or foot force is the mean over [s]."""
+    return scenario.plant.time_step if scenario.recording.rows == "per_step" else 0.0
+
+
+def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.ndarray:
+    """Mean of the torque commands over the ticks that begin at a log's rows, (N, n) [Nm].
+
+    A log that is slower than the control has only samples of what changed in between.
+    """
+    share = start_share(float(log.meta["period"]), scenario.control.period)
+    after = np.concatenate([torque[1:], torque[-1:]])
+    return torque + share * (after - torque)
+
+
 def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
-    """As `Scenario.believed_sensors`; velocities that the log lacks are differences."""
+    """As `Scenario.believed_sensors`; velocities that the log lacks are differentiated."""
     sensors = scenario.sensors
     if "joint/velocity" not in log:
-        encoders = replace(sensors.encoders, velocity="differenced")
+        noise = differentiated_noise(sensors.encoders.angle_noise, float(log.meta["period"]))
+        encoders = replace(sensors.encoders, velocity="exact", velocity_noise=noise)
         scenario = replace(scenario, sensors=replace(sensors, encoders=encoders))
     return scenario.believed_sensors
 
@@ -94,6 +115,7 @@ class Replay:
             period=float(log.meta["period"]),
             plan=_plan(scenario, robot),
             every_sample=True,
+            reading=_reading_time(scenario),
             sensors=sensors,
             knows_torque=knows_torque,
         )

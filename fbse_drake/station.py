@@ -103,6 +103,7 @@ class Station(Diagram):
             period=scenario.control.period,
             plan=self.reference.plan,
             sensors=scenario.believed_sensors,
+            reading=scenario.plant.time_step,
         )
         ports |= add_estimator(builder, self.estimator, ports)
         add_compensation(builder, scenario, self.robot.description, controller, ports)

@@ -89,7 +89,10 @@ class Base:
         pads = sum(len(leg.pads) for leg in self.robot.description.legs.values())
         standing = np.tile([0.0, 0.0, 87.0 * 9.81 / pads], pads)
         resting = {"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, "support": np.ones(2)}
-        return pack(self.monitor, **{**resting, **values})
+        readings = pack(self.monitor, **{**resting, **values})
+        for name in readings["mean"].dtype.names:
+            readings["mean"][name] = readings[name]
+        return readings
 
     def model_of(self, **values: np.ndarray | float) -> np.ndarray:
         """The posterior of the model for such readings."""

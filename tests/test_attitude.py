@@ -1,6 +1,7 @@
 """Attitude from IMU and feet, against closed forms and textbook filters."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from rig import CLOCK, TICK, Base, Rig, numbers, pack, rms, robot_copy
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.spatial import (
     normalized,
     quaternion_from_gravity,
@@ -27,9 +29,9 @@ IMU_ONLY = {"level_feet": 0.0, "standing_time": 0.0}
 class Attitude(Rig):
     """An AttitudeEstimator on feet that are level when the base is."""
 
-    def __init__(self, base: Base = BASE, **config: float):
+    def __init__(self, base: Base = BASE, sensors: SensorBeliefs = USUAL_SENSORS, **config: float):
         types = base.monitor.posterior_type, base.model.posterior_type
-        super().__init__(AttitudeEstimator(AttitudeConfig(**config), base.robot, *types, CLOCK))
+        super().__init__(AttitudeEstimator(AttitudeConfig(**config), sensors, base.robot, *types, CLOCK))
         self._base = base
         self.fix(model=self.feet(np.eye(3)))
 
@@ -75,18 +77,19 @@ def test_quaternion_helpers_agree_with_scipy():
 
 def test_gravity_filter_is_the_textbook_kalman_filter():
     """Nine states [gravity, acceleration, bias] with full matrices; the estimator has one covariance for all axes."""
-    config = AttitudeConfig(**IMU_ONLY, acceleration_bias=0.05, acceleration_noise=0.1, angular_velocity_noise=2e-3)
-    attitude = Attitude(**IMU_ONLY, acceleration_bias=0.05, acceleration_noise=0.1, angular_velocity_noise=2e-3)
+    sensors = replace(USUAL_SENSORS, acceleration_noise=0.1, angular_velocity_noise=2e-3)
+    config = AttitudeConfig(**IMU_ONLY, acceleration_bias=0.05)
+    attitude = Attitude(sensors=sensors, **IMU_ONLY, acceleration_bias=0.05)
     readings = np.array([0.3, -0.2, 9.8]) + np.random.default_rng(1).normal(scale=0.3, size=(400, 3))
     # A first reading, of which nothing is known but how large its parts may be: P0 H^T (H P0 H^T + R)^-1 y.
     I3, H = np.eye(3), np.hstack([np.eye(3)] * 3)
     P = np.kron(np.diag([GRAVITY**2, config.standing_acceleration**2, config.acceleration_bias**2]), I3)
-    R = config.acceleration_noise**2 * I3
+    R = sensors.acceleration_noise**2 * I3
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     x, P = K @ readings[0], P - K @ H @ P
     fade = math.exp(-TICK / config.motion_time)
     F = np.kron(np.diag([1.0, fade, 1.0]), I3)
-    walk = (GRAVITY * TICK * config.angular_velocity_noise) ** 2
+    walk = (GRAVITY * TICK * sensors.angular_velocity_noise) ** 2
     Q = np.kron(np.diag([walk, (1 - fade**2) * config.motion_acceleration**2, 0.0]), I3)
     attitude.read(readings[0], np.zeros(3))
     for y in readings[1:]:
@@ -115,7 +118,7 @@ def test_quaternion_filter_about_one_axis_is_the_textbook_kalman_filter():
     gyro = rate + 0.015 + generator.normal(scale=1e-3, size=len(time))
     correlated = 2 * config.motion_time / TICK
     F, H = np.array([[1.0, -TICK], [0.0, 1.0]]), np.array([[1.0, 0.0]])
-    Q = np.diag([(TICK * config.angular_velocity_noise) ** 2, 0.0])
+    Q = np.diag([(TICK * USUAL_SENSORS.angular_velocity_noise) ** 2, 0.0])
     x = P = None
     for k in range(len(time)):
         f = GRAVITY * np.array([0, math.sin(truth[k]), math.cos(truth[k])]) + generator.normal(scale=0.02, size=3) * [0, 1, 1]

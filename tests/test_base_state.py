@@ -15,6 +15,7 @@ from fbse_drake import Log, load_scenario
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.base_state import AdaptiveLipm, AdaptiveLipmEstimator, BaseStateEstimator, ContactAided, ContactAidedEstimator
+from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.estimator import Fbse
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
@@ -32,7 +33,7 @@ class BaseState(Rig):
 
     def __init__(self, kind: type[BaseStateEstimator], config: AdaptiveLipm | ContactAided):
         readings, model = BASE.monitor.posterior_type, BASE.model.posterior_type
-        self._attitude = AttitudeEstimator(AttitudeConfig(), BASE.robot, readings, model, CLOCK)
+        self._attitude = AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, readings, model, CLOCK)
         types = readings, self._attitude.posterior_type, model
         super().__init__(kind(config, BASE.robot, *types, CLOCK, (0.0, 0.0)))
         self.turned()

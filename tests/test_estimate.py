@@ -15,6 +15,7 @@ from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sensors.encoders import differentiate
+from fbse_drake.walking.reference import Recorded
 
 Run = Callable[..., Log]
 # The plan, of which the duration is, only says where the feet stand at first.
@@ -134,6 +135,54 @@ def test_refusals(run: Run):
             estimate(scenario_, bad)
         assert message in str(refused.value)
         assert "\n" not in str(refused.value)
+
+
+def test_without_torque_commands_all_but_the_friction(run: Run):
+    """What needs no torques is what it is with them."""
+    log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 400))
+    told, untold = (estimate(WALK, x) for x in (log, without(log, "joint/torque_command")))
+    assert untold.remarks == (*told.remarks, "The friction is not known: the log has no joint/torque_command.")
+    found = estimates(untold.log)
+    assert "estimate/base/velocity" in found
+    assert not [name for name in found if "friction" in name or "torque" in name]
+    for name, values in found.items():
+        np.testing.assert_array_equal(values, told.log[name])
+    observer = dataclasses.replace(WALK, estimator=DisturbanceObserver())
+    with pytest.raises(InputError, match=r"^the log has no channel for .* torque_command \(joint/torque_command\)$"):
+        estimate(observer, without(log, "joint/torque_command"))
+
+
+def test_recorded_motion_starts_at_the_origin(run: Run):
+    log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 100))
+    planned, recorded = (
+        estimate(dataclasses.replace(WALK, reference=reference), log).log["estimate/base/position"]
+        for reference in (WALK.reference, Recorded())
+    )
+    moved = recorded - planned
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-4)
+    assert np.linalg.norm(moved[0]) > 0.01
+
+
+def test_what_is_believed_of_the_sensors():
+    """Stated by the scenario; a noise of zero is a small one; the estimator's own word wins."""
+    believed = WALK.believed_sensors
+    assert believed.joint_position_noise == pytest.approx(4.8e-5 / np.sqrt(12))
+    assert (believed.joint_velocity_noise, believed.acceleration_noise) == (5e-4, 0.02)
+    assert (believed.angular_velocity_noise, believed.force_noise) == (1e-3, 0.5)
+    exact = scenario("paper_walk_fbse", "estimator.sensors.force_noise=3", noise=False).believed_sensors
+    assert exact.force_noise == 3
+    assert exact.acceleration_noise == pytest.approx(0.002)
+    assert not exact.joint_velocity_counted
+    counted = "sensors.encoders={resolution: 0.0015, period: 0.01, velocity: differenced}"
+    coarse = scenario("paper_walk_fbse", counted).believed_sensors
+    assert coarse.joint_velocity_counted
+    assert coarse.joint_velocity_noise == pytest.approx(np.sqrt(2) * 0.0015 / np.sqrt(12) / 0.01)
+
+
+def test_old_places_of_noise_are_refused():
+    for key in ("joint_acceleration.acceleration_noise", "attitude.acceleration_noise", "link_torque"):
+        with pytest.raises(InputError, match="unknown key"):
+            scenario("paper_walk_fbse", f"estimator.{key}=0.1")
 
 
 def test_planned_support_needs_a_plan():

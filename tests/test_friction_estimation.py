@@ -12,6 +12,7 @@ from rig import CLOCK, TICK, Base, Rig, estimated, pack, part, rms
 from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
 from fbse_drake.estimators.friction import (
     ModelAided,
@@ -21,16 +22,17 @@ from fbse_drake.estimators.friction import (
     recursive_least_squares,
 )
 from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
-from fbse_drake.estimators.link_torque import LinkTorqueConfig, LinkTorqueEstimator
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 
 GRAVITY = 9.81
 BASE = Base.of()
 READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
 ACCELERATION = JointAccelerationEstimator(
     JointAccelerationConfig(),
+    USUAL_SENSORS,
     BASE.robot,
     READINGS,
-    AttitudeEstimator(AttitudeConfig(), BASE.robot, READINGS, MODEL, CLOCK).posterior_type,
+    AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK).posterior_type,
     MODEL,
     CLOCK,
 )
@@ -78,7 +80,7 @@ class Friction(Rig):
     def __init__(self, config: RecursiveLeastSquares | ModelAided):
         kind = ModelAidedEstimator if isinstance(config, ModelAided) else RecursiveLeastSquaresEstimator
         types = READINGS, MODEL, ACCELERATION.posterior_type
-        self._link = LinkTorqueEstimator(LinkTorqueConfig(), BASE.robot, *types, CLOCK)
+        self._link = LinkTorqueEstimator(USUAL_SENSORS, BASE.robot, *types, CLOCK)
         super().__init__(kind(config, BASE.robot, READINGS, self._link.posterior_type, CLOCK))
 
     def see(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.evidence import Evidence
@@ -16,6 +17,7 @@ from fbse_drake.discrepancy.study import model_error, study
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.sensor import FootForceGain, FootForceLag, FootForceMisalignment
 from fbse_drake.errors import InputError
+from fbse_drake.estimate import EstimationResult, estimate
 from fbse_drake.interop.convert import read_log
 from fbse_drake.log import Log
 from fbse_drake.resources import folder
@@ -144,3 +146,83 @@ def test_unknown_rows_and_effects_are_refused(scenario: Scenario, log: Log) -> N
         Predictor(load_scenario("real/icub", overrides=["recording.unused_rows=[base/force_w]"]), log)
     residual = Predictor(scenario, log).residual
     assert np.isnan(rms(residual.value, residual.known)[residual.row_index["base/force_y"]])
+
+
+@pytest.fixture(scope="module")
+def estimated(scenario: Scenario, log: Log) -> EstimationResult:
+    return estimate(scenario, log)
+
+
+def own_pose_is_fresh(log: Log) -> np.ndarray:
+    """Rows in which the recording's own pose is neither held for more than 40 ms nor about to jump, (N,) bool.
+
+    Eight times it stands still for a quarter of a second while the gyro shows a turning base.
+    """
+    angles = Rotation.from_quat(log["recorded/base/orientation"], scalar_first=True)
+    step = np.r_[0.0, (angles[:-1].inv() * angles[1:]).magnitude()]
+    held = np.cumsum(step > 0)
+    near_jump = np.convolve(step > np.deg2rad(2), np.ones(9), "same") > 0
+    return (np.bincount(held)[held] <= 4) & ~near_jump
+
+
+def yaw(orientation: Rotation) -> np.ndarray:
+    R = orientation.as_matrix()
+    return np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+
+
+def test_base_pose_is_the_recordings_own(estimated: EstimationResult) -> None:
+    """The own pose is off by 0.9 deg from the robot's own attitude sensor; while it stands by up to
+    1 deg from accelerometer and soles, which agree. So nobody can be much nearer to it."""
+    log = estimated.log
+    found, own = (
+        Rotation.from_quat(log[f"{source}/base/orientation"], scalar_first=True)
+        for source in ("estimate", "recorded")
+    )
+    up, own_up = (rotation.inv().apply([0, 0, 1]) for rotation in (found, own))
+    tilt = np.rad2deg(np.arccos(np.clip((up * own_up).sum(axis=1), -1, 1)))
+    fresh = own_pose_is_fresh(log)
+    assert fresh.mean() > 0.95
+    assert np.sqrt(np.mean(tilt[fresh] ** 2)) < 0.8
+    # Yaw is that of the start.
+    drift = np.rad2deg(yaw(found) - yaw(own))
+    assert np.abs(drift - drift[:100].mean())[fresh].max() < 3.0
+
+
+def test_at_rest_the_tilt_is_that_of_the_accelerometer(estimated: EstimationResult) -> None:
+    """Stretches of some seconds in which the robot stands, long after the start."""
+    log = estimated.log
+    R_BI = Rotation.from_euler("xyz", [-2.09439521059, 0.0, -1.57079632679])
+    found = Rotation.from_quat(log["estimate/base/orientation"], scalar_first=True)
+    seconds = log.time - log.time[0]
+    for start, end in ((16, 20), (32, 37), (54, 60), (71, 75), (85, 88)):
+        rows = np.flatnonzero((seconds >= start) & (seconds < end))
+        up = R_BI.apply(log["imu/linear_acceleration"][rows].mean(axis=0))
+        expected = found[rows].apply(up / np.linalg.norm(up)).mean(axis=0)
+        assert np.rad2deg(np.hypot(*expected[:2])) < 0.6
+
+
+def test_no_joint_is_stuck(estimated: EstimationResult) -> None:
+    status = estimated.log["estimate/sensors/status"]
+    assert (status[:, :2] == 0).all()
+    assert (status[:, 2:] > 0).mean() < 0.01
+
+
+def test_friction_is_not_known_without_torques(estimated: EstimationResult) -> None:
+    log = estimated.log
+    assert not [name for name in log if "friction" in name or "link_torque" in name]
+    for name in ("base/velocity", "base/position", "imu/angular_velocity_bias", "support", "zmp"):
+        assert np.isfinite(log[f"estimate/{name}"]).all()
+    believed, unknown = estimated.remarks
+    assert "gyro 0.007 rad/s" in believed
+    assert unknown == "The friction is not known: the log has no joint/torque_command."
+
+
+def test_friction_comes_with_torques(scenario: Scenario, log: Log) -> None:
+    short = log.part(slice(0, 300))
+    zeros = np.zeros_like(short["joint/position"])
+    told = Log({**short.channels, "joint/torque_command": zeros}, short.meta)
+    result = estimate(scenario, told)
+    assert len(result.remarks) == 1
+    torque = result.log["estimate/joint/friction_torque"]
+    assert torque.shape == (300, 26)
+    assert np.isfinite(torque).all()

@@ -85,6 +85,10 @@ _LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
 _LARGEST_ACCELERATION = 50.0
 # What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
 _FOOT_RATE_ERROR, _FOOT_ACCELERATION_ERROR = 0.05, 0.3
+
+# A foot does little in spite of all while the robot rests: this share of what it does from this
+# speed of the robot on [m/s].
+_AT_REST, _WALKING_SPEED = 0.1, 0.03
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -242,14 +246,27 @@ def _predict(
     _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            _add_noise(P, _FEET + 6 * foot, config.foot_creep**2 * T)
-            _add_noise(P, _FEET + 6 * foot + 3, config.foot_turning**2 * T)
+            turned = _FEET + 6 * foot + 3
+            _add_noise(P, turned - 3, config.foot_creep**2 * T)
+            for i in range(3):
+                share = _unrest(v) if i == 2 else 1.0
+                P[turned + i, turned + i] += (share * config.foot_turning) ** 2 * T
     acceleration = add(rotate(rotation(x.rotation), f), gravity)
     put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
     put(x.imu_velocity, add(v, scale(T, acceleration)))
     _turn(
         x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w)))
     )
+
+
+@njit(cache=True)
+def _unrest(v: Vector) -> float:
+    """Share of what a standing foot does in spite of all, for it comes of the robot's motion.
+
+    Args:
+        v: velocity of the IMU [m/s].
+    """
+    return min(1.0, max(_AT_REST, math.sqrt(dot(v, v)) / _WALKING_SPEED))
 
 
 @njit(cache=True)
@@ -431,6 +448,7 @@ def _listen_to_foot(
     start, keep = _FEET + 6 * foot, math.exp(-elapsed / _AGREEMENT_TIME)
     # Errors that last for some time, as white noise that leaves as much over many ticks.
     lasting = max(1.0, 2.0 * config.foot_time / elapsed) * max(1.0, _FIRM_LOAD / share) ** 2
+    held = (_unrest(v) ** 2 - 1.0) * lasting
     angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
@@ -447,6 +465,7 @@ def _listen_to_foot(
     seen = quaternion_product(quaternion(x.orientation), q_BF)
     z = rotation_vector(quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot]))))
     noise = _isotropic(config.foot_orientation**2 * lasting + turning * angle)
+    noise[2, 2] += config.foot_orientation**2 * held
     variance[_FOOT_ORIENTATION] = _update(
         P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
         agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
@@ -468,6 +487,7 @@ def _listen_to_foot(
 
     z = add(w, w_BF)
     noise = _isotropic(config.foot_rate**2 * lasting + turning * rate + gyro)
+    noise[2, 2] += config.foot_rate**2 * held
     variance[_FOOT_RATE] = _update(
         P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
         agreement[_FOOT_RATE], innovation[_FOOT_RATE],
@@ -727,21 +747,25 @@ def _estimate_base(
     x.status = trust.max()
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
-    f_raw = rotate(R_BI, vector(measured.specific_force))
+    f_mean = rotate(R_BI, vector(measured.mean.specific_force))
     wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
+    mean_force = measured.mean.pad_force
+    mean_wrench = foot_wrenches(mean_force, known.pads.position, known.pads.foot, feet)
     weight = known.mass * 9.81
-    w = subtract(w_raw, vector(x.gyro_bias_B))
-    rests, rolling = _rolling(x.foot_standing, wrench, weight, w, model)
+    w_now = subtract(w_raw, vector(x.gyro_bias_B))
+    rests, rolling = _rolling(x.foot_standing, wrench, weight, w_now, model)
     if first:
         _start(x, measured, model, known)
     else:
-        f = subtract(f_raw, vector(x.accelerometer_bias_B))
+        w = rotate(R_BI, vector(measured.mean.angular_velocity))
+        w = subtract(w, vector(x.gyro_bias_B))
+        f = subtract(f_mean, vector(x.accelerometer_bias_B))
         rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
         if trust[1] > 0:
             f = rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
             rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
             if rests and trust[0] == 0 and trust[2:].max() == 0:
-                w, rate_noise = subtract(w, rolling), _FOOT_RATE_ERROR
+                w, rate_noise = subtract(w_now, rolling), _FOOT_RATE_ERROR
             else:
                 w = (0.0, 0.0, 0.0)
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
@@ -766,7 +790,8 @@ def _estimate_base(
             _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
-        foot_force = rotate(R_BF, (wrench[foot, 3], wrench[foot, 4], load))
+        in_foot = (mean_wrench[foot, 3], mean_wrench[foot, 4], mean_wrench[foot, 5])
+        foot_force = rotate(R_BF, in_foot)
         force = add(force, foot_force)
         put(load_by_mass[foot], scale(1.0 / known.mass, foot_force))
         carried += load
@@ -781,13 +806,13 @@ def _estimate_base(
         relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
-        _cross_check(x.check, f_raw, relative, push, load_by_mass, rests, rolling, w, elapsed)
+        _cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
     elif not is_fresh:
         x.check.age = 0.0
         x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
-        _listen_to_forces(x, P, correction, force, f_raw, w, away, before, elapsed, known)
+        _listen_to_forces(x, P, correction, force, f_mean, w, away, before, elapsed, known)
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)

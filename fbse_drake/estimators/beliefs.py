@@ -81,7 +81,7 @@ _FINEST = 0.1
 
 def beliefs_of(encoders: EncoderConfig, imu: ImuConfig, foot_force: FootForceConfig) -> SensorBeliefs:
     """What a scenario says of its robot's sensors; a noise of zero becomes a small one."""
-    angle = math.hypot(encoders.noise, encoders.resolution / math.sqrt(12.0))
+    angle = encoders.angle_noise
     differenced = encoders.velocity == "differenced"
     rate = math.sqrt(2.0) * angle / encoders.period if differenced else encoders.velocity_noise
     stated = {

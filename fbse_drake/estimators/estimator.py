@@ -156,7 +156,7 @@ class EstimatorDiagram(Diagram):
             JointAccelerationEstimator(config.joint_acceleration, sensors, robot, *kinds, clock),
         )
         self._join(acceleration, measurements="sensor_monitor", attitude="attitude")
-        self._connect_model_at_start(acceleration)
+        self._connect_model(acceleration, "over_step")
         if not self.knows_friction:
             return
         kinds = (measurements, model, self._type("joint_acceleration"))
@@ -164,7 +164,7 @@ class EstimatorDiagram(Diagram):
         self._join(
             link_torque, measurements="sensor_monitor", joint_acceleration="joint_acceleration"
         )
-        self._connect_model_at_start(link_torque)
+        self._connect_model(link_torque, "over_step")
         self._feed(link_torque, "torque_command")
         kind = RecursiveLeastSquaresEstimator
         if isinstance(config.friction, ModelAided):
@@ -186,7 +186,7 @@ class EstimatorDiagram(Diagram):
             base_state="base_state",
             model="model",
         )
-        self._connect_model_at_start(friction)
+        self._connect_model(friction, "at_step_start")
         self._feed(friction, "torque_command")
 
     def _add_base(self, config: Fbse, robot: Robot, clock: Clock, plan: TaskPlan | None) -> None:
@@ -289,11 +289,10 @@ class EstimatorDiagram(Diagram):
                 self._systems[source].GetOutputPort("posterior"), system.GetInputPort(port)
             )
 
-    def _connect_model_at_start(self, system: RecursiveEstimator) -> None:
-        self._builder.Connect(
-            self._systems["model"].GetOutputPort("at_step_start"),
-            system.GetInputPort("model_at_step_start"),
-        )
+    def _connect_model(self, system: RecursiveEstimator, output: str) -> None:
+        """Connects the model where the tick began, `at_step_start`, or `over_step`."""
+        source = self._systems["model"].GetOutputPort(output)
+        self._builder.Connect(source, system.GetInputPort(f"model_{output}"))
 
     def _feed(self, system: RecursiveEstimator, *ports: str) -> None:
         """Makes inputs of the diagram of a system's input ports."""
@@ -336,6 +335,7 @@ def make_estimator(
     period: float,
     plan: TaskPlan | None = None,
     every_sample: bool = False,
+    reading: float | None = None,
     sensors: SensorBeliefs = USUAL_SENSORS,
     knows_torque: bool = True,
 ) -> EstimatorDiagram | None:
@@ -346,6 +346,8 @@ def make_estimator(
         period: tick [s].
         plan: for the planned support, and for where the feet stand at the start.
         every_sample: every evaluation at a later time is a tick, whatever the period; for recorded logs.
+        reading: what a reading of accelerometer or foot force is the mean over [s], 0 for a sample;
+            by default the tick.
         sensors: what is believed of them where the config says nothing.
         knows_torque: the torque commands are known; without them an `Fbse` estimates no friction.
 
@@ -354,7 +356,8 @@ def make_estimator(
     """
     if isinstance(config, NoEstimator):
         return None
-    clock = Clock(period, 1e-9 if every_sample else period * (1 - 1e-6))
+    shortest = 1e-9 if every_sample else period * (1 - 1e-6)
+    clock = Clock(period, shortest, period if reading is None else reading)
     believed = believed_sensors(config, sensors)
     return EstimatorDiagram(config, robot, clock, plan, believed, knows_torque=knows_torque)
 

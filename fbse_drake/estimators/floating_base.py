@@ -15,10 +15,10 @@ from numba import njit
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
-from pydrake.systems.framework import Context, ValueProducer
+from pydrake.systems.framework import BasicVector, Context, ValueProducer
 
-from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.records import as_record, record, record_type, size_of
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
 from fbse_drake.estimators.spatial import (
     Rotation,
     Vector,
@@ -48,11 +48,7 @@ class ImuMount:
 
 @njit(cache=True)
 def base_specific_force(
-    specific_force: Vector,
-    w: Vector,
-    w_dot: Vector,
-    R_BI: Rotation,
-    p_BI: Vector,
+    specific_force: Vector, w: Vector, w_dot: Vector, R_BI: Rotation, p_BI: Vector
 ) -> Vector:
     """Specific force of the base's origin in base axes [m/s^2].
 
@@ -167,13 +163,15 @@ class FloatingBaseModel(RecursiveEstimator):
         - posterior
         - (one for each field)
         - at_step_start
+        - over_step
 
     `measurements` is the posterior of a `SensorMonitor`. `angular_velocity_bias` (3,) [rad/s] of
     the gyro, as it was known a tick ago, is there where somebody estimates it. `posterior` belongs
     to the present tick; `at_step_start` to the tick before, where the step began whose
-    accelerations and forces are measured now. Velocities are ordered [base angular (3), base linear
-    (3), joints (n)] whatever the plant's order. Fields, for n joints, v = 6 + n velocities and f
-    feet, all in base axes but those of a foot, which are in its sole frame F:
+    accelerations and forces are measured now; `over_step` is the mean of both, as far as these are,
+    see `start_share`, with the velocities of the start. Velocities are ordered [base angular (3),
+    base linear (3), joints (n)] whatever the plant's order. Fields, for n joints, v = 6 + n
+    velocities and f feet, all in base axes but those of a foot, which are in its sole frame F:
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
         bias            (n,)       joint rows of C v [Nm]
@@ -235,6 +233,22 @@ class FloatingBaseModel(RecursiveEstimator):
         )
         self._declare_posterior(*inputs)
         self.DeclareStateOutputPort("at_step_start", self._last)
+        size, self._reading = size_of(posterior_type), clock.reading
+        sources = {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs}
+        tickets = sources | {self.time_ticket(), self.xd_ticket()}
+        self.DeclareVectorOutputPort("over_step", size, self._calc_over_step, tickets)
+
+    def _calc_over_step(self, context: Context, output: BasicVector) -> None:
+        start = context.get_discrete_state().value(0)
+        share = start_share(context.get_time() - start.item(0), self._reading)
+        if share == 0.0:
+            output.SetFromVector(start)
+            return
+        output.SetFromVector(start + share * (self._posterior.Eval(context) - start))
+        before, mean = (
+            as_record(x, self.posterior_type) for x in (start, output.get_mutable_value())
+        )
+        mean["velocity"] = before["velocity"]
 
     def _allocate_workspace(self) -> AbstractValue:
         upright = self._robot.base_pose_positions(RigidTransform())
@@ -261,12 +275,7 @@ class FloatingBaseModel(RecursiveEstimator):
                 (
                     plant.CalcJacobianSpatialVelocity(now, wrt, sole, origin, world, sole),
                     plant.CalcBiasSpatialAcceleration(
-                        now,
-                        wrt,
-                        sole,
-                        origin,
-                        world,
-                        sole,
+                        now, wrt, sole, origin, world, sole
                     ).get_coeffs(),
                 )
                 for sole in self._soles

@@ -145,7 +145,7 @@ def measured_acceleration(
     w = rotate(R_BI, vector(measured.angular_velocity))
     w_dot = scale(1.0 / elapsed, subtract(w, vector(last_rate)))
     put(acceleration[:3], w_dot)
-    force = subtract(vector(measured.specific_force), vector(attitude.acceleration_bias))
+    force = subtract(vector(measured.mean.specific_force), vector(attitude.acceleration_bias))
     put(acceleration[3:6], base_specific_force(force, w_start, w_dot, R_BI, p_BI))
     for i in range(6, v):
         acceleration[i] = (measured.joint_velocity[i - 6] - velocity[i]) / elapsed
@@ -339,7 +339,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
         input_ports:
         - measurements
         - attitude
-        - model_at_step_start
+        - model_over_step
         output_ports:
         - posterior
         - (one for each field)
@@ -397,8 +397,8 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._legs = [np.array([robot.joint_names.index(x) for x in joints]) for joints in legs]
         self._measurements = self._declare_record_input("measurements", measurements)
         self._attitude = self._declare_record_input("attitude", attitude)
-        self._model = self._declare_record_input("model_at_step_start", model)
-        self._declare_posterior("measurements", "attitude", "model_at_step_start")
+        self._model = self._declare_record_input("model_over_step", model)
+        self._declare_posterior("measurements", "attitude", "model_over_step")
 
     def _tick(
         self,

@@ -81,7 +81,7 @@ def _estimate_link_torque(
     posterior, last, measured = posterior[()], last[()], measured[()]
     model, acceleration, known = model[()], acceleration[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
-    wrench = foot_wrenches(measured.pad_force, pads.position, pads.foot, feet)
+    wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     _watch_forces(posterior, last, elapsed, wrench, known)
     if not np.isfinite(torque_command).all():
         _clear(posterior, _NOT_FINITE)
@@ -147,7 +147,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         name: LinkTorqueEstimator
         input_ports:
         - measurements
-        - model_at_step_start
+        - model_over_step
         - joint_acceleration
         - torque_command
         output_ports:
@@ -212,11 +212,11 @@ class LinkTorqueEstimator(RecursiveEstimator):
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
-        self._model = self._declare_record_input("model_at_step_start", model)
+        self._model = self._declare_record_input("model_over_step", model)
         self._acceleration = self._declare_record_input("joint_acceleration", acceleration)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
         self.DeclareDiscreteState(n)  # the last command
-        self._declare_posterior("measurements", "model_at_step_start", "joint_acceleration")
+        self._declare_posterior("measurements", "model_over_step", "joint_acceleration")
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray

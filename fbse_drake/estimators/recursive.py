@@ -7,6 +7,7 @@ from enum import IntEnum
 from functools import partial
 
 import numpy as np
+from numba import njit
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, State
 
 from fbse_drake.estimators.records import as_record, parts, size_of
@@ -35,6 +36,23 @@ class Clock:
     # An evaluation that comes sooner after the last tick than this [s] is no tick: the posterior is
     # held. Over a recorded log every sample is one.
     shortest: float = 0.001 * (1 - 1e-6)
+    # A reading of accelerometer or foot force is the mean over this time before it [s]; 0 for a
+    # sample.
+    reading: float = 0.001
+
+
+@njit(cache=True)
+def start_share(elapsed: float, reading: float) -> float:
+    """Weight of what was read where a tick began in the mean over the tick.
+
+    It is 0 for readings that are the mean over the tick, and grows to a half (the trapezoidal
+    rule) for ticks that are much longer than that.
+
+    Args:
+        elapsed: length of the tick [s], NaN at the first.
+        reading: see `Clock`.
+    """
+    return 0.5 * (1.0 - reading / elapsed) if elapsed > 1.5 * reading else 0.0
 
 
 @dataclass(frozen=True)

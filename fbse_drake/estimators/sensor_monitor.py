@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status, start_share
 from fbse_drake.estimators.spatial import vector
 from fbse_drake.estimators.support import (
     MeasuredSupport,
@@ -49,6 +49,10 @@ _MOST = 5.0
 # ... or for so long [s] in accord with the velocity: had it only jumped, had it been wrong in other
 # ways, too, had both jumped; other joints are believed after the last of them.
 _ADOPTED, _MENDED, _BOTH_MENDED, _AGREED = 0.3, 0.1, 0.3, 0.02
+
+
+# The readings whose mean over the tick is told.
+_MEANT = ("specific_force", "angular_velocity", "pad_force")
 
 
 @dataclass(frozen=True)
@@ -260,7 +264,8 @@ def _watch_sensors(
         doubt: of IMU and feet, see there, (1 + feet,).
         known: record with the values of `SensorMonitorConfig` as `limits` and of `SensorBeliefs` as
             `beliefs`; the mass that the feet carry [kg], 0 where they need not; which foot each pad
-            belongs to; the thresholds of `detect_support`; whether joint velocities are `counted`.
+            belongs to; the thresholds of `detect_support`; whether joint velocities are
+            `counted`; and how long a `reading` takes, see `Clock`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
@@ -345,6 +350,15 @@ def _watch_sensors(
                 if trust[2 + foot] == _OK and load[foot] < 0.02 * weight:
                     trust[2 + foot] = _LOST
     posterior.light = light
+    share = start_share(elapsed, known.reading) if last.status == _OK else 0.0
+    for i in range(3):
+        now, before = posterior.specific_force[i], last.specific_force[i]
+        posterior.mean.specific_force[i] = now + share * (before - now)
+        now, before = posterior.angular_velocity[i], last.angular_velocity[i]
+        posterior.mean.angular_velocity[i] = now + share * (before - now)
+        for pad in range(len(known.pad_foot)):
+            now, before = posterior.pad_force[pad, i], last.pad_force[pad, i]
+            posterior.mean.pad_force[pad, i] = now + share * (before - now)
     posterior.status = trust.max()
     detect_support(
         posterior.support,
@@ -380,6 +394,7 @@ class SensorMonitor(RecursiveEstimator):
 
         trust       (2 + feet,)  status of joints, IMU and every foot
         ...                      the readings, the last good one where there is none now
+        mean                     those of IMU and forces over the tick
         unchanged                for how long [s] each of their channels has repeated itself
         light       ()           for how long [s] the feet have shown too little
         support     (feet,)      1 for a foot that stands, else 0
@@ -423,6 +438,7 @@ class SensorMonitor(RecursiveEstimator):
             status=(),
             trust=(2 + len(legs),),
             **readings,
+            mean=record_type(**{name: readings[name] for name in _MEANT}),
             unchanged=sensors,
             light=(),
             support=feet,
@@ -447,6 +463,7 @@ class SensorMonitor(RecursiveEstimator):
             limits=config,
             beliefs=beliefs,
             counted=bool(beliefs.joint_velocity_counted),
+            reading=clock.reading,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
             thresholds=record(

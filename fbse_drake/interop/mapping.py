@@ -27,7 +27,8 @@ class ChannelMap:
 
     # Of a bag; by default the one that has the channel's standard message.
     topic: str = ""
-    # One for each component, or fewer that have several numbers in a row. Of a message: a field, as `wrench.force`.
+    # One for each component, or fewer that have several numbers in a row. Of a message: a field, as `wrench.force`. An orientation
+    # is a quaternion [w, x, y, z] or roll, pitch and yaw.
     columns: list[str] = field(default_factory=list)
     # The columns are multiplied by these: one, or as many.
     times: list[str] = field(default_factory=list)
@@ -68,6 +69,8 @@ class ChannelMap:
         """
         unit, shape = channel_kind(name)
         width = columns.shape[1]
+        if name.endswith("/orientation") and width == 3:
+            return self._quaternions(columns)
         expected = ("n" in shape and joints) or int(np.prod([size for size in shape if isinstance(size, int)]))
         if width != expected and not ("m" in shape and width and width % expected == 0):
             several = " for each pad" if "m" in shape else f", one for each of {joints} joints" if "n" in shape else ""
@@ -89,6 +92,11 @@ class ChannelMap:
         if self.rotation_deg or self.position:
             values = self._in_log_frame(values)
         return values.reshape(len(values), *(-1 if size == "m" else joints if size == "n" else size for size in shape))
+
+    def _quaternions(self, columns: np.ndarray) -> np.ndarray:
+        """Orientations [w, x, y, z], (N, 4), of recorded roll, pitch and yaw, (N, 3)."""
+        angles = si_factor(self.unit or "rad", "rad") * columns
+        return np.array([RollPitchYaw(row).ToQuaternion().wxyz() for row in angles])
 
     def _in_log_frame(self, values: np.ndarray) -> np.ndarray:
         R_LS = RotationMatrix(RollPitchYaw(np.deg2rad(self.rotation_deg or [0.0, 0.0, 0.0]))).matrix()

@@ -1,5 +1,6 @@
 """Joint encoders."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -15,8 +16,9 @@ from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
 from fbse_drake.signals import Signal, signals_of
 
-# Time constant of the smoothing of joint velocities that are differentiated from angles [s].
-_DIFFERENTIATION_TIME = 0.004
+# Time constant of the smoothing of joint velocities that are differentiated from angles [s]. Short:
+# estimators believe in noise, but not in lag.
+_DIFFERENTIATION_TIME = 0.001
 
 
 @in_library
@@ -44,6 +46,11 @@ class EncoderConfig(Sensor):
         if self.velocity not in ("exact", "differenced"):
             raise InputError(f"velocity: expected exact or differenced, found {self.velocity}")
         require_positive(self, "period")
+
+    @property
+    def angle_noise(self) -> float:
+        """Standard deviation of an angle as it is read [rad]."""
+        return math.hypot(self.noise, self.resolution / math.sqrt(12.0))
 
     def system(self, robot: Robot, run: Run) -> "Encoders":
         return Encoders(self, len(robot.joint_names), run.seed, run.duration)
@@ -74,6 +81,16 @@ def differentiate(time: np.ndarray, position: np.ndarray, time_constant: float) 
         stage[1] = keep * stage[1] + (1 - keep) * stage[0]
         velocity[k] = stage[1]
     return velocity
+
+
+def differentiated_noise(noise: float, period: float) -> float:
+    """White noise of angles in the velocity that `readings` makes of them [rad/s].
+
+    Args:
+        noise: standard deviation of an angle [rad]; period: between angles [s].
+    """
+    smoothed = math.sqrt(period / (4.0 * _DIFFERENTIATION_TIME**3))
+    return noise * min(smoothed, math.sqrt(2.0) / period)
 
 
 def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:
