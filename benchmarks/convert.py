@@ -23,8 +23,13 @@ def write_bag(path: Path, minutes: float) -> None:
     """Writes a bag of noise."""
     samples, joints = round(60 * minutes / _PERIOD), [f"joint_{i}" for i in range(12)]
     noise = np.random.default_rng(0).standard_normal
-    channels = {f"joint/{name}": noise((samples, len(joints))) for name in ("position", "velocity", "torque_command")}
-    channels |= {f"imu/{name}": noise((samples, 3)) for name in ("linear_acceleration", "angular_velocity")}
+    channels = {
+        f"joint/{name}": noise((samples, len(joints)))
+        for name in ("position", "velocity", "torque_command")
+    }
+    channels |= {
+        f"imu/{name}": noise((samples, 3)) for name in ("linear_acceleration", "angular_velocity")
+    }
     channels |= {f"foot/{side}/wrench": noise((samples, 6)) for side in ("left", "right")}
     meta = {"joints": joints, "sides": ["left", "right"], "period": _PERIOD}
     write_mcap(Log({"time": _PERIOD * np.arange(samples)} | channels, meta), path)
@@ -40,14 +45,22 @@ def main() -> None:
         subprocess.run([sys.executable, "-c", write], check=True)
         written = time.perf_counter() - start
         start = time.perf_counter()
-        process = subprocess.Popen([sys.executable, "-m", "fbse_drake", "convert", str(bag), str(log), "--quiet"])
+        process = subprocess.Popen(
+            [sys.executable, "-m", "fbse_drake", "convert", str(bag), str(log), "--quiet"]
+        )
         _, status, usage = os.wait4(process.pid, 0)
         elapsed = time.perf_counter() - start
         if status:
             sys.exit("the conversion failed")
-        print(f"{minutes:g} min at 1 kHz: {bag.stat().st_size / 2**20:.0f} MiB of MCAP, written in {written:.0f} s")
-        print(f"converted in {elapsed:.1f} s ({usage.ru_utime + usage.ru_stime:.1f} s of processor time)")
-        print(f"peak memory {usage.ru_maxrss / 2**10:.0f} MiB; the log's numbers alone are {_numbers(log) / 2**20:.0f} MiB")
+        print(
+            f"{minutes:g} min at 1 kHz: {bag.stat().st_size / 2**20:.0f} MiB of MCAP, written in {written:.0f} s"
+        )
+        print(
+            f"converted in {elapsed:.1f} s ({usage.ru_utime + usage.ru_stime:.1f} s of processor time)"
+        )
+        print(
+            f"peak memory {usage.ru_maxrss / 2**10:.0f} MiB; the log's numbers alone are {_numbers(log) / 2**20:.0f} MiB"
+        )
 
 
 def _numbers(path: Path) -> int:

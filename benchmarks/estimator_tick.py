@@ -34,7 +34,9 @@ def bare_calls(scenario: Scenario, log: Log) -> Timer:
     plant, context = robot.plant, robot.plant.CreateDefaultContext()
     world, origin, kind = plant.world_frame(), np.zeros(3), JacobianWrtVariable.kV
     soles = [robot.sole(side) for side in robot.description.sides]
-    state = np.concatenate([robot.base_pose_positions(RigidTransform()), np.zeros(plant.num_velocities())])
+    state = np.concatenate(
+        [robot.base_pose_positions(RigidTransform()), np.zeros(plant.num_velocities())]
+    )
     joints = np.concatenate([robot.position_index, plant.num_positions() + robot.velocity_index])
     motion = np.hstack([log["joint/position"], log["joint/velocity"]])
 
@@ -71,8 +73,13 @@ def whole_tick(scenario: Scenario, log: Log) -> Timer:
 def single_systems(scenario: Scenario, log: Log) -> tuple[list[str], Timer]:
     """Names of the estimator's LeafSystems; times the output of each, its inputs known, and then the update of each."""
     replay = Replay(scenario, log)
-    systems = [system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)]
-    outputs = [(system.GetOutputPort("posterior"), system.GetMyContextFromRoot(replay.context)) for system in systems]
+    systems = [
+        system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)
+    ]
+    outputs = [
+        (system.GetOutputPort("posterior"), system.GetMyContextFromRoot(replay.context))
+        for system in systems
+    ]
     other = replay.estimator.CreateDefaultContext()
     updates = [
         (system, context, system.GetMyMutableContextFromRoot(other).get_mutable_state())
@@ -106,7 +113,9 @@ def main() -> None:
     gc.disable()
     for start in range(0, len(log.time), _STRETCH):
         for timer, values in zip(timers, durations, strict=True):
-            values.extend(timer(sample) for sample in range(start, min(start + _STRETCH, len(log.time))))
+            values.extend(
+                timer(sample) for sample in range(start, min(start + _STRETCH, len(log.time)))
+            )
     # The first stretch compiles and warms up.
     bare, tick, shares = (1e6 * np.array(values[100:]) for values in durations)
     print(f"{name}, {len(tick)} ticks [us]")
@@ -114,7 +123,9 @@ def main() -> None:
     p99, ratio = np.percentile(tick, 99), np.median(tick) / np.median(bare)
     print(f"estimator tick     median {np.median(tick):6.1f}   p99 {p99:6.1f}   {ratio:.2f} x bare")
     print("each system by itself, median       output  update")
-    for system, output, update in zip(systems, *np.median(shares, axis=0).reshape(2, -1), strict=True):
+    for system, output, update in zip(
+        systems, *np.median(shares, axis=0).reshape(2, -1), strict=True
+    ):
         print(f"  {system:32} {output:7.1f} {update:7.1f}")
 
 

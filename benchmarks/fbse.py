@@ -55,7 +55,9 @@ _DISTURBED = {
     "force sensors 5 ms late": ("sensors.foot_force.delay=0.005",),
     "IMU turned by 0.5 deg about y": ("sensors.imu.misalignment=[0, 0.00873, 0]",),
     "all sensors ten times finer": _FINER,
-    "friction model twice as steep": ("estimator.friction=!ModelAided {model: {transition: {all: 0.005}}}",),
+    "friction model twice as steep": (
+        "estimator.friction=!ModelAided {model: {transition: {all: 0.005}}}",
+    ),
 }
 
 
@@ -75,17 +77,28 @@ def run(job: tuple[Case, int]) -> tuple[str, dict[str, dict[str, Any]]]:
     """Simulates a case; returns its name and the figures of the walk (under the case's name) and of each watcher."""
     case, seed = job
     with tempfile.TemporaryDirectory() as scratch:
-        overrides = [f"seed={seed}", *(_model_override(text, Path(scratch)) for text in case.overrides)]
+        overrides = [
+            f"seed={seed}",
+            *(_model_override(text, Path(scratch)) for text in case.overrides),
+        ]
         scenario = load_scenario(case.scenario, case.child, overrides)
         result = simulate(scenario, name=case.name)
         log = result.log
         results = {case.name: _figures(log, result.failure, math.nan)}
         if "estimate/joint/friction_torque" in log:
-            results[case.name]["tick_us"] = 1e6 * float(np.median(estimate(scenario, _start(log, 2000)).tick_time))
+            results[case.name]["tick_us"] = 1e6 * float(
+                np.median(estimate(scenario, _start(log, 2000)).tick_time)
+            )
         for name, estimator in (case.watchers or {}).items():
-            child, change = (estimator, []) if not estimator.startswith("!") else (case.child, [f"estimator={estimator}"])
+            child, change = (
+                (estimator, [])
+                if not estimator.startswith("!")
+                else (case.child, [f"estimator={estimator}"])
+            )
             watched = estimate(load_scenario(case.scenario, child, overrides + change), log)
-            results[name] = _figures(watched.log, result.failure, 1e6 * float(np.median(watched.tick_time)))
+            results[name] = _figures(
+                watched.log, result.failure, 1e6 * float(np.median(watched.tick_time))
+            )
     return case.name, results
 
 
@@ -97,7 +110,9 @@ def _figures(log: Log, failure: str | None, tick_us: float) -> dict[str, Any]:
     metrics = run_metrics(log, 1.0)
     return {
         "failure": failure,
-        "nrmse": {phase: list(values.values()) for phase, values in metrics["friction_nrmse"].items()},
+        "nrmse": {
+            phase: list(values.values()) for phase, values in metrics["friction_nrmse"].items()
+        },
         "attitude": list(metrics["attitude_rmse_deg"].values()),
         "base_velocity": list(metrics["base_velocity_rmse"].values()),
         "tracking": 1e3 * float(np.mean(list(metrics["joint_tracking_rms"].values()))),
@@ -112,7 +127,10 @@ def _model_override(text: str, scratch: Path) -> str:
     """An override as it is, or that of a model with another trunk, whose files are written to `scratch`."""
     changes = {
         "heavy": ('<mass value="50"/>', '<mass value="55"/>'),
-        "shifted": ('<origin xyz="0.025 0 0.15"/>\n      <mass', '<origin xyz="0.035 0 0.15"/>\n      <mass'),
+        "shifted": (
+            '<origin xyz="0.025 0 0.15"/>\n      <mass',
+            '<origin xyz="0.035 0 0.15"/>\n      <mass',
+        ),
     }
     if text not in changes:
         return text
@@ -138,9 +156,16 @@ def fixed_friction(scenario: str, child: str | None = None) -> str:
     """A friction model identified offline from the measured friction of one walk, as `--set estimator=` takes it."""
     log = simulate(load_scenario(scenario, child, [f"seed={_OFFLINE_SEED}"])).log
     rows = slice(500, None)
-    found = identify(CoulombViscousFriction, log.joints, log["joint/velocity"][rows], log["estimate/joint/residual_torque"][rows])
+    found = identify(
+        CoulombViscousFriction,
+        log.joints,
+        log["joint/velocity"][rows],
+        log["estimate/joint/residual_torque"][rows],
+    )
     text = yaml.dump({"model": dict(vars(found.config()))}, default_flow_style=True, width=10**6)
-    return "!FixedFriction " + text.strip().replace("{model: {", "{model: !CoulombViscousFriction {")
+    return "!FixedFriction " + text.strip().replace(
+        "{model: {", "{model: !CoulombViscousFriction {"
+    )
 
 
 def cases(fixed: Mapping[str, str]) -> list[Case]:
@@ -164,7 +189,11 @@ def cases(fixed: Mapping[str, str]) -> list[Case]:
         "disturbance observer": ("estimator=!DisturbanceObserver {}",),
         "torque sensors": ("estimator=!TorqueSensor {}", _TORQUE_SENSOR),
         "fixed model": (f"estimator={fixed['hrp2_walk_fbse']}",),
-        "no friction": ("robot.effects=null", "estimator=!NoEstimator {}", "compensation=!NoCompensation {}"),
+        "no friction": (
+            "robot.effects=null",
+            "estimator=!NoEstimator {}",
+            "compensation=!NoCompensation {}",
+        ),
     }
     seen = {
         "no compensation": {
@@ -174,13 +203,25 @@ def cases(fixed: Mapping[str, str]) -> list[Case]:
         }
     }
     return [
-        Case("Table I, best variant", "paper_walk_fbse", overrides=(_TORQUE_SENSOR,), watchers=watchers),
+        Case(
+            "Table I, best variant",
+            "paper_walk_fbse",
+            overrides=(_TORQUE_SENSOR,),
+            watchers=watchers,
+        ),
         Case("Table I, biased IMU", "paper_walk_fbse", overrides=_BIASES),
         Case("integral law, best variant", "paper_walk_integral"),
         Case("integral law, paper's method", "paper_walk_integral", overrides=(paper,)),
-        Case("integral law, true friction", "paper_walk_integral", overrides=("estimator=!TrueFriction {}",)),
+        Case(
+            "integral law, true friction",
+            "paper_walk_integral",
+            overrides=("estimator=!TrueFriction {}",),
+        ),
         Case("Table I, no friction", "paper_walk_fbse", overrides=("robot.effects=null",)),
-        *(Case(f"HRP-2, {name}", "hrp2_walk_fbse", overrides=changes, watchers=seen.get(name)) for name, changes in hrp2.items()),
+        *(
+            Case(f"HRP-2, {name}", "hrp2_walk_fbse", overrides=changes, watchers=seen.get(name))
+            for name, changes in hrp2.items()
+        ),
         Case("HRP-2, biased IMU", "hrp2_walk_fbse", overrides=_BIASES),
     ]
 
@@ -205,7 +246,9 @@ class Results:
             self._runs[name].append(values)
 
     def mean(self, name: str, pick: Callable[[dict[str, Any]], Any]) -> np.ndarray:
-        return np.mean([np.asarray(pick(values), dtype=float) for values in self._runs[name]], axis=0)
+        return np.mean(
+            [np.asarray(pick(values), dtype=float) for values in self._runs[name]], axis=0
+        )
 
     def nrmse(self, name: str, phase: str) -> np.ndarray:
         """Mean NRMSE of the friction of each leg joint, both legs together."""
@@ -222,21 +265,36 @@ class Results:
     def com_deviation(self, name: str, other: str) -> np.ndarray:
         """Mean distance of the CoM to that of the same walk `other`, in x and y [mm]."""
         pairs = zip(self._runs[name], self._runs[other], strict=True)
-        rows = [np.abs(a["com"][: len(b["com"])] - b["com"][: len(a["com"])]).mean(axis=0) for a, b in pairs]
+        rows = [
+            np.abs(a["com"][: len(b["com"])] - b["com"][: len(a["com"])]).mean(axis=0)
+            for a, b in pairs
+        ]
         return 1e3 * np.mean(rows, axis=0)
 
 
 def tables(results: Results, robust: Results) -> dict[str, Table]:
     """All tables by title."""
     joints = results.leg_joints()
-    methods = ["HRP-2, FBSE", "HRP-2, no compensation", *(f"Table I, {name}" for name in ("best variant", "paper's method"))]
-    rows = [(name, phase, *results.nrmse(name, phase)) for name in methods for phase in ("stance", "swing")]
+    methods = [
+        "HRP-2, FBSE",
+        "HRP-2, no compensation",
+        *(f"Table I, {name}" for name in ("best variant", "paper's method")),
+    ]
+    rows = [
+        (name, phase, *results.nrmse(name, phase))
+        for name in methods
+        for phase in ("stance", "swing")
+    ]
     friction = Table(("Friction NRMSE", "leg in", *joints), tuple(rows))
 
     states = Table(
         ("RMS error", "roll [deg]", "pitch [deg]", "base vx [m/s]", "vy [m/s]", "vz [m/s]"),
         tuple(
-            (name, *results.mean(name, lambda f: f["attitude"]), *results.mean(name, lambda f: f["base_velocity"]))
+            (
+                name,
+                *results.mean(name, lambda f: f["attitude"]),
+                *results.mean(name, lambda f: f["base_velocity"]),
+            )
             for name in (*methods, "Table I, biased IMU", "HRP-2, biased IMU")
         ),
     )
@@ -244,32 +302,86 @@ def tables(results: Results, robust: Results) -> dict[str, Table]:
     plain = results.mean("Table I, best variant", lambda f: f["com_error"])
     claim_rows: list[tuple[str | float, ...]] = []
     laws = ("best variant", "paper's method", "true friction")
-    for name in ("Table I, best variant", *(f"integral law, {law}" for law in laws), "Table I, no friction"):
-        label = {"Table I, best variant": "position loop alone", "Table I, no friction": "position loop alone, no friction"}.get(name, name)
+    for name in (
+        "Table I, best variant",
+        *(f"integral law, {law}" for law in laws),
+        "Table I, no friction",
+    ):
+        label = {
+            "Table I, best variant": "position loop alone",
+            "Table I, no friction": "position loop alone, no friction",
+        }.get(name, name)
         error = results.mean(name, lambda f: f["com_error"])
-        claim_rows.append((label, *error, *(100 * (error / plain - 1)), float(results.mean(name, lambda f: f["tracking"]))))
-    claim = Table(("Paper's gains", "CoM error x [mm]", "y [mm]", "change x [%]", "y [%]", "tracking [mrad]"), tuple(claim_rows))
+        claim_rows.append(
+            (
+                label,
+                *error,
+                *(100 * (error / plain - 1)),
+                float(results.mean(name, lambda f: f["tracking"])),
+            )
+        )
+    claim = Table(
+        ("Paper's gains", "CoM error x [mm]", "y [mm]", "change x [%]", "y [%]", "tracking [mrad]"),
+        tuple(claim_rows),
+    )
 
     def recovered(values: Mapping[str, float], name: str) -> float:
-        return 100 * (values["no compensation"] - values[name]) / (values["no compensation"] - values["oracle"])
+        return (
+            100
+            * (values["no compensation"] - values[name])
+            / (values["no compensation"] - values["oracle"])
+        )
 
-    compared = ("no compensation", "oracle", "FBSE", "disturbance observer", "torque sensors", "fixed model")
-    tracking = {name: float(results.mean(f"HRP-2, {name}", lambda f: f["tracking"])) for name in compared}
-    deviation = {name: results.com_deviation(f"HRP-2, {name}", "HRP-2, no friction") for name in compared}
+    compared = (
+        "no compensation",
+        "oracle",
+        "FBSE",
+        "disturbance observer",
+        "torque sensors",
+        "fixed model",
+    )
+    tracking = {
+        name: float(results.mean(f"HRP-2, {name}", lambda f: f["tracking"])) for name in compared
+    }
+    deviation = {
+        name: results.com_deviation(f"HRP-2, {name}", "HRP-2, no friction") for name in compared
+    }
     sides = [{name: float(value[axis]) for name, value in deviation.items()} for axis in range(2)]
     both = {name: float(np.hypot(*value)) for name, value in deviation.items()}
-    header = ("tracking [mrad]", "recovered [%]", "CoM deviation x [mm]", "y [mm]", "recovered x [%]", "y [%]", "both [%]")
+    header = (
+        "tracking [mrad]",
+        "recovered [%]",
+        "CoM deviation x [mm]",
+        "y [mm]",
+        "recovered x [%]",
+        "y [%]",
+        "both [%]",
+    )
     recovery_rows: list[tuple[str | float, ...]] = []
     for name in compared:
         shares = (recovered(values, name) for values in (*sides, both))
-        recovery_rows.append((name, tracking[name], recovered(tracking, name), *deviation[name], *shares))
+        recovery_rows.append(
+            (name, tracking[name], recovered(tracking, name), *deviation[name], *shares)
+        )
     recovery = Table(("HRP-2 friction, fed forward", *header), tuple(recovery_rows))
 
     reference_rows: list[tuple[str | float, ...]] = []
     for name in (
-        *(f"Table I, {method}" for method in ("best variant", "paper's method", "disturbance observer", "torque sensors", "fixed model")),
+        *(
+            f"Table I, {method}"
+            for method in (
+                "best variant",
+                "paper's method",
+                "disturbance observer",
+                "torque sensors",
+                "fixed model",
+            )
+        ),
         "HRP-2, no compensation",
-        *(f"HRP-2 watched, {method}" for method in ("disturbance observer", "torque sensors", "fixed model")),
+        *(
+            f"HRP-2 watched, {method}"
+            for method in ("disturbance observer", "torque sensors", "fixed model")
+        ),
     ):
         tick = float(results.mean(name, lambda f: f["tick_us"]))
         for phase in ("stance", "swing"):
@@ -279,12 +391,22 @@ def tables(results: Results, robust: Results) -> dict[str, Table]:
 
     robust_rows: list[tuple[str | float, ...]] = []
     for walk, undisturbed in (("Table I", "Table I, best variant"), ("HRP-2", "HRP-2, FBSE")):
-        sources = [(f"{walk}, no error", results, undisturbed), *((f"{walk}, {e}", robust, f"{walk}, {e}") for e in _DISTURBED)]
+        sources = [
+            (f"{walk}, no error", results, undisturbed),
+            *((f"{walk}, {e}", robust, f"{walk}, {e}") for e in _DISTURBED),
+        ]
         for name, source, key in sources:
             tilt = float(np.max(source.mean(key, lambda f: f["attitude"])))
             velocity = float(np.max(source.mean(key, lambda f: f["base_velocity"])))
-            walked = (tilt, velocity, float(source.mean(key, lambda f: f["tracking"])), float(source.falls(key)))
-            robust_rows += [(name, phase, *source.nrmse(key, phase), *walked) for phase in ("stance", "swing")]
+            walked = (
+                tilt,
+                velocity,
+                float(source.mean(key, lambda f: f["tracking"])),
+                float(source.falls(key)),
+            )
+            robust_rows += [
+                (name, phase, *source.nrmse(key, phase), *walked) for phase in ("stance", "swing")
+            ]
     header = ("tilt [deg]", "velocity [m/s]", "tracking [mrad]", "falls")
     robustness = Table(("Friction NRMSE", "leg in", *joints, *header), tuple(robust_rows))
     return {
@@ -303,7 +425,9 @@ def print_table(console: Console, title: str, table: Table) -> None:
     for head, cell in zip(table.header, table.rows[0], strict=True):
         shown.add_column(head, justify="left" if isinstance(cell, str) else "right")
     for row in table.rows:
-        shown.add_row(*(str(cell) if isinstance(cell, (str, int)) else number(float(cell)) for cell in row))
+        shown.add_row(
+            *(str(cell) if isinstance(cell, (str, int)) else number(float(cell)) for cell in row)
+        )
     console.print(shown)
 
 
@@ -311,31 +435,57 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs everything and prints the tables."""
     parser = argparse.ArgumentParser(description="Figures of merit of the friction estimate.")
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds (default 10)")
-    parser.add_argument("--robustness-seeds", type=int, default=3, help="number of seeds of the robustness table (default 3)")
-    parser.add_argument("--out", type=Path, default=Path("out/fbse"), help="where the report goes (default out/fbse)")
+    parser.add_argument(
+        "--robustness-seeds",
+        type=int,
+        default=3,
+        help="number of seeds of the robustness table (default 3)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/fbse"),
+        help="where the report goes (default out/fbse)",
+    )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(width=190)
-    fixed = {scenario: fixed_friction(scenario) for scenario in ("paper_walk_fbse", "hrp2_walk_fbse")}
+    fixed = {
+        scenario: fixed_friction(scenario) for scenario in ("paper_walk_fbse", "hrp2_walk_fbse")
+    }
     jobs = [(case, seed) for seed in range(options.seeds) for case in cases(fixed)]
-    robust_jobs = [(case, seed) for seed in range(options.robustness_seeds) for case in robustness_cases()]
+    robust_jobs = [
+        (case, seed) for seed in range(options.robustness_seeds) for case in robustness_cases()
+    ]
     results, robust = Results(), Results()
     with Pool() as pool:
         # In order, so that the runs of a seed stay together.
         for _, figures in track(pool.imap(run, jobs), "walking", len(jobs), console=console):
             results.add(figures)
-        for _, figures in track(pool.imap(run, robust_jobs), "walking with errors", len(robust_jobs), console=console):
+        for _, figures in track(
+            pool.imap(run, robust_jobs), "walking with errors", len(robust_jobs), console=console
+        ):
             robust.add(figures)
     made = tables(results, robust)
     for title, table in made.items():
         print_table(console, title, table)
     write_text(
         options.out / "figures.json",
-        json.dumps({title: {"header": table.header, "rows": table.rows} for title, table in made.items()}, indent=1, default=float) + "\n",
+        json.dumps(
+            {title: {"header": table.header, "rows": table.rows} for title, table in made.items()},
+            indent=1,
+            default=float,
+        )
+        + "\n",
     )
     sections = tuple(Section(title, tables=(table,)) for title, table in made.items())
-    outcome = f"Means over {options.seeds} seeds ({options.robustness_seeds} in the robustness table)."
-    write_report(options.out / "report.html", Report("Friction estimation in figures", True, outcome, sections))
+    outcome = (
+        f"Means over {options.seeds} seeds ({options.robustness_seeds} in the robustness table)."
+    )
+    write_report(
+        options.out / "report.html",
+        Report("Friction estimation in figures", True, outcome, sections),
+    )
     console.print(f"Report: {options.out / 'report.html'}", highlight=False)
 
 

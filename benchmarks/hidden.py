@@ -36,7 +36,15 @@ from fbse_drake.discrepancy.strangers import STRANGERS
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.effect import library
 from fbse_drake.files import write_text
-from fbse_drake.report.html import Details, FigureBlock, Report, Section, Table, number, write_report
+from fbse_drake.report.html import (
+    Details,
+    FigureBlock,
+    Report,
+    Section,
+    Table,
+    number,
+    write_report,
+)
 
 _SCENARIO = "paper_walk"
 _FRICTION = frozenset(
@@ -71,7 +79,9 @@ _OTHER_LAW = (
     "ankle_pitch: 0.1, ankle_roll: 0.05}, viscous: {all: 0.9}}"
 )
 _MISMATCHES = {
-    "similar": Mismatch("contact solver (similar)", ("plant.discrete_contact_approximation=similar",), _CREEP),
+    "similar": Mismatch(
+        "contact solver (similar)", ("plant.discrete_contact_approximation=similar",), _CREEP
+    ),
     "sap": Mismatch("contact solver (sap)", ("plant.discrete_contact_approximation=sap",), _CREEP),
     "step": Mismatch("plant step (0.5 ms)", ("plant.time_step=0.0005",)),
     "friction": Mismatch("friction law", (_OTHER_LAW,), _FRICTION),
@@ -119,29 +129,61 @@ class Case:
 def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
     """All cases but those at the smallest size that can be found, see `threshold_cases`."""
     names = [name for name, effect in library().items() if not effect.composite]
-    result = [Case(f"decoy-{seed}", "decoy", "decoy", rollout=seed < _ROLLED_DECOYS) for seed in range(4 if quick else 30)]
+    result = [
+        Case(f"decoy-{seed}", "decoy", "decoy", rollout=seed < _ROLLED_DECOYS)
+        for seed in range(4 if quick else 30)
+    ]
     for seed in range(seeds):
         for size in sizes:
             rollout = size == "large" and seed == 0
-            result += [Case(f"effect-{name}-{size}-{seed}", "effect", name, size, rollout=rollout) for name in names]
+            result += [
+                Case(f"effect-{name}-{size}-{seed}", "effect", name, size, rollout=rollout)
+                for name in names
+            ]
     for seed in range(1 if quick else 2):
-        result += [Case(f"stranger-{name}-{size}-{seed}", "stranger", name, size) for name in STRANGERS for size in SIZES[1:]]
-    result += [Case(f"pair-{seed}", "pair", "library", SIZES[1 + seed % 2], 2) for seed in range(3 if quick else 15)]
+        result += [
+            Case(f"stranger-{name}-{size}-{seed}", "stranger", name, size)
+            for name in STRANGERS
+            for size in SIZES[1:]
+        ]
+    result += [
+        Case(f"pair-{seed}", "pair", "library", SIZES[1 + seed % 2], 2)
+        for seed in range(3 if quick else 15)
+    ]
     for name, mismatch in _MISMATCHES.items():
         for seed in range(1 if quick else 3):
             for what, size in (("decoy", "medium"), ("library", SIZES[1 + seed % 2])):
-                result.append(Case(f"mismatch-{name}-{what}-{seed}", "mismatch", what, size, overrides=mismatch.overrides))
+                result.append(
+                    Case(
+                        f"mismatch-{name}-{what}-{seed}",
+                        "mismatch",
+                        what,
+                        size,
+                        overrides=mismatch.overrides,
+                    )
+                )
     return result
 
 
 def length_cases() -> list[Case]:
     """One effect in walks once, twice and four times as long."""
-    hidden = HiddenEffect("TorqueGain", ("left_knee_pitch",), 0.1, {"shortfall": {"left_knee_pitch": 0.1}})
+    hidden = HiddenEffect(
+        "TorqueGain", ("left_knee_pitch",), 0.1, {"shortfall": {"left_knee_pitch": 0.1}}
+    )
     answer = Answer("library", "large", 1.0, (hidden,))
     result = []
     for times, supports in ((1, 7), (2, 14), (4, 30)):
         overrides = (f"duration={11.5 * times}", f"reference.single_supports={supports}")
-        result.append(Case(f"length-{times}", "length", "TorqueGain", "large", overrides=overrides, answer=answer))
+        result.append(
+            Case(
+                f"length-{times}",
+                "length",
+                "TorqueGain",
+                "large",
+                overrides=overrides,
+                answer=answer,
+            )
+        )
     return result
 
 
@@ -156,7 +198,12 @@ def threshold_cases(stated: dict[str, dict[str, float]]) -> list[Case]:
         for label, factor in (("half", 0.5), ("twice", 2.0)):
             size = factor * stated.get(name, {}).get(target, np.inf)
             if np.isfinite(size):
-                answer = Answer("library", "small", 1.0, (HiddenEffect(name, (target,), size, {parameter: {target: size}}),))
+                answer = Answer(
+                    "library",
+                    "small",
+                    1.0,
+                    (HiddenEffect(name, (target,), size, {parameter: {target: size}}),),
+                )
                 result.append(Case(f"threshold-{name}-{label}", "threshold", name, answer=answer))
     return result
 
@@ -172,7 +219,11 @@ def run(job: tuple[Case, Path, str]) -> None:
         result = _run(case)
     except Exception:  # One bad case must not stop the others.
         result = {"error": traceback.format_exc()}
-    write_text(path, json.dumps({"sources": sources, "case": asdict(case), **result}, indent=1, default=float) + "\n")
+    write_text(
+        path,
+        json.dumps({"sources": sources, "case": asdict(case), **result}, indent=1, default=float)
+        + "\n",
+    )
 
 
 def _run(case: Case) -> dict[str, Any]:
@@ -180,7 +231,9 @@ def _run(case: Case) -> dict[str, Any]:
     if case.answer is not None:
         exercise = record(scenario, _SCENARIO, case.answer, case.seed)
     else:
-        exercise = make_exercise(scenario, _SCENARIO, case.seed, what=case.what, size=case.size, count=case.count)
+        exercise = make_exercise(
+            scenario, _SCENARIO, case.seed, what=case.what, size=case.size, count=case.count
+        )
     scenario = exercise.scenario
     if case.group == "mismatch":
         # What is believed knows nothing of the overrides.
@@ -190,7 +243,10 @@ def _run(case: Case) -> dict[str, Any]:
     if case.rollout:
         found = study_json(study(scenario, exercise.log))
     else:
-        found = {"diagnoses": [diagnosis_json(diagnose(Predictor(scenario, exercise.log)))], "steps": []}
+        found = {
+            "diagnoses": [diagnosis_json(diagnose(Predictor(scenario, exercise.log)))],
+            "steps": [],
+        }
     duration = time.perf_counter() - start
     return {
         "answer": asdict(exercise.answer),
@@ -238,7 +294,9 @@ class Result:
     @property
     def label(self) -> str:
         """What the diagnosis says, in a word."""
-        if self.diagnosis["verdict"] == "unknown_effect" and (self.group == "stranger" or not self.chosen):
+        if self.diagnosis["verdict"] == "unknown_effect" and (
+            self.group == "stranger" or not self.chosen
+        ):
             return _UNKNOWN
         return self.chosen[0]["effect"] if self.chosen else _NOTHING
 
@@ -248,7 +306,10 @@ class Result:
 
     def is_found(self, *, alternatives: bool = True) -> bool:
         """Is everything found that is hidden, or else declared to be an alternative?"""
-        return all(found or (alternatives and self.score["confusable"][name]) for name, found in self.score["found"].items())
+        return all(
+            found or (alternatives and self.score["confusable"][name])
+            for name, found in self.score["found"].items()
+        )
 
     def is_alternative(self) -> bool:
         """Is the hidden effect declared to be an alternative to what is ranked first?"""
@@ -259,24 +320,42 @@ class Result:
 
         Where nothing is found, also larger than the size that this log's own diagnosis states: what is hidden may keep a joint still.
         """
-        own = {name: status["smallest_detectable_by_target"] for name, status in self.diagnosis["effects"].items()}
+        own = {
+            name: status["smallest_detectable_by_target"]
+            for name, status in self.diagnosis["effects"].items()
+        }
         limits = [stated] if self.chosen else [stated, own]
 
         def exceeds(hidden: dict[str, Any], target: str) -> bool:
-            return all(_strength(hidden, target) > _limit(sizes, hidden, target) for sizes in limits)
+            return all(
+                _strength(hidden, target) > _limit(sizes, hidden, target) for sizes in limits
+            )
 
-        return all(any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden)
+        return all(
+            any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden
+        )
 
     def is_wrong(self, allowed: Iterable[str] = ()) -> bool:
         """Does it name effects with confidence that are not there?"""
-        return self.diagnosis["verdict"] == "effect_found" and bool(set(self.score["wrong"]) - set(allowed))
+        return self.diagnosis["verdict"] == "effect_found" and bool(
+            set(self.score["wrong"]) - set(allowed)
+        )
 
     def text(self) -> str:
         """One line."""
-        hidden = ", ".join(f"{e['effect']} {e['size']:.3g} ({' '.join(e['targets'])})" for e in self.hidden) or _NOTHING
-        chosen = ", ".join(f"{f['effect']} ({' '.join(f['joints'])})" for f in self.chosen) or _NOTHING
+        hidden = (
+            ", ".join(
+                f"{e['effect']} {e['size']:.3g} ({' '.join(e['targets'])})" for e in self.hidden
+            )
+            or _NOTHING
+        )
+        chosen = (
+            ", ".join(f"{f['effect']} ({' '.join(f['joints'])})" for f in self.chosen) or _NOTHING
+        )
         left = " ".join(row["row"] for row in self.diagnosis["unexplained"]) or "nothing"
-        return f"{self.name}: {hidden} -> {self.diagnosis['verdict']}: {chosen}; unexplained: {left}"
+        return (
+            f"{self.name}: {hidden} -> {self.diagnosis['verdict']}: {chosen}; unexplained: {left}"
+        )
 
 
 def _strength(hidden: dict[str, Any], target: str) -> float:
@@ -289,7 +368,11 @@ def _strength(hidden: dict[str, Any], target: str) -> float:
     parameters = library()[hidden["effect"]].parameters
     return float(
         np.linalg.norm(
-            [hidden["parameters"].get(n, {}).get(target, 0.0) for n, p in parameters.items() if p.linear and p.unit == parameter.unit]
+            [
+                hidden["parameters"].get(n, {}).get(target, 0.0)
+                for n, p in parameters.items()
+                if p.linear and p.unit == parameter.unit
+            ]
         )
     )
 
@@ -305,9 +388,15 @@ def stated_sizes(decoys: Sequence[Result]) -> dict[str, dict[str, float]]:
     """The smallest size that can be found, by effect and target: the median of what the diagnoses of the decoys say."""
     sizes: dict[str, dict[str, float]] = {}
     for name in library():
-        stated = [decoy.diagnosis["effects"].get(name, {}).get("smallest_detectable_by_target", {}) for decoy in decoys]
+        stated = [
+            decoy.diagnosis["effects"].get(name, {}).get("smallest_detectable_by_target", {})
+            for decoy in decoys
+        ]
         targets = dict.fromkeys(target for of_decoy in stated for target in of_decoy)
-        sizes[name] = {target: float(np.median([of_decoy.get(target, np.inf) for of_decoy in stated])) for target in targets}
+        sizes[name] = {
+            target: float(np.median([of_decoy.get(target, np.inf) for of_decoy in stated]))
+            for target in targets
+        }
     return sizes
 
 
@@ -345,28 +434,90 @@ class Figures:
         # What is wrong with a sensor that the controller does not read changes no bit of the simulated motion, and a small effect less than
         # other noise does.
         noise = max((_rollouts(r)[0] for r in decoys if r.tree["steps"]), default=0.0)
-        rolled = [r for r in self.of("effect") if len(r.tree["steps"]) > 1 and r.is_found() and len(set(_rollouts(r))) > 1]
+        rolled = [
+            r
+            for r in self.of("effect")
+            if len(r.tree["steps"]) > 1 and r.is_found() and len(set(_rollouts(r))) > 1
+        ]
         walks = [(before, after) for before, after in map(_rollouts, rolled) if before > noise]
-        half, twice = ([r for r in self.of("threshold") if r.name.endswith(label)] for label in ("half", "twice"))
-        times = [r.tree["wall_time"] for r in self.results if r.group != "length" and not r.tree["steps"]]
+        half, twice = (
+            [r for r in self.of("threshold") if r.name.endswith(label)]
+            for label in ("half", "twice")
+        )
+        times = [
+            r.tree["wall_time"] for r in self.results if r.group != "length" and not r.tree["steps"]
+        ]
         lengths = {r.name: r.tree["wall_time"] for r in self.of("length")}
         rows = [
-            ("hidden effect ranked first (above the stated smallest size)", ">= 95 %", *_share(r.score["first"] for r in visible)),
-            ("  the rest: declared confusable with the first", "100 %", *_share(r.is_alternative() for r in missed)),
-            ("  where it is found: on exactly the right targets", "", *_share(all(r.score["targets"].values()) for r in right)),
-            ("  where it is found: no effect named that is not there", "", *_share(not r.score["wrong"] for r in right)),
-            ("  where it is found: with the verdict effect_found", "", *_share(r.score["verdict"] for r in right)),
-            ("nothing hidden: false alarms", "<= 1 of 30", f"{sum(not r.score['verdict'] for r in decoys)}", f"{len(decoys)}"),
-            ("below the stated smallest size: no other effect named", "", *_share(not r.score["wrong"] for r in small)),
-            ("not in the library: unknown_effect", "", *_share(r.score["verdict"] for r in strangers)),
-            ("  with exactly the right joints", ">= 80 %", *_share(r.score["verdict"] and r.score["joints"] for r in strangers)),
+            (
+                "hidden effect ranked first (above the stated smallest size)",
+                ">= 95 %",
+                *_share(r.score["first"] for r in visible),
+            ),
+            (
+                "  the rest: declared confusable with the first",
+                "100 %",
+                *_share(r.is_alternative() for r in missed),
+            ),
+            (
+                "  where it is found: on exactly the right targets",
+                "",
+                *_share(all(r.score["targets"].values()) for r in right),
+            ),
+            (
+                "  where it is found: no effect named that is not there",
+                "",
+                *_share(not r.score["wrong"] for r in right),
+            ),
+            (
+                "  where it is found: with the verdict effect_found",
+                "",
+                *_share(r.score["verdict"] for r in right),
+            ),
+            (
+                "nothing hidden: false alarms",
+                "<= 1 of 30",
+                f"{sum(not r.score['verdict'] for r in decoys)}",
+                f"{len(decoys)}",
+            ),
+            (
+                "below the stated smallest size: no other effect named",
+                "",
+                *_share(not r.score["wrong"] for r in small),
+            ),
+            (
+                "not in the library: unknown_effect",
+                "",
+                *_share(r.score["verdict"] for r in strangers),
+            ),
+            (
+                "  with exactly the right joints",
+                ">= 80 %",
+                *_share(r.score["verdict"] and r.score["joints"] for r in strangers),
+            ),
             ("  a wrong name with confidence", "<= 10 %", *_share(r.is_wrong() for r in strangers)),
             ("two effects: both found", ">= 80 %", *_share(r.is_found() for r in pairs)),
-            ("held-out residual after adding <= 1.2 x noise", "100 %", *_share(r.diagnosis["held_out_after"] <= 1.2 for r in right)),
-            ("rollout error falls, where it is more than noise", "100 %", *_share(before > after for before, after in walks)),
+            (
+                "held-out residual after adding <= 1.2 x noise",
+                "100 %",
+                *_share(r.diagnosis["held_out_after"] <= 1.2 for r in right),
+            ),
+            (
+                "rollout error falls, where it is more than noise",
+                "100 %",
+                *_share(before > after for before, after in walks),
+            ),
             ("95 % intervals that hold the true value", "88 to 99 %", *_share(covered)),
-            ("half the stated smallest size: not found", "100 %", *_share(not any(r.score["found"].values()) for r in half)),
-            ("twice the stated smallest size: found", "100 %", *_share(r.is_found() for r in twice)),
+            (
+                "half the stated smallest size: not found",
+                "100 %",
+                *_share(not any(r.score["found"].values()) for r in half),
+            ),
+            (
+                "twice the stated smallest size: found",
+                "100 %",
+                *_share(r.is_found() for r in twice),
+            ),
             *(
                 (
                     f"another {m.description} than the model's: a wrong name with confidence",
@@ -375,9 +526,19 @@ class Figures:
                 )
                 for name, m in _MISMATCHES.items()
             ),
-            ("time of a diagnosis, median and longest, with all cores busy", "<= 60 s", _spread(times), f"{len(times)}"),
+            (
+                "time of a diagnosis, median and longest, with all cores busy",
+                "<= 60 s",
+                _spread(times),
+                f"{len(times)}",
+            ),
             *(
-                (f"  of a log {k} times as long", f"{k} times as long", _ratio(lengths, f"length-{k}", "length-1"), "1")
+                (
+                    f"  of a log {k} times as long",
+                    f"{k} times as long",
+                    _ratio(lengths, f"length-{k}", "length-1"),
+                    "1",
+                )
                 for k in (2, 4)
                 if f"length-{k}" in lengths
             ),
@@ -397,15 +558,36 @@ class Figures:
             if not mine:
                 continue
             seen = [r for r in mine if r in self.visible]
-            counts = [f"{sum(r.score['first'] for r in mine if r.size == size)}/{sum(r.size == size for r in mine)}" for size in SIZES]
+            counts = [
+                f"{sum(r.score['first'] for r in mine if r.size == size)}/{sum(r.size == size for r in mine)}"
+                for size in SIZES
+            ]
             others = Counter(r.label for r in seen if not r.score["first"])
             covered = [value for r in seen for value in r.score["covered"].values()]
             after = [r.diagnosis["held_out_after"] for r in seen if r.score["first"]]
             shown = ", ".join(f"{label} {count}" for label, count in others.items())
             middle = float(np.median(after)) if after else np.nan
             shrunk = sum(r.tree["answer"]["shrunk"] < 1 for r in mine)
-            rows.append((name, *counts, f"{len(mine) - len(seen)}", f"{shrunk}", shown, _share(covered)[0], middle))
-        header = ("hidden", *SIZES, "too small", "made smaller", "first instead", "intervals", "held-out after")
+            rows.append(
+                (
+                    name,
+                    *counts,
+                    f"{len(mine) - len(seen)}",
+                    f"{shrunk}",
+                    shown,
+                    _share(covered)[0],
+                    middle,
+                )
+            )
+        header = (
+            "hidden",
+            *SIZES,
+            "too small",
+            "made smaller",
+            "first instead",
+            "intervals",
+            "held-out after",
+        )
         return Table(header, tuple(rows))
 
     def failures(self) -> list[str]:
@@ -421,15 +603,26 @@ class Figures:
 
     def confusion(self) -> Figure:
         """How often each hidden effect led to each answer: shares of a row, with the counts."""
-        shown = [r for r in self.of("effect", "decoy", "stranger") if r.group != "effect" or r in self.visible]
+        shown = [
+            r
+            for r in self.of("effect", "decoy", "stranger")
+            if r.group != "effect" or r in self.visible
+        ]
         counts = Counter((r.truth, r.label) for r in shown)
         names = [*(name for name, effect in library().items() if not effect.composite), _NOTHING]
         rows = [name for name in (*names, *STRANGERS) if any(truth == name for truth, _ in counts)]
         columns = [*names, _UNKNOWN]
-        matrix = np.array([[counts[row, column] for column in columns] for row in rows], dtype=float).reshape(len(rows), len(columns))
+        matrix = np.array(
+            [[counts[row, column] for column in columns] for row in rows], dtype=float
+        ).reshape(len(rows), len(columns))
         figure = Figure(figsize=(12, 11), layout="constrained")
         axes = figure.add_subplot()
-        axes.imshow(matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1.4)
+        axes.imshow(
+            matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1),
+            cmap="Blues",
+            vmin=0,
+            vmax=1.4,
+        )
         for i, j in zip(*np.nonzero(matrix), strict=True):
             axes.text(j, i, f"{matrix[i, j]:.0f}", ha="center", va="center", fontsize=8)
         axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
@@ -489,7 +682,9 @@ class Store:
         done = {result.name for result in self.read(cases)}
         todo = [(case, self._path(case), self._sources) for case in cases if case.name not in done]
         # Numerical libraries must not start threads of their own beside a process for every core.
-        os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        os.environ |= dict.fromkeys(
+            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+        )
         # Drake's diagrams hold on to what they were built of: a process that simulates again and again grows.
         with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=10) as pool:
             for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
@@ -511,13 +706,38 @@ def _print(console: Console, title: str, table: Table) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs what has not been run, and prints the figures of all that has."""
     parser = argparse.ArgumentParser(description="How well missing physics is found.")
-    parser.add_argument("--quick", action="store_true", help="one seed, medium sizes, few of the other cases")
-    parser.add_argument("--only", default="", metavar="NAME", help="run only cases with this in their names, as effect-TorqueGain or decoy")
-    parser.add_argument("--seeds", type=int, default=3, help="number of seeds of each effect and size (default 3)")
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=SIZES, help="sizes of the effects (default all)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases that run at once (default: all cores)")
+    parser.add_argument(
+        "--quick", action="store_true", help="one seed, medium sizes, few of the other cases"
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="NAME",
+        help="run only cases with this in their names, as effect-TorqueGain or decoy",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="number of seeds of each effect and size (default 3)"
+    )
+    parser.add_argument(
+        "--sizes",
+        nargs="+",
+        choices=SIZES,
+        default=SIZES,
+        help="sizes of the effects (default all)",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=os.cpu_count(),
+        help="cases that run at once (default: all cores)",
+    )
     parser.add_argument("--keep", action="store_true", help="keep results of other sources")
-    parser.add_argument("--out", type=Path, default=Path("out/hidden"), help="where everything goes (default out/hidden)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/hidden"),
+        help="where everything goes (default out/hidden)",
+    )
     options = parser.parse_args(arguments)
     console = Console(width=190)
     store = Store(options.out / "cases", _sources(), keep=options.keep)
@@ -536,7 +756,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     everything = store.read([*drawn, *thresholds, *lengths])
     figures = Figures.of_finished(everything)
-    errors = [f"{result.name}:\n{result.tree['error']}" for result in everything if "error" in result.tree]
+    errors = [
+        f"{result.name}:\n{result.tree['error']}" for result in everything if "error" in result.tree
+    ]
     made = {"What was asked for": figures.table(), "By effect": figures.by_effect()}
     for title, table in made.items():
         _print(console, title, table)
@@ -547,13 +769,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     caption = "Hidden effects large enough to be found, decoys and strangers; numbers count cases."
     sections = (
         *(Section(title, tables=(table,)) for title, table in made.items()),
-        Section("Confusion", figures=(FigureBlock("What was hidden and what was ranked first", caption, confusion),)),
+        Section(
+            "Confusion",
+            figures=(FigureBlock("What was hidden and what was ranked first", caption, confusion),),
+        ),
         Section("Cases that went wrong", details=(Details("One line each", failures or "none"),)),
     )
     versions = len({result.tree["sources"] for result in everything})
     outcome = f"{len(everything)} cases, made by {versions} version{'s' if versions != 1 else ''} of the sources."
     console.print(outcome, highlight=False)
-    write_report(options.out / "report.html", Report("Finding the missing physics", not errors, outcome, sections))
+    write_report(
+        options.out / "report.html",
+        Report("Finding the missing physics", not errors, outcome, sections),
+    )
     console.print(f"Report: {options.out / 'report.html'}", highlight=False)
 
 

@@ -92,12 +92,22 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="fbse", description="Find the friction, and the missing physics, of a legged robot.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    parser = _Parser(
+        prog="fbse", description="Find the friction, and the missing physics, of a legged robot."
+    )
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=_Parser
+    )
 
-    run = commands.add_parser("simulate", help="run a scenario", description="Simulates a scenario; writes log, metrics and report.")
+    run = commands.add_parser(
+        "simulate",
+        help="run a scenario",
+        description="Simulates a scenario; writes log, metrics and report.",
+    )
     _add_scenario(run)
-    run.add_argument("--meshcat", action="store_true", help="show the run in a browser; also writes meshcat.html")
+    run.add_argument(
+        "--meshcat", action="store_true", help="show the run in a browser; also writes meshcat.html"
+    )
     _add_output(run, "out/ and the name of the scenario or of its file")
     run.set_defaults(run=_simulate)
 
@@ -112,7 +122,12 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(run=_estimate)
 
     for name, function, short, description in (
-        ("compare", _compare, "where a scenario's model fails on a log", "Says where a scenario's model fails on a log."),
+        (
+            "compare",
+            _compare,
+            "where a scenario's model fails on a log",
+            "Says where a scenario's model fails on a log.",
+        ),
         (
             "diagnose",
             _diagnose,
@@ -125,14 +140,26 @@ def _parser() -> argparse.ArgumentParser:
             "inertial parameters and plain friction",
             "Identifies the inertial parameters that a scenario does not trust (identify.inertia), with plain friction.",
         ),
-        ("study", _study, "diagnose, add, and again", "Adds what a scenario's model lacks until a log shows nothing more."),
+        (
+            "study",
+            _study,
+            "diagnose, add, and again",
+            "Adds what a scenario's model lacks until a log shows nothing more.",
+        ),
     ):
-        run = commands.add_parser(name, help=short, description=f"{description} Writes {name}.json and a report.")
+        run = commands.add_parser(
+            name, help=short, description=f"{description} Writes {name}.json and a report."
+        )
         _add_scenario(run)
         _add_log(run)
         if function in (_study, _identify):
             run.add_argument(
-                "--test", metavar="LOG", type=Path, action="append", default=[], help="another log to test on; nothing is fitted to it"
+                "--test",
+                metavar="LOG",
+                type=Path,
+                action="append",
+                default=[],
+                help="another log to test on; nothing is fitted to it",
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
         run.set_defaults(run=function)
@@ -142,10 +169,22 @@ def _parser() -> argparse.ArgumentParser:
         help="make a log of a recording, or a bag of a log",
         description="Makes a log of recordings (ROS bags, CSV, JSON, MATLAB, npz), or of a log a file for other programs (mcap, csv).",
     )
-    run.add_argument("inputs", metavar="IN", type=Path, nargs="+", help="a recording or a log; several recordings become one log")
-    run.add_argument("out", metavar="OUT", type=Path, help="the file to write: .npz (a log), .mcap or .csv")
+    run.add_argument(
+        "inputs",
+        metavar="IN",
+        type=Path,
+        nargs="+",
+        help="a recording or a log; several recordings become one log",
+    )
+    run.add_argument(
+        "out", metavar="OUT", type=Path, help="the file to write: .npz (a log), .mcap or .csv"
+    )
     _add_map(run)
-    run.add_argument("--strict", action="store_true", help="refuse recordings of which something must be left out")
+    run.add_argument(
+        "--strict",
+        action="store_true",
+        help="refuse recordings of which something must be left out",
+    )
     run.add_argument("--force", action="store_true", help="replace OUT if it exists")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.set_defaults(run=_convert)
@@ -156,9 +195,23 @@ def _parser() -> argparse.ArgumentParser:
         description="Writes a scenario whose model has what a diagnosis found.",
     )
     _add_scenario(run)
-    run.add_argument("diagnosis", metavar="DIAGNOSIS", type=Path, help="what diagnose wrote: its folder, or diagnosis.json")
-    run.add_argument("--effect", help="an effect of the diagnosis' ranking (default: all that the diagnosis chose)")
-    run.add_argument("--out", metavar="NEW_SCENARIO", type=Path, required=True, help="the new scenario's file (yaml)")
+    run.add_argument(
+        "diagnosis",
+        metavar="DIAGNOSIS",
+        type=Path,
+        help="what diagnose wrote: its folder, or diagnosis.json",
+    )
+    run.add_argument(
+        "--effect",
+        help="an effect of the diagnosis' ranking (default: all that the diagnosis chose)",
+    )
+    run.add_argument(
+        "--out",
+        metavar="NEW_SCENARIO",
+        type=Path,
+        required=True,
+        help="the new scenario's file (yaml)",
+    )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.set_defaults(run=_add)
 
@@ -168,10 +221,21 @@ def _parser() -> argparse.ArgumentParser:
         description="Hides an effect in a scenario's robot and writes the log without it in the model, and the answer sealed (see reveal).",
     )
     _add_scenario(run)
-    run.add_argument("--seed", type=_whole_number, required=True, help="decides on what is hidden and on the sensors' noise")
-    run.add_argument("--what", default="any", help="any, library, decoy (nothing), stranger (none of the library) or the name of an effect")
+    run.add_argument(
+        "--seed",
+        type=_whole_number,
+        required=True,
+        help="decides on what is hidden and on the sensors' noise",
+    )
+    run.add_argument(
+        "--what",
+        default="any",
+        help="any, library, decoy (nothing), stranger (none of the library) or the name of an effect",
+    )
     run.add_argument("--size", choices=SIZES, help="how large it is (default: drawn as well)")
-    run.add_argument("--count", type=_whole_number, default=1, help="how many effects are hidden (default: 1)")
+    run.add_argument(
+        "--count", type=_whole_number, default=1, help="how many effects are hidden (default: 1)"
+    )
     _add_output(run, "as for simulate, with _hidden at its end")
     run.set_defaults(run=_hide)
 
@@ -193,24 +257,42 @@ def _whole_number(text: str) -> int:
 
 
 def _add_scenario(run: argparse.ArgumentParser) -> None:
-    run.add_argument("scenario", metavar="SCENARIO", help="a YAML file, or the name of one in scenarios/")
-    run.add_argument("--name", help="which scenario of the file (default: its only one, or the one called like the file)")
     run.add_argument(
-        "--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help="changes a value, as in seed=3; repeatable"
+        "scenario", metavar="SCENARIO", help="a YAML file, or the name of one in scenarios/"
+    )
+    run.add_argument(
+        "--name",
+        help="which scenario of the file (default: its only one, or the one called like the file)",
+    )
+    run.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        dest="overrides",
+        help="changes a value, as in seed=3; repeatable",
     )
 
 
 def _add_log(run: argparse.ArgumentParser) -> None:
-    run.add_argument("log", metavar="LOG", type=Path, help="a log file (npz), or a recording (see convert)")
+    run.add_argument(
+        "log", metavar="LOG", type=Path, help="a log file (npz), or a recording (see convert)"
+    )
     _add_map(run)
 
 
 def _add_map(run: argparse.ArgumentParser) -> None:
-    run.add_argument("--map", metavar="MAP", help="what a recording's columns or topics mean (yaml); standard messages need none")
+    run.add_argument(
+        "--map",
+        metavar="MAP",
+        help="what a recording's columns or topics mean (yaml); standard messages need none",
+    )
 
 
 def _add_output(run: argparse.ArgumentParser, default: str) -> None:
-    run.add_argument("--out", metavar="DIR", type=Path, help=f"where the results go (default: {default})")
+    run.add_argument(
+        "--out", metavar="DIR", type=Path, help=f"where the results go (default: {default})"
+    )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
@@ -219,13 +301,21 @@ def _simulate(options: argparse.Namespace) -> int:
     out = _output_folder(options, "")
     console = Console(quiet=options.quiet)
     meshcat = _start_meshcat(console) if options.meshcat else None
-    with located(f"{options.scenario}: "), _progress(console, f"simulating {name}", scenario.duration) as progress:
+    with (
+        located(f"{options.scenario}: "),
+        _progress(console, f"simulating {name}", scenario.duration) as progress,
+    ):
         result = simulate(scenario, name=name, meshcat=meshcat, progress=progress)
-    _write_results(console, out, name, scenario, result.log, run_metrics(result.log, result.wall_time))
+    _write_results(
+        console, out, name, scenario, result.log, run_metrics(result.log, result.wall_time)
+    )
     if meshcat is not None:
         write_text(out / "meshcat.html", meshcat.StaticHtml())
     if result.failure is not None:
-        print(f"fbse: {name}: {result.failure}; what was recorded until then is in {out}", file=sys.stderr)
+        print(
+            f"fbse: {name}: {result.failure}; what was recorded until then is in {out}",
+            file=sys.stderr,
+        )
         return FAILED
     return DONE
 
@@ -238,9 +328,14 @@ def _estimate(options: argparse.Namespace) -> int:
         raise InputError(f"--out {out}: the log with the estimates would overwrite {options.log}")
     console = Console(quiet=options.quiet)
     start, end = float(log.time[0]), float(log.time[-1])
-    with located(f"{options.scenario} over {options.log}: "), _progress(console, f"estimating with {name}", end - start) as progress:
+    with (
+        located(f"{options.scenario} over {options.log}: "),
+        _progress(console, f"estimating with {name}", end - start) as progress,
+    ):
         result = estimate(scenario, log, progress=lambda time: progress(time - start))
-    estimated = replace(result.log, meta=result.log.meta | {"estimator_scenario": dump_scenario(scenario, name)})
+    estimated = replace(
+        result.log, meta=result.log.meta | {"estimator_scenario": dump_scenario(scenario, name)}
+    )
     metrics = run_metrics(estimated, float(result.tick_time.sum()), result.tick_time)
     _write_results(console, out, name, scenario, estimated, metrics)
     for remark in result.remarks:
@@ -274,7 +369,13 @@ def _diagnose(options: argparse.Namespace) -> int:
     _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
     with console.status("writing the report"):
         write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)
-    _conclude(console, out, inputs.hygiene, diagnosis_outcome(diagnosis), _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]))
+    _conclude(
+        console,
+        out,
+        inputs.hygiene,
+        diagnosis_outcome(diagnosis),
+        _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]),
+    )
     return DONE
 
 
@@ -283,7 +384,9 @@ def _study(options: argparse.Namespace) -> int:
     train, tests = _train_and_tests(scenario, log, options)
     with _errors_located(options), console.status("comparing the model with the log") as status:
         predictor = _checked(scenario, train)
-        inputs = replace(inputs, hygiene=inspect(predictor.motion), tests=tuple(map(str, options.test)))
+        inputs = replace(
+            inputs, hygiene=inspect(predictor.motion), tests=tuple(map(str, options.test))
+        )
         comparison = compare(predictor)
         result = study(scenario, train, tests=tests, progress=status.update)
         status.update("comparing the completed model with the log")
@@ -293,16 +396,38 @@ def _study(options: argparse.Namespace) -> int:
     if result.found:
         write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
     with console.status("writing the report"):
-        write_study_report(out / "report.html", result, (predictor, comparison), completed, inputs, tests)
-    relative = [name for name, error in result.steps[0].errors.items() if np.isfinite(error.relative)] if tests else []
+        write_study_report(
+            out / "report.html", result, (predictor, comparison), completed, inputs, tests
+        )
+    relative = (
+        [name for name, error in result.steps[0].errors.items() if np.isfinite(error.relative)]
+        if tests
+        else []
+    )
     columns = [f"relative error, {name}" for name in relative]
-    table = Table("added", "held-out error / noise", "fitted error / noise", *columns, title=inputs.name, title_justify="left")
+    table = Table(
+        "added",
+        "held-out error / noise",
+        "fitted error / noise",
+        *columns,
+        title=inputs.name,
+        title_justify="left",
+    )
     for step in result.steps:
-        effects = [f"{spaced(effect)} ({targets_text(targets)})" for effect, targets in by_effect(step.added).items()]
+        effects = [
+            f"{spaced(effect)} ({targets_text(targets)})"
+            for effect, targets in by_effect(step.added).items()
+        ]
         added = ", ".join(effects) or "the model as given"
         shares = (f"{100 * step.errors[name].relative:.2f} %" for name in relative)
         table.add_row(added, number(step.held_out_rmse), number(step.train_rmse), *shares)
-    _conclude(console, out, inputs.hygiene, f"{study_outcome(result)} Stopped because {result.stopped_because}.", table)
+    _conclude(
+        console,
+        out,
+        inputs.hygiene,
+        f"{study_outcome(result)} Stopped because {result.stopped_because}.",
+        table,
+    )
     return DONE
 
 
@@ -318,7 +443,10 @@ def _identify(options: argparse.Namespace) -> int:
     console.print(identifiability_text(result.inertia), highlight=False)
     table = Table(*BASE_HEADER, title=inputs.name, title_justify="left")
     for base in result.inertia.base_parameters:
-        table.add_row(f"{base.body} {base.parameter}{', with others' if base.others else ''}", *base_row(base)[1:])
+        table.add_row(
+            f"{base.body} {base.parameter}{', with others' if base.others else ''}",
+            *base_row(base)[1:],
+        )
     console.print(table)
     errors = Table(*ERROR_HEADER)
     for row in error_rows(result):
@@ -327,7 +455,9 @@ def _identify(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _train_and_tests(scenario: Scenario, log: Log, options: argparse.Namespace) -> tuple[Log, dict[str, Log]]:
+def _train_and_tests(
+    scenario: Scenario, log: Log, options: argparse.Namespace
+) -> tuple[Log, dict[str, Log]]:
     """What models are fitted to, and logs to test them on, by name."""
     train, rest = train_and_rest(scenario, log)
     tests = {"rest of the log": rest} if rest is not None else {}
@@ -342,10 +472,14 @@ def _convert(options: argparse.Namespace) -> int:
     if out.exists() and any(path.exists() and path.samefile(out) for path in options.inputs):
         raise InputError(f"{out}: this is what is to be converted")
     with console.status("reading") as status:
-        log = read_logs(options.inputs, options.map, progress=lambda text: status.update(escape(text)))
+        log = read_logs(
+            options.inputs, options.map, progress=lambda text: status.update(escape(text))
+        )
         findings = log.meta.get("findings", [])
         if findings and options.strict:
-            raise InputError(f"{findings[0]}{f' (and {len(findings) - 1} more findings)' if findings[1:] else ''}")
+            raise InputError(
+                f"{findings[0]}{f' (and {len(findings) - 1} more findings)' if findings[1:] else ''}"
+            )
         status.update(f"writing {escape(out.name)}")
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
@@ -353,7 +487,10 @@ def _convert(options: argparse.Namespace) -> int:
         except OSError as error:
             raise InputError(f"{out}: {error.strerror or error}") from None
     table = Table(title=escape(str(out)), show_header=False, title_justify="left")
-    table.add_row("rows", f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} s apart")
+    table.add_row(
+        "rows",
+        f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} s apart",
+    )
     table.add_row("joints", ", ".join(log.joints))
     table.add_row("channels", ", ".join(name for name in log if name != "time"))
     for finding in findings:
@@ -362,11 +499,19 @@ def _convert(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _scenario_and_log(options: argparse.Namespace, suffix: str) -> tuple[Console, Scenario, Inputs, Log, Path]:
+def _scenario_and_log(
+    options: argparse.Namespace, suffix: str
+) -> tuple[Console, Scenario, Inputs, Log, Path]:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
     log = read_log(options.log, options.map)
     out = _output_folder(options, suffix)
-    return Console(quiet=options.quiet), scenario, Inputs(name, options.scenario, str(options.log), str(out)), log, out
+    return (
+        Console(quiet=options.quiet),
+        scenario,
+        Inputs(name, options.scenario, str(options.log), str(out)),
+        log,
+        out,
+    )
 
 
 def _errors_located(options: argparse.Namespace) -> AbstractContextManager[None]:
@@ -380,7 +525,9 @@ def _checked(scenario: Scenario, log: Log) -> Predictor:
     return predictor
 
 
-def _write_findings(out: Path, kind: str, content: dict[str, Any], scenario: Scenario, inputs: Inputs) -> None:
+def _write_findings(
+    out: Path, kind: str, content: dict[str, Any], scenario: Scenario, inputs: Inputs
+) -> None:
     """Writes what was found, under its own name and as metrics.json, and the scenario."""
     content = {**content, "hygiene": hygiene_json(inputs.hygiene)}
     write_json(out / f"{kind}.json", content)
@@ -402,7 +549,15 @@ def _conclude(console: Console, out: Path, hygiene: Hygiene, outcome: str, table
 
 
 def _findings_table(title: str, findings: Sequence[Finding]) -> Table:
-    table = Table("effect", "in", "held-out error before", "after", "values (95 % interval)", title=title, title_justify="left")
+    table = Table(
+        "effect",
+        "in",
+        "held-out error before",
+        "after",
+        "values (95 % interval)",
+        title=title,
+        title_justify="left",
+    )
     for finding in findings:
         name = spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})"
         errors = (number(error) for error in (finding.held_out_before, finding.held_out_after))
@@ -429,7 +584,10 @@ def _add(options: argparse.Namespace) -> int:
     if out.exists() and Path(options.scenario).is_file() and out.samefile(options.scenario):
         raise InputError(f"--out {out}: the new scenario would overwrite the old one")
     header = "\n# ".join(
-        [f"{_ADDED} to {options.scenario}, from {path}.", *(line for finding in findings for line in _value_lines(finding))]
+        [
+            f"{_ADDED} to {options.scenario}, from {path}.",
+            *(line for finding in findings for line in _value_lines(finding)),
+        ]
     )
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -446,7 +604,10 @@ def _value_lines(finding: Finding) -> list[str]:
     """Values with their 95 % intervals, and what they bring; for the comments of a scenario."""
     where = f"{finding.effect} in {targets_text(finding.targets)}"
     errors = f"{where}: held-out error {finding.held_out_before:.3g} times the noise before, {finding.held_out_after:.3g} after"
-    values = [f"{where}: {parameter_text(name, estimate)}, with its 95 % interval" for name, estimate in finding.parameters.items()]
+    values = [
+        f"{where}: {parameter_text(name, estimate)}, with its 95 % interval"
+        for name, estimate in finding.parameters.items()
+    ]
     return [errors, *values]
 
 
@@ -455,12 +616,26 @@ def _hide(options: argparse.Namespace) -> int:
     out = _output_folder(options, "_hidden")
     console = Console(quiet=options.quiet)
     start = clock.perf_counter()
-    with located(f"{options.scenario}: "), _progress(console, f"simulating {name}", scenario.duration) as progress:
-        hide(scenario, name, options.seed, out, what=options.what, size=options.size, count=options.count, progress=progress)
+    with (
+        located(f"{options.scenario}: "),
+        _progress(console, f"simulating {name}", scenario.duration) as progress,
+    ):
+        hide(
+            scenario,
+            name,
+            options.seed,
+            out,
+            what=options.what,
+            size=options.size,
+            count=options.count,
+            progress=progress,
+        )
     log, (_, public) = Log.load(out / "log.npz"), read_scenario(str(out / "scenario.yaml"))
     _write_results(console, out, name, public, log, run_metrics(log, clock.perf_counter() - start))
     console.print(
-        f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}", highlight=False, soft_wrap=True
+        f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}",
+        highlight=False,
+        soft_wrap=True,
     )
     return DONE
 
@@ -470,21 +645,34 @@ def _reveal(options: argparse.Namespace) -> int:
     answer, score = revealed["answer"], revealed["score"]
     write_json(options.folder / "answer.json", revealed)
     console = Console(quiet=options.quiet)
-    table = Table("hidden", "in", "values", title=f"{options.folder}: {answer['kind']}", title_justify="left")
+    table = Table(
+        "hidden", "in", "values", title=f"{options.folder}: {answer['kind']}", title_justify="left"
+    )
     for effect in answer["effects"]:
-        values = (f"{key} {number(float(next(iter(by_target.values()))))}" for key, by_target in effect["parameters"].items())
+        values = (
+            f"{key} {number(float(next(iter(by_target.values()))))}"
+            for key, by_target in effect["parameters"].items()
+        )
         table.add_row(spaced(effect["effect"]), targets_text(effect["targets"]), ", ".join(values))
     console.print(table if answer["effects"] else "Nothing was hidden.")
     if score is None:
-        console.print(f"No diagnosis.json or study.json in {options.folder} to score.", highlight=False)
+        console.print(
+            f"No diagnosis.json or study.json in {options.folder} to score.", highlight=False
+        )
         return DONE
     verdict = "right" if score["verdict"] else "wrong"
-    found = ", ".join(f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in score["found"].items())
-    console.print("; ".join(part for part in (f"Verdict: {verdict}", found) if part) + ".", highlight=False)
+    found = ", ".join(
+        f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in score["found"].items()
+    )
+    console.print(
+        "; ".join(part for part in (f"Verdict: {verdict}", found) if part) + ".", highlight=False
+    )
     return DONE
 
 
-def _write_results(console: Console, out: Path, name: str, scenario: Scenario, log: Log, metrics: dict[str, Any]) -> None:
+def _write_results(
+    console: Console, out: Path, name: str, scenario: Scenario, log: Log, metrics: dict[str, Any]
+) -> None:
     """Writes log, metrics, scenario and report, and says what came out."""
     with console.status("writing the report"):
         log.save(out / "log.npz")
@@ -524,8 +712,15 @@ def _start_meshcat(console: Console) -> Meshcat:
 @contextmanager
 def _progress(console: Console, title: str, duration: float) -> Iterator[Callable[[float], None]]:
     """A bar over simulated or recorded time; its value is the function to call with it."""
-    columns = (TextColumn(title), BarColumn(), TextColumn("{task.completed:.1f} of {task.total:.1f} s"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        TextColumn("{task.completed:.1f} of {task.total:.1f} s"),
+        TimeElapsedColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
         task = bar.add_task(title, total=duration)
         yield lambda time: bar.update(task, completed=time)
 
@@ -535,18 +730,36 @@ def _summary(name: str, metrics: dict[str, Any]) -> Group:
     table.add_row("outcome", metrics["outcome"])
     table.add_row("length", f"{metrics['simulated_time']:.2f} s")
     table.add_row("real time factor", f"{metrics['real_time_factor']:.2f}")
-    tracking, creep, tick = (metrics[key] for key in ("joint_tracking_rms", "stance_creep_max", "tick_us"))
+    tracking, creep, tick = (
+        metrics[key] for key in ("joint_tracking_rms", "stance_creep_max", "tick_us")
+    )
     law = metrics["friction_law_error"]
     worst, farthest = worst_joint(tracking), worst_joint(law)
     largest = max((value for value in creep.values() if not np.isnan(value)), default=np.nan)
     for label, values, text in (
         ("joint tracking rms, worst", tracking, f"{1e3 * tracking[worst]:.2f} mrad ({worst})"),
         ("torque less its law, worst", law, f"{percent(law[farthest])} ({farthest})"),
-        ("CoM error, mean", metrics["com_rse_mean"], _by_name(metrics["com_rse_mean"], "{:.2f} mm", 1e3)),
+        (
+            "CoM error, mean",
+            metrics["com_rse_mean"],
+            _by_name(metrics["com_rse_mean"], "{:.2f} mm", 1e3),
+        ),
         ("stance creep, largest", creep, f"{1e3 * largest:.3f} mm"),
-        ("attitude error, rms", metrics["attitude_rmse_deg"], _by_name(metrics["attitude_rmse_deg"], "{:.3f} deg")),
-        ("base velocity error, rms", metrics["base_velocity_rmse"], _by_name(metrics["base_velocity_rmse"], "{:.2f} mm/s", 1e3)),
-        ("estimator tick", tick, f"median {tick['median']:.0f} µs, 99 % below {tick['p99']:.0f} µs"),
+        (
+            "attitude error, rms",
+            metrics["attitude_rmse_deg"],
+            _by_name(metrics["attitude_rmse_deg"], "{:.3f} deg"),
+        ),
+        (
+            "base velocity error, rms",
+            metrics["base_velocity_rmse"],
+            _by_name(metrics["base_velocity_rmse"], "{:.2f} mm/s", 1e3),
+        ),
+        (
+            "estimator tick",
+            tick,
+            f"median {tick['median']:.0f} µs, 99 % below {tick['p99']:.0f} µs",
+        ),
     ):
         if not _unknown(values):
             table.add_row(label, text)

@@ -59,17 +59,25 @@ class Log(Mapping[str, np.ndarray]):
         for name, values in self.channels.items():
             _, sample_shape = channel_kind(name)
             expected = (samples, *(n if size == "n" else size for size in sample_shape))
-            if len(values.shape) != len(expected) or any(e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)):
-                raise InputError(f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}")
+            if len(values.shape) != len(expected) or any(
+                e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)
+            ):
+                raise InputError(
+                    f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}"
+                )
             if values.dtype.kind not in "fiub":
                 raise InputError(f"channel {name}: expected numbers, found {values.dtype}")
             finite = np.isfinite(values).reshape(samples, -1).all(axis=1)
             if not finite.all():
-                raise InputError(f"channel {name}: not a finite number in row {int(finite.argmin())}")
+                raise InputError(
+                    f"channel {name}: not a finite number in row {int(finite.argmin())}"
+                )
         backwards = np.diff(self.channels["time"]) <= 0
         if backwards.any():
             row = int(backwards.argmax()) + 1
-            raise InputError(f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} s)")
+            raise InputError(
+                f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} s)"
+            )
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.channels:
@@ -104,7 +112,11 @@ class Log(Mapping[str, np.ndarray]):
 
     def save(self, path: str | Path) -> None:
         """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""
-        meta = {"format_version": FORMAT_VERSION, **self.meta, "units": {name: self.unit(name) for name in self.channels}}
+        meta = {
+            "format_version": FORMAT_VERSION,
+            **self.meta,
+            "units": {name: self.unit(name) for name in self.channels},
+        }
 
         def write(partial: Path) -> None:
             with partial.open("wb") as file:
@@ -138,7 +150,9 @@ class Log(Mapping[str, np.ndarray]):
         version = meta.pop("format_version", None)
         meta.pop("units", None)
         if version != FORMAT_VERSION:
-            raise InputError(f"{path}: log format version {version}, this program reads {FORMAT_VERSION}")
+            raise InputError(
+                f"{path}: log format version {version}, this program reads {FORMAT_VERSION}"
+            )
         with located(f"{path}: "):
             return cls(content, meta)
 

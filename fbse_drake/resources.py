@@ -27,4 +27,6 @@ def find(name_or_path: str | Path, *, kind: str) -> Path:
         return shipped
     files = (p.relative_to(folder(kind)).with_suffix("") for p in folder(kind).rglob("*.yaml"))
     names = ", ".join(sorted(p.as_posix() for p in files if p.suffix not in (".dmd", ".map")))
-    raise InputError(f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {names})")
+    raise InputError(
+        f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {names})"
+    )

@@ -26,4 +26,8 @@ def state_views(system: System, context: Context) -> list[DiscreteValues]:
     """
     if not isinstance(system, Diagram):
         return [context.get_discrete_state()]
-    return [view for inner in system.GetSystems() for view in state_views(inner, system.GetSubsystemContext(inner, context))]
+    return [
+        view
+        for inner in system.GetSystems()
+        for view in state_views(inner, system.GetSubsystemContext(inner, context))
+    ]

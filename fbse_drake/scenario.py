@@ -164,13 +164,22 @@ class RecordingConfig:
     def __post_init__(self) -> None:
         require_positive(self, "block")
         require_not_negative(self, "cutoff", "recorded_cutoff")
-        for key, allowed in (("rows", ("per_step", "instantaneous")), ("velocity", ("measured", "differenced"))):
+        for key, allowed in (
+            ("rows", ("per_step", "instantaneous")),
+            ("velocity", ("measured", "differenced")),
+        ):
             if getattr(self, key) not in allowed:
-                raise InputError(f"{key}: expected {' or '.join(allowed)}, found {getattr(self, key)}")
+                raise InputError(
+                    f"{key}: expected {' or '.join(allowed)}, found {getattr(self, key)}"
+                )
         if self.cutoff > 0 and self.block * self.cutoff < 0.5:
-            raise InputError(f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found {self.block:g} s")
+            raise InputError(
+                f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found {self.block:g} s"
+            )
         if not 0 < self.train_share <= 1:
-            raise InputError(f"train_share: expected a number in (0, 1], found {self.train_share:g}")
+            raise InputError(
+                f"train_share: expected a number in (0, 1], found {self.train_share:g}"
+            )
         for key in ("torque_noise", "torque_noise_share", "least_speed"):
             for joint, value in getattr(self, key).items():
                 if value < 0:
@@ -189,7 +198,9 @@ class IdentifyConfig:
     def __post_init__(self) -> None:
         for name in self.ruled_out:
             if name not in library():
-                raise InputError(f"ruled_out: {name}: no such effect (there are: {', '.join(library())})")
+                raise InputError(
+                    f"ruled_out: {name}: no such effect (there are: {', '.join(library())})"
+                )
 
 
 @dataclass(frozen=True)
@@ -202,7 +213,9 @@ class LogConfig:
 
 def _plant_config() -> MultibodyPlantConfig:
     # "lagged" holds stance feet still; "sap" lets them creep by millimetres over a walk.
-    return MultibodyPlantConfig(time_step=0.001, contact_model="point", discrete_contact_approximation="lagged")
+    return MultibodyPlantConfig(
+        time_step=0.001, contact_model="point", discrete_contact_approximation="lagged"
+    )
 
 
 # Control, log and sensors tick at least this far apart, unless they are given a period [s].
@@ -258,13 +271,17 @@ class Scenario:
             raise InputError(f"seed: expected a whole number >= 0, found {self.seed}")
         for key in ("time_step", "stiction_tolerance", "penetration_allowance"):
             if getattr(self.plant, key) <= 0:
-                raise InputError(f"plant.{key}: expected a number > 0, found {getattr(self.plant, key):g}")
+                raise InputError(
+                    f"plant.{key}: expected a number > 0, found {getattr(self.plant, key):g}"
+                )
         try:
             ApplyMultibodyPlantConfig(self.plant, MultibodyPlant(self.plant.time_step))
         except RuntimeError as error:
             raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:
-            raise InputError("plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False")
+            raise InputError(
+                "plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False"
+            )
         approximation = self.plant.discrete_contact_approximation
         if approximation == "tamsi":
             allowed = "sap, similar or lagged, which solve joint friction too"
@@ -276,11 +293,15 @@ class Scenario:
         object.__setattr__(self, "log", _with_period(self.log, usual))
         object.__setattr__(self, "sensors", self.sensors.with_period(usual))
         if self.duration < self.control.period:
-            raise InputError(f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}")
+            raise InputError(
+                f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}"
+            )
         if isinstance(self.estimator, NoEstimator) and self.compensation.uses_estimate:
             raise InputError("compensation: needs an estimator (estimator: !Fbse {})")
         if isinstance(self.estimator, TorqueSensor) and self.sensors.joint_torque is None:
-            raise InputError("estimator: !TorqueSensor needs sensors.joint_torque (as in sensors.joint_torque: {noise: 0.3})")
+            raise InputError(
+                "estimator: !TorqueSensor needs sensors.joint_torque (as in sensors.joint_torque: {noise: 0.3})"
+            )
         periods = {"control.period": self.control.period, "log.period": self.log.period}
         for name, sensor in self.sensors.by_name.items():
             where = f"sensors.more.{name}" if name in self.sensors.more else f"sensors.{name}"
@@ -289,7 +310,9 @@ class Scenario:
         for key, period in periods.items():
             steps = period / self.plant.time_step
             if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:
-                raise InputError(f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}")
+                raise InputError(
+                    f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}"
+                )
 
     @property
     def usual_period(self) -> float:
@@ -309,7 +332,9 @@ class Scenario:
         """The model, also where the scenario leaves it out."""
         if self.model is not None:
             return self.model
-        return RobotConfig(self.robot.description, self.robot.gantry_height, self.robot.rotor_inertia)
+        return RobotConfig(
+            self.robot.description, self.robot.gantry_height, self.robot.rotor_inertia
+        )
 
 
 def build_robot(
@@ -330,7 +355,9 @@ def build_robot(
     """
     bare, _ = make_robot(config.description)
     added, point_masses = inertia_changes(config.effects, bare)
-    rotor_inertia = added + bare.description.per_joint(config.rotor_inertia, key="rotor_inertia", default=0.0)
+    rotor_inertia = added + bare.description.per_joint(
+        config.rotor_inertia, key="rotor_inertia", default=0.0
+    )
     robot, _ = make_robot(
         config.description,
         rotor_inertia=dict(zip(bare.joint_names, rotor_inertia, strict=True)),
@@ -356,7 +383,9 @@ def planned_reference(scenario: Scenario, model: Robot) -> Reference:
         return make_reference(scenario.reference, model, time)
 
 
-def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(
+    scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()
+) -> Scenario:
     """Reads a scenario.
 
     Args:
@@ -370,14 +399,18 @@ def load_scenario(scenario: str | Path, name: str | None = None, overrides: Sequ
     return read_scenario(scenario, name, overrides)[1]
 
 
-def read_scenario(scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()) -> tuple[str, Scenario]:
+def read_scenario(
+    scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()
+) -> tuple[str, Scenario]:
     """As `load_scenario`; returns the scenario's name as well."""
     path = resources.find(scenario, kind="scenarios")
     file = schema.load_tree(path)
     if name is None:
         name = next(iter(file)) if len(file) == 1 else path.stem
     if name not in file:
-        raise InputError(f"{path}: no scenario called {name} (there are: {', '.join(map(str, file))})")
+        raise InputError(
+            f"{path}: no scenario called {name} (there are: {', '.join(map(str, file))})"
+        )
     tree = file[name] if file[name] is not None else {}
     source = str(path)
     for override in overrides:
@@ -426,7 +459,9 @@ def dump_scenario(scenario: Scenario, name: str) -> str:
 def _override(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise InputError(f"--set {text}: expected KEY=VALUE, as in --set reference.step_length=0.05")
+        raise InputError(
+            f"--set {text}: expected KEY=VALUE, as in --set reference.step_length=0.05"
+        )
     try:
         tree: Any = yaml_load(data=f"value: {value}")["value"]
     except yaml.YAMLError:

@@ -39,7 +39,9 @@ def load_tree(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark else ""
-        raise InputError(f"{path}{where}: not valid YAML: {getattr(error, 'problem', error)}") from None
+        raise InputError(
+            f"{path}{where}: not valid YAML: {getattr(error, 'problem', error)}"
+        ) from None
     if not isinstance(tree, dict):
         raise InputError(f"{path}: expected a mapping of keys to values, found {_describe(tree)}")
     return tree
@@ -53,7 +55,11 @@ def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
             merged.pop(key, None)
             continue
         old = merged.get(key)
-        same_kind = isinstance(old, dict) and isinstance(value, dict) and value.get("_tag", old.get("_tag")) == old.get("_tag")
+        same_kind = (
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and value.get("_tag", old.get("_tag")) == old.get("_tag")
+        )
         merged[key] = merge(old, value) if same_kind else value
     return merged
 
@@ -77,7 +83,13 @@ def dump(value: Any, *, child_name: str) -> str:
 
     Drake's own `yaml_dump_typed` leaves out the tag of the first alternative, which would tie a file to the order of alternatives.
     """
-    return yaml.dump({child_name: _tree(type(value), value)}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+    return yaml.dump(
+        {child_name: _tree(type(value), value)},
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=120,
+    )
 
 
 class _Tagged(dict):
@@ -131,7 +143,9 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         if not isinstance(value, dict):
             raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")
         old = default or {}
-        items = {str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()}
+        items = {
+            str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()
+        }
         return {**old, **items}
     return _mapping(schema, value, default, file, key)
 
@@ -166,7 +180,9 @@ def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, 
         tag = f"!{type(default).__name__}"
     if tag is None or tag[1:] not in names:
         found = f"the tag {tag}" if tag else f"{_describe(value)} without a tag"
-        raise InputError(f"{file}{key}: expected one of {', '.join(f'!{name}' for name in names)}, found {found}")
+        raise InputError(
+            f"{file}{key}: expected one of {', '.join(f'!{name}' for name in names)}, found {found}"
+        )
     schema = names[tag[1:]]
     return _mapping(schema, value, default if type(default) is schema else None, file, key)
 
@@ -181,7 +197,9 @@ def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         if name not in fields:
             close = difflib.get_close_matches(str(name), fields, n=1)
             hint = f", did you mean {close[0]}?" if close else ""
-            raise InputError(f"{file}{prefix}{name}: unknown key{hint} (allowed: {', '.join(fields)})")
+            raise InputError(
+                f"{file}{prefix}{name}: unknown key{hint} (allowed: {', '.join(fields)})"
+            )
     defaults = _defaults(schema)
     if default is not None:
         defaults = {name: getattr(default, name) for name in fields}

@@ -84,7 +84,11 @@ def _postponed_interruption() -> Iterator[threading.Event]:
 
 
 def _simulate(
-    scenario: Scenario, name: str, meshcat: Meshcat | None, progress: Callable[[float], None] | None, interrupted: threading.Event
+    scenario: Scenario,
+    name: str,
+    meshcat: Meshcat | None,
+    progress: Callable[[float], None] | None,
+    interrupted: threading.Event,
 ) -> SimulationResult:
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
@@ -134,7 +138,9 @@ def _simulate(
     return SimulationResult(log, failure, wall_time)
 
 
-def fall_reason(robot: Robot, context: Context, criterion: FallConfig, initial_height: float) -> str | None:
+def fall_reason(
+    robot: Robot, context: Context, criterion: FallConfig, initial_height: float
+) -> str | None:
     """Why the robot counts as fallen, in words, or None.
 
     Args:
@@ -181,7 +187,14 @@ def _base_pose(robot: Robot, context: Context) -> RigidTransform:
     return robot.plant.EvalBodyPoseInWorld(context, robot.base)
 
 
-def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog, failure: str | None, fell: bool) -> Log:
+def _make_log(
+    scenario: Scenario,
+    name: str,
+    station: Station,
+    record: VectorLog,
+    failure: str | None,
+    fell: bool,
+) -> Log:
     robot, time_step = station.robot, scenario.plant.time_step
     names = recorded_ports(station)
     ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
@@ -191,14 +204,21 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
     # Of the plant steps those that ended are known.
     steps = max(int(finite.sum()) - 1, 1)
     rows = np.arange(0, steps, round(scenario.log.period / time_step))
-    raw = {port: values[np.minimum(rows + signals.is_late(port), len(values) - 1)] for port, values in ticks.items()}
+    raw = {
+        port: values[np.minimum(rows + signals.is_late(port), len(values) - 1)]
+        for port, values in ticks.items()
+    }
     time = rows * time_step
     channels = {
         "time": time,
         **_port_channels(scenario.sensors, robot, raw),
         **_reference_channels(station.reference, time),
-        **_truth_channels(robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]),
-        "truth/joint/friction_law_torque": _law(scenario, robot, ticks)[np.minimum(rows, steps - 1)],
+        **_truth_channels(
+            robot, raw["plant_state"], raw["generalized_acceleration"], raw["true_pad_force"]
+        ),
+        "truth/joint/friction_law_torque": _law(scenario, robot, ticks)[
+            np.minimum(rows, steps - 1)
+        ],
     }
     meta = {
         "joints": robot.joint_names,
@@ -215,7 +235,12 @@ def _make_log(scenario: Scenario, name: str, station: Station, record: VectorLog
         "source": "fbse_drake simulation",
         "title": scenario.title,
         "scenario": dump_scenario(scenario, name),
-        "outcome": {"finished": failure is None, "fell": fell, "reason": failure or "finished", "time": float(time[-1])},
+        "outcome": {
+            "finished": failure is None,
+            "fell": fell,
+            "reason": failure or "finished",
+            "time": float(time[-1]),
+        },
     }
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 
@@ -228,7 +253,9 @@ def _law(scenario: Scenario, robot: Robot, ticks: Mapping[str, np.ndarray]) -> n
         ticks: of every port at every plant tick, (N, size).
     """
     effects = scenario.robot.effects_of(JointTorqueEffect, robot.description, key="robot")
-    state, command, loss = (ticks[name] for name in ("plant_state", "torque_command", "torque_loss"))
+    state, command, loss = (
+        ticks[name] for name in ("plant_state", "torque_command", "torque_loss")
+    )
     velocity = state[:, robot.plant.num_positions() + robot.velocity_index]
     count, time_step = max(len(state) - 1, 1), scenario.plant.time_step
     motion = JointMotion(
@@ -276,7 +303,9 @@ def _reference_channels(reference: Reference, time: np.ndarray) -> dict[str, np.
     return channels
 
 
-def _truth_channels(robot: Robot, state: np.ndarray, acceleration: np.ndarray, pad_force: np.ndarray) -> dict[str, np.ndarray]:
+def _truth_channels(
+    robot: Robot, state: np.ndarray, acceleration: np.ndarray, pad_force: np.ndarray
+) -> dict[str, np.ndarray]:
     """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of the exact foot forces.
 
     Accelerations are the plant's own, over the step that ends at the row's time; base quantities are those of the base frame's origin,
@@ -298,7 +327,12 @@ def _truth_channels(robot: Robot, state: np.ndarray, acceleration: np.ndarray, p
 
     soles = {side: robot.sole(side) for side in robot.description.sides}
     pads = {side: robot.pad_positions(side) for side in soles}
-    for name in ("base/position", "com/position", "com/velocity", *(f"foot/{side}/position" for side in soles)):
+    for name in (
+        "base/position",
+        "com/position",
+        "com/velocity",
+        *(f"foot/{side}/position" for side in soles),
+    ):
         truth[name] = np.empty((samples, 3))
     truth["base/orientation"] = np.empty((samples, 4))
     pad_force_F = pad_force.reshape(samples, -1, 3)

@@ -88,7 +88,12 @@ class Base:
         """Trusted readings of a robot that stands on level ground, but for the values given."""
         pads = sum(len(leg.pads) for leg in self.robot.description.legs.values())
         standing = np.tile([0.0, 0.0, 87.0 * 9.81 / pads], pads)
-        resting = {"joint_position": BENT, "specific_force": [0, 0, 9.81], "pad_force": standing, "support": np.ones(2)}
+        resting = {
+            "joint_position": BENT,
+            "specific_force": [0, 0, 9.81],
+            "pad_force": standing,
+            "support": np.ones(2),
+        }
         readings = pack(self.monitor, **{**resting, **values})
         for name in readings["mean"].dtype.names:
             readings["mean"][name] = readings[name]
@@ -112,7 +117,9 @@ def robot_copy(folder: Path, edit: Callable[[str], str]) -> str:
 def part(log: Log, seconds: float) -> Log:
     """The beginning of a log."""
     rows = round(seconds / log.meta["period"]) + 1
-    return dataclasses.replace(log, channels={name: channel[:rows] for name, channel in log.channels.items()})
+    return dataclasses.replace(
+        log, channels={name: channel[:rows] for name, channel in log.channels.items()}
+    )
 
 
 def estimated(log: Log, scenario: Scenario, config: EstimatorConfig, **changes: object) -> Log:
@@ -135,7 +142,9 @@ def diagram(config: EstimatorConfig, scenario: Scenario) -> EstimatorDiagram:
     """The estimator as the scenario's station has it."""
     believed = scenario.believed
     robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia)
-    plan = make_reference(scenario.reference, robot, np.arange(round(scenario.duration / TICK) + 1) * TICK).plan
+    plan = make_reference(
+        scenario.reference, robot, np.arange(round(scenario.duration / TICK) + 1) * TICK
+    ).plan
     estimator = make_estimator(config, robot, period=TICK, plan=plan)
     assert estimator is not None
     return estimator
@@ -153,7 +162,9 @@ class Replay:
         copy.estimator, copy.context = self.estimator, self.context.Clone()
         return copy
 
-    def run(self, time: np.ndarray, inputs: Mapping[str, np.ndarray], *channels: str) -> dict[str, np.ndarray]:
+    def run(
+        self, time: np.ndarray, inputs: Mapping[str, np.ndarray], *channels: str
+    ) -> dict[str, np.ndarray]:
         """Outputs for each sample; by default all.
 
         A name of the form `system.field` is a field of that system's posterior.

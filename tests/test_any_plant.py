@@ -55,7 +55,12 @@ CRANE = f"""
   </transmission>
 </robot>
 """
-DESCRIPTION = {"urdf": "crane.urdf", "base": "rail", "fixed_base": True, "joints": ["swing", "slide"]}
+DESCRIPTION = {
+    "urdf": "crane.urdf",
+    "base": "rail",
+    "fixed_base": True,
+    "joints": ["swing", "slide"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +81,11 @@ def crane(folder: Path, **effects: object) -> Scenario:
     return Scenario(
         duration=8.0,
         robot=RobotConfig(described(folder), effects=effects),
-        reference=JointSines(amplitude={"swing": 0.6, "slide": 0.3}, frequency={"swing": 0.7, "slide": 0.45}, ramp=0.5),
+        reference=JointSines(
+            amplitude={"swing": 0.6, "slide": 0.3},
+            frequency={"swing": 0.7, "slide": 0.45},
+            ramp=0.5,
+        ),
         control=PositionLoopConfig(kp={"all": 4000.0}, kd={"all": 80.0}),
         sensors=SensorsConfig(encoders=EncoderConfig(velocity_noise=1e-4)),
     )
@@ -84,16 +93,26 @@ def crane(folder: Path, **effects: object) -> Scenario:
 
 @pytest.fixture(scope="module")
 def rubbing(folder: Path) -> tuple[Scenario, Log]:
-    scenario = crane(folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5}))
+    scenario = crane(
+        folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5})
+    )
     return scenario, simulate(scenario).log
 
 
-def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(folder: Path, rubbing: tuple[Scenario, Log]):
+def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(
+    folder: Path, rubbing: tuple[Scenario, Log]
+):
     """q_swing, x: (m + M) x.. + m l (q.. cos q - q.^2 sin q) = F and m l^2 q.. + m l x.. cos q + m g l sin q = T, plus the spoon's."""
     log = rubbing[1]
-    rigid = dataclasses.replace(rubbing[0], model=RobotConfig(described(folder, held={"spoon_hinge": np.pi / 2})))
+    rigid = dataclasses.replace(
+        rubbing[0], model=RobotConfig(described(folder, held={"spoon_hinge": np.pi / 2}))
+    )
     blocks = Predictor(rigid, log).motion.steps
-    q, (w, _), (q_dd, x_dd) = blocks.joint_position[:, 0], blocks.joint_velocity.T, blocks.joint_acceleration.T
+    q, (w, _), (q_dd, x_dd) = (
+        blocks.joint_position[:, 0],
+        blocks.joint_velocity.T,
+        blocks.joint_acceleration.T,
+    )
     # By a quarter turn about y the spoon's mass lies 0.1 m below the hinge, which is that of the rod.
     moment = LOAD * LENGTH + 1.0 * 0.1
     inertia = LOAD * LENGTH**2 + 1.0 * 0.1**2
@@ -106,7 +125,9 @@ def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(folder: Pat
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_limits_and_damping_of_the_model_file_are_not_taken(folder: Path, rubbing: tuple[Scenario, Log]):
+def test_limits_and_damping_of_the_model_file_are_not_taken(
+    folder: Path, rubbing: tuple[Scenario, Log]
+):
     assert np.abs(rubbing[1]["joint/torque_command"]).max() > 4.0
     robot, _ = make_robot(described(folder))
     assert robot.torque_units == ["Nm", "N"]
@@ -134,27 +155,45 @@ def test_hidden_friction_is_found_in_a_machine_without_legs(rubbing: tuple[Scena
     diagnosis = diagnose(predictor)
     found = {finding.effect: finding for finding in diagnosis.chosen}
     assert diagnosis.verdict == "effect_found"
-    assert {effect: finding.targets for effect, finding in found.items()} == {"CoulombFriction": ("slide",), "ViscousFriction": ("swing",)}
+    assert {effect: finding.targets for effect, finding in found.items()} == {
+        "CoulombFriction": ("slide",),
+        "ViscousFriction": ("swing",),
+    }
     assert found["CoulombFriction"].parameters["coulomb"].value == pytest.approx(7.0, rel=0.02)
     assert found["ViscousFriction"].parameters["viscous"].value == pytest.approx(1.5, rel=0.02)
 
 
 def test_a_crooked_sensor_of_a_machine_without_feet_is_simulated(folder: Path):
-    scenario = dataclasses.replace(crane(folder, crooked=EncoderOffset({"swing": 0.05})), duration=0.5)
+    scenario = dataclasses.replace(
+        crane(folder, crooked=EncoderOffset({"swing": 0.05})), duration=0.5
+    )
     log = simulate(scenario).log
-    np.testing.assert_allclose(log["joint/position"][:, 0] - log["truth/joint/position"][:, 0], 0.05, atol=1e-9)
+    np.testing.assert_allclose(
+        log["joint/position"][:, 0] - log["truth/joint/position"][:, 0], 0.05, atol=1e-9
+    )
 
 
 def test_friction_that_is_known_is_fed_forward_in_a_machine_without_feet(folder: Path):
-    law = CoulombViscousFriction(coulomb={"slide": 7.0, "swing": 0.0}, viscous={"slide": 5.0, "swing": 1.5}, transition={"all": 0.01})
-    scenario = dataclasses.replace(crane(folder, friction=law), duration=3.0, estimator=FixedFriction(law))
+    law = CoulombViscousFriction(
+        coulomb={"slide": 7.0, "swing": 0.0},
+        viscous={"slide": 5.0, "swing": 1.5},
+        transition={"all": 0.01},
+    )
+    scenario = dataclasses.replace(
+        crane(folder, friction=law), duration=3.0, estimator=FixedFriction(law)
+    )
     fed = dataclasses.replace(scenario, compensation=FeedforwardCompensation())
     alone, compensated = (simulate(one).log for one in (scenario, fed))
     moving = np.abs(alone["joint/velocity"][:-1]).min(axis=1) > 0.05
     np.testing.assert_allclose(
-        alone["estimate/joint/friction_torque"][1:][moving], alone["truth/joint/friction_torque"][:-1][moving], rtol=0.05
+        alone["estimate/joint/friction_torque"][1:][moving],
+        alone["truth/joint/friction_torque"][:-1][moving],
+        rtol=0.05,
     )
-    left = [np.sqrt(np.mean((log["reference/joint/position"] - log["truth/joint/position"]) ** 2)) for log in (alone, compensated)]
+    left = [
+        np.sqrt(np.mean((log["reference/joint/position"] - log["truth/joint/position"]) ** 2))
+        for log in (alone, compensated)
+    ]
     assert left[1] < 0.3 * left[0]
 
 
@@ -163,7 +202,9 @@ def test_nothing_is_found_where_nothing_is_hidden(folder: Path):
     assert diagnose(Predictor(scenario, simulate(scenario).log)).verdict == "nothing_missing"
 
 
-def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(rubbing: tuple[Scenario, Log]):
+def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(
+    rubbing: tuple[Scenario, Log],
+):
     scenario, log = rubbing
     scenario = dataclasses.replace(scenario, recording=RecordingConfig(train_share=0.75))
     train, rest = train_and_rest(scenario, log)
@@ -173,14 +214,21 @@ def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(ru
     error, residual = model_error(predictor), predictor.residual
     torque = residual.signals.torque_command
     assert error.relative == pytest.approx(np.linalg.norm(residual.value) / np.linalg.norm(torque))
-    assert error.relative_by_joint["slide"] == pytest.approx(np.linalg.norm(residual.value[:, 1]) / np.linalg.norm(torque[:, 1]))
-    assert train_and_rest(dataclasses.replace(scenario, recording=RecordingConfig()), log)[1] is None
+    assert error.relative_by_joint["slide"] == pytest.approx(
+        np.linalg.norm(residual.value[:, 1]) / np.linalg.norm(torque[:, 1])
+    )
+    assert (
+        train_and_rest(dataclasses.replace(scenario, recording=RecordingConfig()), log)[1] is None
+    )
 
 
 def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: Path):
     """A recorder that samples torque and angles at once, every 8 ms, without velocities: exact motions give no residual."""
     scenario = dataclasses.replace(
-        crane(folder), recording=RecordingConfig(block=0.04, rows="instantaneous", velocity="differenced", cutoff=25.0)
+        crane(folder),
+        recording=RecordingConfig(
+            block=0.04, rows="instantaneous", velocity="differenced", cutoff=25.0
+        ),
     )
     robot, _ = make_robot(described(folder))
     period, a, f = 0.008, np.array([0.6, 0.3]), 2 * np.pi * np.array([0.7, 0.45])
@@ -194,8 +242,13 @@ def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: 
         full[robot.velocity_index] = dv[k]
         bias = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
         torque[k] = (plant.CalcMassMatrix(context) @ full + bias)[robot.velocity_index]
-    log = Log({"time": t[:, 0], "joint/position": q, "joint/torque_command": torque}, {"joints": robot.joint_names, "period": period})
-    wrong = dataclasses.replace(scenario, recording=dataclasses.replace(scenario.recording, rows="per_step"))
+    log = Log(
+        {"time": t[:, 0], "joint/position": q, "joint/torque_command": torque},
+        {"joints": robot.joint_names, "period": period},
+    )
+    wrong = dataclasses.replace(
+        scenario, recording=dataclasses.replace(scenario.recording, rows="per_step")
+    )
     middle = slice(20, -20)
     error = Predictor(scenario, log).motion.residual.value[middle]
     late = Predictor(wrong, log).motion.residual.value[middle]
@@ -207,29 +260,43 @@ def test_a_position_servo_tells_its_torque_by_its_gains(rubbing: tuple[Scenario,
     """A recording of positions alone: the torque follows from what was asked for and the known gains of the loop."""
     scenario, log = rubbing
     asked = dataclasses.replace(scenario, reference=Recorded())
-    without = Log({name: values for name, values in log.items() if name != "joint/torque_command"}, log.meta)
+    without = Log(
+        {name: values for name, values in log.items() if name != "joint/torque_command"}, log.meta
+    )
     names = make_robot(scenario.robot.description)[0].description
     torque = with_command(asked, without, names)["joint/torque_command"]
     np.testing.assert_allclose(torque, log["joint/torque_command"], atol=1e-9)
     assert with_command(asked, log, names) is log
-    limited = dataclasses.replace(asked, control=dataclasses.replace(asked.control, torque_limit={"all": 5.0}))
+    limited = dataclasses.replace(
+        asked, control=dataclasses.replace(asked.control, torque_limit={"all": 5.0})
+    )
     assert np.abs(with_command(limited, without, names)["joint/torque_command"]).max() == 5.0
     off = Log({**without.channels, "joint/enabled": np.zeros_like(torque)}, log.meta)
     assert not with_command(asked, off, names)["joint/torque_command"].any()
-    blind = Log({name: values for name, values in without.items() if name != "joint/velocity"}, log.meta)
+    blind = Log(
+        {name: values for name, values in without.items() if name != "joint/velocity"}, log.meta
+    )
     with pytest.raises(InputError, match="control: kd: the log has no channel joint/velocity"):
         with_command(asked, blind, names)
-    with pytest.raises(InputError, match="gain kp: expected a number that is kept with the log's stretches"):
+    with pytest.raises(
+        InputError, match="gain kp: expected a number that is kept with the log's stretches"
+    ):
         with_command(dataclasses.replace(asked, reference=Recorded(gain="kp")), without, names)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"joints": ["swing", "lift"]}, "joints: the model has no revolute or prismatic joint called lift"),
+        (
+            {"joints": ["swing", "lift"]},
+            "joints: the model has no revolute or prismatic joint called lift",
+        ),
         ({"joints": ["swing", "swing"]}, "joints: swing is named twice"),
         ({"joints": []}, "expected legs, joints or both, found neither"),
-        ({"held": {"slide": 0.1}}, r"held.slide: expected a joint of the model that is not named elsewhere \(there are: spoon_hinge\)"),
+        (
+            {"held": {"slide": 0.1}},
+            r"held.slide: expected a joint of the model that is not named elsewhere \(there are: spoon_hinge\)",
+        ),
         ({"urdf": "other.urdf"}, "other.urdf: no such file"),
         ({"urdf": "${NOT_SET_ANYWHERE}/crane.urdf"}, "this environment variable is not set"),
         ({"directives": "crane.dmd.yaml"}, "expected either directives or urdf"),

@@ -31,7 +31,9 @@ class Attitude(Rig):
 
     def __init__(self, base: Base = BASE, sensors: SensorBeliefs = USUAL_SENSORS, **config: float):
         types = base.monitor.posterior_type, base.model.posterior_type
-        super().__init__(AttitudeEstimator(AttitudeConfig(**config), sensors, base.robot, *types, CLOCK))
+        super().__init__(
+            AttitudeEstimator(AttitudeConfig(**config), sensors, base.robot, *types, CLOCK)
+        )
         self._base = base
         self.fix(model=self.feet(np.eye(3)))
 
@@ -64,14 +66,18 @@ def test_quaternion_helpers_agree_with_scipy():
     for _ in range(50):
         a, b = Rotation.random(rng=generator), Rotation.random(rng=generator)
         p, q = (tuple(r.as_quat(scalar_first=True)) for r in (a, b))
-        np.testing.assert_allclose(rotation_matrix(quaternion_product(p, q)), (a * b).as_matrix().ravel(), atol=1e-14)
+        np.testing.assert_allclose(
+            rotation_matrix(quaternion_product(p, q)), (a * b).as_matrix().ravel(), atol=1e-14
+        )
         np.testing.assert_allclose(normalized(tuple(3.0 * np.array(p))), p, atol=1e-15)
         np.testing.assert_allclose(yaw_of(p), a.as_euler("ZYX")[0], atol=1e-12)
         r = generator.normal(size=3) * 10 ** generator.uniform(-12, 0)
         turn = Rotation.from_quat(rotation_vector_to_quaternion(tuple(r)), scalar_first=True)
         np.testing.assert_allclose(turn.as_rotvec(), r, rtol=1e-10)
         up = a.inv().apply([0, 0, generator.uniform(1, 20)])
-        from_gravity = Rotation.from_quat(quaternion_from_gravity(tuple(up), a.as_euler("ZYX")[0]), scalar_first=True)
+        from_gravity = Rotation.from_quat(
+            quaternion_from_gravity(tuple(up), a.as_euler("ZYX")[0]), scalar_first=True
+        )
         np.testing.assert_allclose(from_gravity.as_matrix(), a.as_matrix(), atol=1e-9)
 
 
@@ -80,10 +86,14 @@ def test_gravity_filter_is_the_textbook_kalman_filter():
     sensors = replace(USUAL_SENSORS, acceleration_noise=0.1, angular_velocity_noise=2e-3)
     config = AttitudeConfig(**IMU_ONLY, acceleration_bias=0.05)
     attitude = Attitude(sensors=sensors, **IMU_ONLY, acceleration_bias=0.05)
-    readings = np.array([0.3, -0.2, 9.8]) + np.random.default_rng(1).normal(scale=0.3, size=(400, 3))
+    readings = np.array([0.3, -0.2, 9.8]) + np.random.default_rng(1).normal(
+        scale=0.3, size=(400, 3)
+    )
     # A first reading, of which nothing is known but how large its parts may be: P0 H^T (H P0 H^T + R)^-1 y.
     I3, H = np.eye(3), np.hstack([np.eye(3)] * 3)
-    P = np.kron(np.diag([GRAVITY**2, config.standing_acceleration**2, config.acceleration_bias**2]), I3)
+    P = np.kron(
+        np.diag([GRAVITY**2, config.standing_acceleration**2, config.acceleration_bias**2]), I3
+    )
     R = sensors.acceleration_noise**2 * I3
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     x, P = K @ readings[0], P - K @ H @ P
@@ -98,7 +108,9 @@ def test_gravity_filter_is_the_textbook_kalman_filter():
         K, e = P @ H.T @ np.linalg.inv(S), y - H @ x
         x, P = x + K @ e, P - K @ H @ P
         posterior = attitude.read(y, np.zeros(3))
-        estimated = np.concatenate([posterior[name] for name in ("gravity", "acceleration", "acceleration_bias")])
+        estimated = np.concatenate(
+            [posterior[name] for name in ("gravity", "acceleration", "acceleration_bias")]
+        )
         np.testing.assert_allclose(estimated, x, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(posterior["innovation"]["gravity"], e, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(posterior["innovation_variance"]["gravity"], S[0, 0], rtol=1e-8)
@@ -110,7 +122,12 @@ def test_gravity_filter_is_the_textbook_kalman_filter():
 
 def test_quaternion_filter_about_one_axis_is_the_textbook_kalman_filter():
     """Two states [angle, gyro bias], corrected with the angle of the gravity filter's gravity."""
-    settings = {**IMU_ONLY, "angular_velocity_bias": 0.02, "motion_acceleration": 0.05, "motion_time": 0.1}
+    settings = {
+        **IMU_ONLY,
+        "angular_velocity_bias": 0.02,
+        "motion_acceleration": 0.05,
+        "motion_time": 0.1,
+    }
     config, attitude = AttitudeConfig(**settings), Attitude(**settings)
     generator = np.random.default_rng(2)
     time = np.arange(2000) * TICK
@@ -121,7 +138,9 @@ def test_quaternion_filter_about_one_axis_is_the_textbook_kalman_filter():
     Q = np.diag([(TICK * USUAL_SENSORS.angular_velocity_noise) ** 2, 0.0])
     x = P = None
     for k in range(len(time)):
-        f = GRAVITY * np.array([0, math.sin(truth[k]), math.cos(truth[k])]) + generator.normal(scale=0.02, size=3) * [0, 1, 1]
+        f = GRAVITY * np.array([0, math.sin(truth[k]), math.cos(truth[k])]) + generator.normal(
+            scale=0.02, size=3
+        ) * [0, 1, 1]
         posterior = attitude.read(f, [gyro[k], 0, 0])
         angle = math.atan2(posterior["gravity"][1], posterior["gravity"][2])
         variance = posterior["covariance"]["gravity"]["gg"] / GRAVITY**2
@@ -156,7 +175,10 @@ def test_tilted_at_rest(config: dict[str, float], roll: float, pitch: float):
 
 def test_it_does_not_matter_how_the_imu_sits(tmp_path: Path):
     """The same motion felt by an IMU that is turned on the base."""
-    straight, turned_mount = '<origin xyz="0.01 -0.01 0.02"/>', '<origin xyz="0.01 -0.01 0.02" rpy="0.3 -0.2 1.0"/>'
+    straight, turned_mount = (
+        '<origin xyz="0.01 -0.01 0.02"/>',
+        '<origin xyz="0.01 -0.01 0.02" rpy="0.3 -0.2 1.0"/>',
+    )
     description = robot_copy(tmp_path / "models", lambda urdf: urdf.replace(straight, turned_mount))
     R_BI = Rotation.from_euler("ZYX", [1.0, -0.2, 0.3])
     for config in (IMU_ONLY, {}):
@@ -168,7 +190,9 @@ def test_it_does_not_matter_how_the_imu_sits(tmp_path: Path):
             expected = plain.read(f, w, **standing)
             posterior = turned.read(R_BI.inv().apply(f), R_BI.inv().apply(w), **standing)
             np.testing.assert_allclose(matrix(posterior), matrix(expected), atol=1e-9)
-            np.testing.assert_allclose(posterior["angular_velocity"], expected["angular_velocity"], atol=1e-9)
+            np.testing.assert_allclose(
+                posterior["angular_velocity"], expected["angular_velocity"], atol=1e-9
+            )
             np.testing.assert_allclose(matrix(posterior), R_WB.as_matrix(), atol=1e-3)
 
 
@@ -179,7 +203,9 @@ def test_yaw_is_the_gyros():
     attitude = Attitude(**IMU_ONLY)
     for k in range(1500):
         truth = Rotation.from_rotvec([0, 0, rate * k * TICK]) * start
-        posterior = attitude.read(truth.inv().apply([0, 0, GRAVITY]), truth.inv().apply([0, 0, rate]))
+        posterior = attitude.read(
+            truth.inv().apply([0, 0, GRAVITY]), truth.inv().apply([0, 0, rate])
+        )
         np.testing.assert_allclose(matrix(posterior), truth.as_matrix(), atol=1e-8)
     still = Attitude(**IMU_ONLY)
     for k in range(1500):
@@ -218,7 +244,9 @@ def test_correction_is_the_same_on_either_sheet():
             posterior = attitude.read([0, 0, GRAVITY], [0, 0, 2 * math.pi * turns])
         assert posterior["orientation"][0] == pytest.approx(1 - 2 * turns, abs=1e-3)
         for _ in range(2000):
-            posterior = attitude.read(Rotation.from_euler("x", 0.02).inv().apply([0, 0, GRAVITY]), np.zeros(3))
+            posterior = attitude.read(
+                Rotation.from_euler("x", 0.02).inv().apply([0, 0, GRAVITY]), np.zeros(3)
+            )
         tilt.append(Rotation.from_matrix(matrix(posterior)).as_rotvec()[0])
     assert tilt[1] == pytest.approx(tilt[0], rel=1e-3)
     assert 0.25 * 0.02 < tilt[0] < 0.021
@@ -228,11 +256,17 @@ def test_gyro_bias_is_recovered():
     """About the horizontal axes from gravity; about the vertical only from a robot that stands at first."""
     bias, generator = np.array([0.02, -0.03, 0.01]), np.random.default_rng(3)
     sure = {"angular_velocity_bias": 0.05, "motion_acceleration": 0.05}
-    walking, standing, blind = Attitude(**IMU_ONLY, **sure), Attitude(level_feet=0.0, **sure), Attitude(**IMU_ONLY)
+    walking, standing, blind = (
+        Attitude(**IMU_ONLY, **sure),
+        Attitude(level_feet=0.0, **sure),
+        Attitude(**IMU_ONLY),
+    )
     f = np.array([0, 0, GRAVITY]) + generator.normal(scale=0.02, size=(3000, 3))
     w = bias + generator.normal(scale=1e-3, size=(3000, 3))
     for k in range(len(f)):
-        moved, stood, ignored = (attitude.read(f[k], w[k]) for attitude in (walking, standing, blind))
+        moved, stood, ignored = (
+            attitude.read(f[k], w[k]) for attitude in (walking, standing, blind)
+        )
     np.testing.assert_allclose(moved["angular_velocity_bias"][:2], bias[:2], atol=2e-3)
     assert moved["angular_velocity_bias"][2] == pytest.approx(0, abs=1e-3)
     np.testing.assert_allclose(stood["angular_velocity_bias"], bias, atol=3e-3)
@@ -246,7 +280,9 @@ def test_level_feet_hold_the_tilt_against_acceleration():
     f = np.array([0.3, 0.0, GRAVITY])
     with_feet, without = Attitude(standing_time=0.0), Attitude(**IMU_ONLY)
     for _ in range(1500):
-        held, fooled = (attitude.read(f, np.zeros(3), stands=True) for attitude in (with_feet, without))
+        held, fooled = (
+            attitude.read(f, np.zeros(3), stands=True) for attitude in (with_feet, without)
+        )
     tilt = [Rotation.from_matrix(matrix(posterior)).as_rotvec()[1] for posterior in (held, fooled)]
     assert tilt[1] == pytest.approx(-0.3 / GRAVITY, rel=0.05)
     assert abs(tilt[0]) < 0.3 * abs(tilt[1])
@@ -258,9 +294,15 @@ def test_innovations_are_as_large_as_believed():
     attitude = Attitude(**IMU_ONLY, motion_acceleration=1e-6, standing_acceleration=1e-6)
     nis = []
     for _ in range(2000):
-        posterior = attitude.read([0, 0, GRAVITY] + generator.normal(scale=0.02, size=3), generator.normal(scale=1e-3, size=3))
+        posterior = attitude.read(
+            [0, 0, GRAVITY] + generator.normal(scale=0.02, size=3),
+            generator.normal(scale=1e-3, size=3),
+        )
         if posterior["innovation_variance"]["gravity"] > 0:
-            nis.append(posterior["innovation"]["gravity"] ** 2 / posterior["innovation_variance"]["gravity"])
+            nis.append(
+                posterior["innovation"]["gravity"] ** 2
+                / posterior["innovation_variance"]["gravity"]
+            )
     # 6000 values of chi-square with one degree of freedom, 4 sigma.
     assert np.mean(nis) == pytest.approx(1, abs=4 * math.sqrt(2 / 6000))
     assert rms(posterior["rotation"] - np.eye(3)) < 1e-3

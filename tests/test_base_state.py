@@ -14,7 +14,13 @@ from scipy.spatial.transform import Rotation
 from fbse_drake import Log, load_scenario
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
-from fbse_drake.estimators.base_state import AdaptiveLipm, AdaptiveLipmEstimator, BaseStateEstimator, ContactAided, ContactAidedEstimator
+from fbse_drake.estimators.base_state import (
+    AdaptiveLipm,
+    AdaptiveLipmEstimator,
+    BaseStateEstimator,
+    ContactAided,
+    ContactAidedEstimator,
+)
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.estimator import Fbse
 from fbse_drake.estimators.recursive import Status
@@ -33,7 +39,9 @@ class BaseState(Rig):
 
     def __init__(self, kind: type[BaseStateEstimator], config: AdaptiveLipm | ContactAided):
         readings, model = BASE.monitor.posterior_type, BASE.model.posterior_type
-        self._attitude = AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, readings, model, CLOCK)
+        self._attitude = AttitudeEstimator(
+            AttitudeConfig(), USUAL_SENSORS, BASE.robot, readings, model, CLOCK
+        )
         types = readings, self._attitude.posterior_type, model
         super().__init__(kind(config, BASE.robot, *types, CLOCK, (0.0, 0.0)))
         self.turned()
@@ -42,7 +50,13 @@ class BaseState(Rig):
     def turned(self, rotation: Rotation | None = None, rate: np.ndarray | None = None) -> None:
         """Attitude R_WB and angular velocity in base axes."""
         R_WB = (rotation or Rotation.identity()).as_matrix()
-        self.fix(attitude=pack(self._attitude, rotation=R_WB, angular_velocity=np.zeros(3) if rate is None else rate))
+        self.fix(
+            attitude=pack(
+                self._attitude,
+                rotation=R_WB,
+                angular_velocity=np.zeros(3) if rate is None else rate,
+            )
+        )
 
 
 def test_adaptive_filter_is_the_papers():
@@ -52,7 +66,9 @@ def test_adaptive_filter_is_the_papers():
     estimator = BaseState(AdaptiveLipmEstimator, AdaptiveLipm())
     p_BC, p_BF = LEVEL["com"], LEVEL["foot_position"]
     height = (p_BC - p_BF[0])[2]
-    pads_F = np.concatenate([BASE.robot.pad_positions(side) for side in BASE.robot.description.sides])
+    pads_F = np.concatenate(
+        [BASE.robot.pad_positions(side) for side in BASE.robot.description.sides]
+    )
     pads = pads_F + np.repeat(p_BF - p_BF.mean(axis=0), 4, axis=0)
     # Random forces and accelerations on a robot that does not turn.
     load = WEIGHT / 8 * generator.uniform(0.5, 1.5, size=(ticks, 8))
@@ -65,7 +81,9 @@ def test_adaptive_filter_is_the_papers():
     mean_e, mean_w = np.zeros(3), np.zeros(9)
     for k in range(ticks):
         pad_force = np.column_stack([np.zeros((8, 2)), load[k]])
-        readings = BASE.measurements(pad_force=pad_force, specific_force=acceleration[k] + [0, 0, GRAVITY])
+        readings = BASE.measurements(
+            pad_force=pad_force, specific_force=acceleration[k] + [0, 0, GRAVITY]
+        )
         posterior = estimator.tick(measurements=readings)
         if k == 0:
             continue
@@ -86,9 +104,15 @@ def test_adaptive_filter_is_the_papers():
         Q = np.diag(np.abs(np.diag((n_q - 1) / n_q * Q + change)))
         state = posterior["state"]
         scale = np.abs(x).max()
-        np.testing.assert_allclose(state.T.ravel(), x.reshape(3, 3)[:, :2].ravel(), rtol=1e-9, atol=1e-10 * scale)
+        np.testing.assert_allclose(
+            state.T.ravel(), x.reshape(3, 3)[:, :2].ravel(), rtol=1e-9, atol=1e-10 * scale
+        )
         np.testing.assert_allclose(posterior["measurement_noise"], np.diag(R)[:2], rtol=1e-9)
-        np.testing.assert_allclose(posterior["process_noise"].T.ravel(), np.diag(Q).reshape(3, 3)[:, :2].ravel(), rtol=1e-11)
+        np.testing.assert_allclose(
+            posterior["process_noise"].T.ravel(),
+            np.diag(Q).reshape(3, 3)[:, :2].ravel(),
+            rtol=1e-11,
+        )
         np.testing.assert_allclose(posterior["innovation"], e[:2], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(posterior["covariance"][1], P[1::3, 1::3], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(posterior["com_position"], [*x[:2], height], atol=1e-9 * scale)
@@ -104,7 +128,9 @@ def test_contact_aided_filter_is_a_kalman_filter():
     np.testing.assert_allclose(J[:, 3:, 3:6], np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
     fade = math.exp(-T / config.acceleration_error_time)
     F = np.array([[1, T, 0], [0, 1, -T], [0, 0, fade]])
-    Q = np.diag([0, (T * config.acceleration_noise) ** 2, (1 - fade**2) * config.acceleration_error**2])
+    Q = np.diag(
+        [0, (T * config.acceleration_noise) ** 2, (1 - fade**2) * config.acceleration_error**2]
+    )
     H, R = np.eye(3)[:2], np.diag([config.position_noise**2, config.velocity_noise**2])
     start = -p_BF.mean(axis=0)
     x = np.stack([start, np.zeros(3), np.zeros(3)])
@@ -116,7 +142,10 @@ def test_contact_aided_filter_is_a_kalman_filter():
         if k == 0:
             shift = np.zeros(3)
         # The feet seen from the base, as if it had moved; the model's own linear velocity is that of the feet seen from the base.
-        seen = {"foot_position": p_BF - shift, "velocity": np.concatenate([np.zeros(3), -speed, np.zeros(12)])}
+        seen = {
+            "foot_position": p_BF - shift,
+            "velocity": np.concatenate([np.zeros(3), -speed, np.zeros(12)]),
+        }
         readings = BASE.measurements(specific_force=acceleration + [0, 0, GRAVITY])
         posterior = estimator.tick(measurements=readings, model=pack(BASE.model, LEVEL, **seen))
         if k > 0:
@@ -129,7 +158,9 @@ def test_contact_aided_filter_is_a_kalman_filter():
         np.testing.assert_allclose(posterior["base_position"], x[0], atol=1e-12)
         np.testing.assert_allclose(posterior["base_velocity"], x[1], atol=1e-11)
         np.testing.assert_allclose(posterior["acceleration_error"], x[2], atol=1e-10)
-        np.testing.assert_allclose(numbers(posterior["covariance"]), P[np.triu_indices(3)], rtol=1e-7, atol=1e-18)
+        np.testing.assert_allclose(
+            numbers(posterior["covariance"]), P[np.triu_indices(3)], rtol=1e-7, atol=1e-18
+        )
     # It learns the accelerometer's bias.
     assert np.linalg.norm(posterior["acceleration_error"] - bias) < 0.3 * np.linalg.norm(bias)
 
@@ -152,7 +183,9 @@ def test_lever_arm_of_the_centre_of_mass():
     """Who spins about the centre of mass does not accelerate it, whatever the IMU feels (eq. 16)."""
     about_com = spin(BaseState(AdaptiveLipmEstimator, AdaptiveLipm()), LEVEL["com"], 600)
     np.testing.assert_allclose(about_com["imu_acceleration"], 0, atol=1e-9)
-    about_imu = spin(BaseState(AdaptiveLipmEstimator, AdaptiveLipm()), np.array([0.01, -0.01, 0.02]), 600)
+    about_imu = spin(
+        BaseState(AdaptiveLipmEstimator, AdaptiveLipm()), np.array([0.01, -0.01, 0.02]), 600
+    )
     # The negative case: w^2 times a lever of decimetres.
     assert np.linalg.norm(about_imu["imu_acceleration"]) > 0.3
 
@@ -162,7 +195,9 @@ def test_lever_arm_of_the_base():
     lifted = {"pad_force": np.zeros(24), "support": np.zeros(2)}
     posterior = spin(BaseState(ContactAidedEstimator, ContactAided()), np.zeros(3), 600, **lifted)
     np.testing.assert_allclose(posterior["base_velocity"], 0, atol=1e-9)
-    posterior = spin(BaseState(ContactAidedEstimator, ContactAided()), np.array([0.0, 0.3, 0.0]), 600, **lifted)
+    posterior = spin(
+        BaseState(ContactAidedEstimator, ContactAided()), np.array([0.0, 0.3, 0.0]), 600, **lifted
+    )
     # The base circles at 0.3 m with 1.8 rad/s.
     assert np.linalg.norm(posterior["base_velocity"]) > 0.1
 
@@ -178,13 +213,23 @@ def test_lever_arm_of_the_base():
         ("paper_walk", AdaptiveLipm(), (0.05, 0.05, 5e-4)),
     ],
 )
-def test_base_velocity_without_sensor_errors(run: Run, name: str, config: AdaptiveLipm | ContactAided, largest: tuple[float, ...]):
+def test_base_velocity_without_sensor_errors(
+    run: Run, name: str, config: AdaptiveLipm | ContactAided, largest: tuple[float, ...]
+):
     log = part(run(name, "duration=3", noise=False), 2.0)
-    estimated = estimate(dataclasses.replace(scenario(name, "duration=3", noise=False), estimator=Fbse(base_state=config)), log).log
+    estimated = estimate(
+        dataclasses.replace(
+            scenario(name, "duration=3", noise=False), estimator=Fbse(base_state=config)
+        ),
+        log,
+    ).log
     error = (estimated["estimate/base/velocity"] - log["truth/base/velocity"])[300:]
     assert np.all(np.sqrt(np.mean(error**2, axis=0)) < largest)
     # It moves ten times as fast as that in the direction that the motion is about.
-    assert rms(log["truth/base/velocity"][300:, 1]) > (10 if isinstance(config, ContactAided) else 3) * largest[1]
+    assert (
+        rms(log["truth/base/velocity"][300:, 1])
+        > (10 if isinstance(config, ContactAided) else 3) * largest[1]
+    )
 
 
 @pytest.mark.parametrize("what", ["base", "com"])
@@ -226,7 +271,9 @@ def test_untrusted_sensors_move_nothing():
         posterior = estimator.tick(measurements=blind)
     assert pushed["base_velocity"][0] == pytest.approx(0.1, rel=1e-6)
     assert posterior["base_velocity"][0] == pytest.approx(0.1, rel=1e-6)
-    assert posterior["base_position"][0] - pushed["base_position"][0] == pytest.approx(0.01, rel=1e-6)
+    assert posterior["base_position"][0] - pushed["base_position"][0] == pytest.approx(
+        0.01, rel=1e-6
+    )
     assert posterior["covariance"]["vv"] > 10 * pushed["covariance"]["vv"]
     assert posterior["status"] == 1
 
@@ -235,7 +282,9 @@ class Support(Rig):
     """A SensorMonitor over a left foot with a load; the right one carries the rest, or as little as is said."""
 
     def __init__(self, **config: float):
-        system: System = SensorMonitor(SensorMonitorConfig(), MeasuredSupport(**config), BASE.robot, CLOCK)
+        system: System = SensorMonitor(
+            SensorMonitorConfig(), MeasuredSupport(**config), BASE.robot, CLOCK
+        )
         super().__init__(system)
 
     def left(self, share: float, right: float | None = None) -> bool:
@@ -260,7 +309,9 @@ def test_support_does_not_chatter():
     generator = np.random.default_rng(2)
     detector, plain = Support(), Support(on=0.075, off=0.075, debounce=0.0)
     noisy = 0.075 + generator.normal(scale=0.008, size=500)
-    changes = [np.count_nonzero(np.diff([rig.left(share) for share in noisy])) for rig in (detector, plain)]
+    changes = [
+        np.count_nonzero(np.diff([rig.left(share) for share in noisy])) for rig in (detector, plain)
+    ]
     # The negative case: with one threshold and no debounce it changes every few ticks.
     assert changes[0] <= 1
     assert changes[1] > 50
@@ -298,7 +349,9 @@ def test_measured_support_is_the_true_one(run: Run):
 def test_planned_support_is_the_plans(run: Run):
     log = part(run("paper_walk", "duration=3", noise=False), 1.3)
     method = load_scenario("paper_walk_fbse", "paper_method").estimator
-    support = Replay(diagram(method, scenario("paper_walk", "duration=3"))).run(log.time, inputs_of(log), "estimate/support")
+    support = Replay(diagram(method, scenario("paper_walk", "duration=3"))).run(
+        log.time, inputs_of(log), "estimate/support"
+    )
     planned = np.stack([log[f"reference/foot/{side}/support"] for side in log.sides], axis=1)
     np.testing.assert_array_equal(support["estimate/support"], planned)
     assert set(planned.sum(axis=1)) == {1.0, 2.0}

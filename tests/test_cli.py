@@ -24,7 +24,18 @@ WALK = ["paper_walk_fbse", "--set", "duration=1"]
 
 
 def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture):
-    status = main(["simulate", "squat", "--set", "duration=0.5", "--set", "seed=4", "--out", str(tmp_path / "out")])
+    status = main(
+        [
+            "simulate",
+            "squat",
+            "--set",
+            "duration=0.5",
+            "--set",
+            "seed=4",
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
     assert status == DONE
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
@@ -46,12 +57,29 @@ def test_the_written_scenario_runs_again_to_the_same_log(tmp_path: Path):
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture):
-    assert main(["simulate", "squat", "--set", "duration=0.1", "--out", str(tmp_path), "--quiet"]) == DONE
+    assert (
+        main(["simulate", "squat", "--set", "duration=0.1", "--out", str(tmp_path), "--quiet"])
+        == DONE
+    )
     assert capsys.readouterr() == ("", "")
 
 
 def test_meshcat_is_recorded(tmp_path: Path):
-    assert main(["simulate", "squat", "--set", "duration=0.1", "--meshcat", "--out", str(tmp_path), "--quiet"]) == DONE
+    assert (
+        main(
+            [
+                "simulate",
+                "squat",
+                "--set",
+                "duration=0.1",
+                "--meshcat",
+                "--out",
+                str(tmp_path),
+                "--quiet",
+            ]
+        )
+        == DONE
+    )
     assert "animation" in (tmp_path / "meshcat.html").read_text()
 
 
@@ -77,19 +105,36 @@ def test_a_fall_ends_the_run_and_keeps_the_log(tmp_path: Path, capsys: pytest.Ca
         (["estimate", "squat"], "the following arguments are required: LOG"),
         (["simulate", "squat", "--sed", "3"], "unrecognized arguments: --sed 3"),
         (["simulate", "squid"], "squid: no such file, and no such name in scenarios/"),
-        (["simulate", "squat", "--set", "duration=0"], "squat: duration: expected a number > 0, found 0"),
+        (
+            ["simulate", "squat", "--set", "duration=0"],
+            "squat: duration: expected a number > 0, found 0",
+        ),
         (["simulate", "squat", "--name", "other"], "no scenario called other (there are: squat)"),
-        (["simulate", "paper_walk", "--set", "reference.step_length=0.5"], "reference: step 2 (left leg"),
-        (["simulate", "squat", "--set", "robot.gantry_height=1.0"], "a robot with a fixed base cannot follow Squat"),
+        (
+            ["simulate", "paper_walk", "--set", "reference.step_length=0.5"],
+            "reference: step 2 (left leg",
+        ),
+        (
+            ["simulate", "squat", "--set", "robot.gantry_height=1.0"],
+            "a robot with a fixed base cannot follow Squat",
+        ),
         (["compare", "squat"], "the following arguments are required: LOG"),
         (["diagnose", "squat", "nowhere.npz"], "nowhere.npz: No such file or directory"),
         (["add", "squat", "nowhere"], "the following arguments are required: --out"),
         (["hide", "squat"], "the following arguments are required: --seed"),
-        (["hide", "squat", "--seed", "-1"], "argument --seed: expected a whole number >= 0, found -1"),
-        (["reveal", "nowhere"], "nowhere/answer.sealed: No such file or directory; fbse hide makes one"),
+        (
+            ["hide", "squat", "--seed", "-1"],
+            "argument --seed: expected a whole number >= 0, found -1",
+        ),
+        (
+            ["reveal", "nowhere"],
+            "nowhere/answer.sealed: No such file or directory; fbse hide makes one",
+        ),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_bad_input_is_one_line_and_status_2(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+):
     if "simulate" in arguments:
         arguments = [*arguments, "--out", str(tmp_path / "out")]
     assert main(arguments) == BAD_INPUT
@@ -108,8 +153,23 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, capsys: pyte
 
 
 def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
-    command = [sys.executable, "-m", "fbse_drake", "simulate", "squat", "--set", "duration=20", "--set", "plant.time_step=1e-4"]
-    process = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, env={**os.environ})
+    command = [
+        sys.executable,
+        "-m",
+        "fbse_drake",
+        "simulate",
+        "squat",
+        "--set",
+        "duration=20",
+        "--set",
+        "plant.time_step=1e-4",
+    ]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "out")],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ},
+    )
     # An interruption while modules are being loaded can be lost in one of them; the folder is made when all are there.
     deadline = time.monotonic() + 120
     while not (tmp_path / "out").is_dir() and time.monotonic() < deadline:
@@ -128,7 +188,9 @@ def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
         assert Log.load(tmp_path / "out/log.npz").meta["outcome"]["reason"].endswith("interrupted")
 
 
-def test_a_copied_scenario_does_not_overwrite_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_copied_scenario_does_not_overwrite_the_original(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").write_text("squat: {duration: 0.05, reference: !Squat {}}\n")
     assert main(["simulate", "mine.yaml", "--quiet"]) == DONE
@@ -138,7 +200,9 @@ def test_a_copied_scenario_does_not_overwrite_the_original(tmp_path: Path, monke
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports are empty, which saves the time to draw them."""
-    monkeypatch.setattr("fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report"))
+    monkeypatch.setattr(
+        "fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +210,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of a walk whose friction was estimated while it walked."""
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report"))
+        patch.setattr(
+            "fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report")
+        )
         assert main(["simulate", *WALK, "--out", str(folder), "--quiet"]) == DONE
     return folder
 
@@ -207,21 +273,35 @@ def test_a_robot_without_effects_has_no_law_error(tmp_path: Path, capsys: pytest
 
 def without_estimates(log: Log, *beginnings: str) -> Log:
     """The log without its estimates and channels with these beginnings."""
-    return Log({name: values for name, values in log.items() if not name.startswith(("estimate/", *beginnings))}, log.meta)
+    return Log(
+        {
+            name: values
+            for name, values in log.items()
+            if not name.startswith(("estimate/", *beginnings))
+        },
+        log.meta,
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_estimate_writes_everything_and_equals_the_live_estimates(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_estimate_writes_everything_and_equals_the_live_estimates(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
     live = Log.load(walk / "log.npz")
     without_estimates(live).save(tmp_path / "recorded.npz")
-    assert main(["estimate", *WALK, str(tmp_path / "recorded.npz"), "--out", str(tmp_path / "out")]) == DONE
+    assert (
+        main(["estimate", *WALK, str(tmp_path / "recorded.npz"), "--out", str(tmp_path / "out")])
+        == DONE
+    )
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
     replayed = Log.load(tmp_path / "out/log.npz")
     assert set(replayed) == set(live)
     for name in live:
         np.testing.assert_allclose(replayed[name], live[name], rtol=1e-9, atol=1e-9, err_msg=name)
     assert load_scenario(tmp_path / "out/scenario.yaml").duration == 1.0
-    before, after = (json.loads((folder / "metrics.json").read_text()) for folder in (walk, tmp_path / "out"))
+    before, after = (
+        json.loads((folder / "metrics.json").read_text()) for folder in (walk, tmp_path / "out")
+    )
     assert set(after) == set(before)
     assert 0.01 < after["friction_nrmse"]["swing"]["right_knee_pitch"] < 0.5
     assert math.isnan(after["friction_nrmse"]["swing"]["left_knee_pitch"])
@@ -233,7 +313,14 @@ def test_estimate_writes_everything_and_equals_the_live_estimates(walk: Path, tm
     assert 0 < after["tick_us"]["median"] <= after["tick_us"]["p99"]
     assert math.isnan(before["tick_us"]["median"])
     printed = capsys.readouterr().out
-    for text in ("right_knee_pitch", "stance", "attitude error", "base velocity error", "estimator tick", "report.html"):
+    for text in (
+        "right_knee_pitch",
+        "stance",
+        "attitude error",
+        "base velocity error",
+        "estimator tick",
+        "report.html",
+    ):
         assert text in printed
 
 
@@ -247,20 +334,27 @@ def test_simulate_tells_the_errors_of_estimates(tmp_path: Path, capsys: pytest.C
     assert "estimator tick" not in printed
 
 
-def test_a_recording_of_a_robot_is_enough(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+def test_a_recording_of_a_robot_is_enough(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
     """No truth, no plan, no velocities; a tenth of the samples lost, the others late by up to 0.3 ms, on a clock of their own."""
     live, random = Log.load(walk / "log.npz"), np.random.default_rng(0)
     kept = np.sort(random.choice(len(live.time), len(live.time) * 9 // 10, replace=False))
     bare = without_estimates(live, "truth/", "reference/", "joint/velocity")
     channels = {name: values[kept] for name, values in bare.items()}
     channels["time"] = channels["time"] + random.uniform(0, 3e-4, len(kept)) + 100.0
-    Log(channels, {key: live.meta[key] for key in ("joints", "sides", "period")}).save(tmp_path / "robot.npz")
+    Log(channels, {key: live.meta[key] for key in ("joints", "sides", "period")}).save(
+        tmp_path / "robot.npz"
+    )
     monkeypatch.chdir(tmp_path)
     assert main(["estimate", *WALK, "robot.npz"]) == DONE
     out = tmp_path / "out/paper_walk_fbse_estimate"
     estimated = Log.load(out / "log.npz")
     np.testing.assert_array_equal(estimated.time, channels["time"])
-    friction, truth = estimated["estimate/joint/friction_torque"], live["truth/joint/friction_torque"]
+    friction, truth = (
+        estimated["estimate/joint/friction_torque"],
+        live["truth/joint/friction_torque"],
+    )
     settled = kept > 300
     error = friction[settled] - truth[kept[settled] - 1]
     assert np.sqrt(np.mean(error**2)) < 0.45 * np.sqrt(np.mean(truth**2))
@@ -288,7 +382,9 @@ def single_array(_: Log, path: Path) -> None:
 
 def texts(log: Log, path: Path) -> None:
     meta = np.array(json.dumps({"format_version": 1, **log.meta}))
-    np.savez(path, meta=meta, **(log.channels | {"joint/velocity": log["joint/velocity"].astype(str)}))
+    np.savez(
+        path, meta=meta, **(log.channels | {"joint/velocity": log["joint/velocity"].astype(str)})
+    )
 
 
 def renamed(log: Log, path: Path) -> None:
@@ -301,7 +397,11 @@ def renamed(log: Log, path: Path) -> None:
     [
         ("paper_walk_fbse", lambda *_: None, "log.npz: No such file or directory"),
         ("paper_walk_fbse", cut, "log.npz: truncated or not a log file (npz)"),
-        ("paper_walk_fbse", lambda _, path: path.write_text("time,position"), "log.npz: truncated or not a log file (npz)"),
+        (
+            "paper_walk_fbse",
+            lambda _, path: path.write_text("time,position"),
+            "log.npz: truncated or not a log file (npz)",
+        ),
         ("paper_walk_fbse", single_array, "log.npz: truncated or not a log file (npz)"),
         ("paper_walk_fbse", texts, "log.npz: channel joint/velocity: expected numbers"),
         ("paper_walk_fbse", renamed, "are not the model's"),
@@ -310,16 +410,28 @@ def renamed(log: Log, path: Path) -> None:
             lambda log, path: without_estimates(log, "foot/").save(path),
             "measured_pad_force (foot/<side>/pad_force, foot/<side>/wrench)",
         ),
-        ("paper_walk_fbse", lambda log, path: without_estimates(log, "imu/").save(path), "measured_imu (imu/linear_acceleration"),
+        (
+            "paper_walk_fbse",
+            lambda log, path: without_estimates(log, "imu/").save(path),
+            "measured_imu (imu/linear_acceleration",
+        ),
         ("squat", Log.save, "squat over"),
         ("squid", Log.save, "squid: no such file"),
     ],
 )
 def test_a_bad_log_is_one_line_and_status_2(
-    scenario: str, damage: Callable[[Log, Path], None], message: str, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    scenario: str,
+    damage: Callable[[Log, Path], None],
+    message: str,
+    walk: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
 ):
     damage(Log.load(walk / "log.npz"), tmp_path / "log.npz")
-    assert main(["estimate", scenario, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    assert (
+        main(["estimate", scenario, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")])
+        == BAD_INPUT
+    )
     printed = capsys.readouterr()
     assert printed.err.startswith("fbse: ")
     assert message in printed.err
@@ -327,7 +439,9 @@ def test_a_bad_log_is_one_line_and_status_2(
     assert not list(tmp_path.glob("out/*"))
 
 
-def test_estimates_do_not_overwrite_the_log_they_are_made_from(walk: Path, capsys: pytest.CaptureFixture):
+def test_estimates_do_not_overwrite_the_log_they_are_made_from(
+    walk: Path, capsys: pytest.CaptureFixture
+):
     before = (walk / "log.npz").read_bytes()
     assert main(["estimate", *WALK, str(walk / "log.npz"), "--out", str(walk)]) == BAD_INPUT
     assert "would overwrite" in capsys.readouterr().err
@@ -338,7 +452,9 @@ def test_estimates_do_not_overwrite_the_log_they_are_made_from(walk: Path, capsy
 def undrawn_findings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of compare, diagnose and study are empty."""
     for kind in ("compare", "diagnosis", "study"):
-        monkeypatch.setattr(f"fbse_drake.cli.write_{kind}_report", lambda path, *_, **__: path.write_text("report"))
+        monkeypatch.setattr(
+            f"fbse_drake.cli.write_{kind}_report", lambda path, *_, **__: path.write_text("report")
+        )
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +462,9 @@ def biased(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of a robot whose left knee lacks 1 Nm, of which the model knows nothing."""
     folder = tmp_path_factory.mktemp("biased")
     bias = "robot.effects={hidden: !TorqueBias {bias: {left_knee_pitch: 1.0}}}"
-    simulate(load_scenario("frictionless_walk", overrides=["duration=1.5", bias])).log.save(folder / "log.npz")
+    simulate(load_scenario("frictionless_walk", overrides=["duration=1.5", bias])).log.save(
+        folder / "log.npz"
+    )
     return folder / "log.npz"
 
 
@@ -356,7 +474,9 @@ FOUND = ["metrics.json", "report.html", "scenario.yaml"]
 
 
 @pytest.mark.usefixtures("undrawn_findings")
-def test_compare_says_where_the_model_fails(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_compare_says_where_the_model_fails(
+    biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
     assert main(["compare", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FOUND, "compare.json"])
     content = json.loads((tmp_path / "compare.json").read_text())
@@ -371,7 +491,9 @@ def test_compare_says_where_the_model_fails(biased: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.usefixtures("undrawn_findings")
-def test_diagnose_then_add_then_compare(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+def test_diagnose_then_add_then_compare(
+    biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
     """From a log to a model that fits it."""
     few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
     monkeypatch.setattr("fbse_drake.cli.diagnose", functools.partial(diagnose, effects=few))
@@ -391,13 +513,30 @@ def test_diagnose_then_add_then_compare(biased: Path, tmp_path: Path, capsys: py
     (effect,) = load_scenario(completed, "frictionless_walk").believed.effects.values()
     assert effect.bias == {"left_knee_pitch": pytest.approx(1.0, abs=0.1)}
     comments = [line for line in completed.read_text().splitlines() if line.startswith("# ")]
-    assert comments[0] == f"# Effects added by fbse add to frictionless_walk, from {found}/diagnosis.json."
+    assert (
+        comments[0]
+        == f"# Effects added by fbse add to frictionless_walk, from {found}/diagnosis.json."
+    )
     assert comments[1].startswith("# TorqueBias in left knee pitch: held-out error ")
     assert comments[2].startswith("# TorqueBias in left knee pitch: bias ")
     assert comments[2].endswith("with its 95 % interval")
 
     # What fbse add wrote may be written again, but not over the scenario that is added to, nor over a file of somebody else.
-    assert main(["add", *BIASED, str(found / "diagnosis.json"), "--effect", "TorqueBias", "--out", str(completed), "--quiet"]) == DONE
+    assert (
+        main(
+            [
+                "add",
+                *BIASED,
+                str(found / "diagnosis.json"),
+                "--effect",
+                "TorqueBias",
+                "--out",
+                str(completed),
+                "--quiet",
+            ]
+        )
+        == DONE
+    )
     assert capsys.readouterr() == ("", "")
     mine = tmp_path / "mine.yaml"
     mine.write_text("squat: {}")
@@ -412,22 +551,42 @@ def test_diagnose_then_add_then_compare(biased: Path, tmp_path: Path, capsys: py
     assert mine.read_text() == "squat: {}"
 
     again = tmp_path / "again"
-    assert main(["compare", str(completed), "--name", "frictionless_walk", str(biased), "--out", str(again), "--quiet"]) == DONE
+    assert (
+        main(
+            [
+                "compare",
+                str(completed),
+                "--name",
+                "frictionless_walk",
+                str(biased),
+                "--out",
+                str(again),
+                "--quiet",
+            ]
+        )
+        == DONE
+    )
     assert json.loads((again / "compare.json").read_text())["failures"] == []
 
 
 @pytest.mark.usefixtures("undrawn_findings")
-def test_study_writes_the_completed_scenario(biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+def test_study_writes_the_completed_scenario(
+    biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
     few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
     monkeypatch.setattr("fbse_drake.cli.study", functools.partial(study, effects=few))
     assert main(["study", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FOUND, "study.json", "completed.yaml"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [*FOUND, "study.json", "completed.yaml"]
+    )
     content = json.loads((tmp_path / "study.json").read_text())
     first, *_, last = content["steps"]
     assert first["held_out_rmse"] > 1.5 * content["noise_floor"]
     assert last["held_out_rmse"] == pytest.approx(1.0, abs=0.05)
     assert last["rollout_rmse"]["joint_position"] < first["rollout_rmse"]["joint_position"]
-    (effect,) = load_scenario(tmp_path / "completed.yaml", "frictionless_walk").believed.effects.values()
+    (effect,) = load_scenario(
+        tmp_path / "completed.yaml", "frictionless_walk"
+    ).believed.effects.values()
     assert effect.bias == {"left_knee_pitch": pytest.approx(1.0, abs=0.1)}
     printed = capsys.readouterr().out
     assert "the model as given" in printed
@@ -444,16 +603,27 @@ def negative(name: str) -> Callable[[Log, Path], None]:
     [
         (cut, "truncated or not a log file (npz)"),
         (renamed, "are not the model's"),
-        (lambda log, path: without_estimates(log, "imu/").save(path), "the log has no channel imu/linear_acceleration"),
+        (
+            lambda log, path: without_estimates(log, "imu/").save(path),
+            "the log has no channel imu/linear_acceleration",
+        ),
         (negative("imu/linear_acceleration"), "its sign is reversed"),
         (negative("joint/velocity"), "channel joint/velocity"),
     ],
 )
 def test_a_log_that_cannot_be_compared_is_one_line_and_status_2(
-    command: str, damage: Callable[[Log, Path], None], message: str, biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    command: str,
+    damage: Callable[[Log, Path], None],
+    message: str,
+    biased: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
 ):
     damage(Log.load(biased), tmp_path / "log.npz")
-    assert main([command, *BIASED, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    assert (
+        main([command, *BIASED, str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")])
+        == BAD_INPUT
+    )
     printed = capsys.readouterr()
     assert printed.err.startswith("fbse: ")
     assert message in printed.err
@@ -470,7 +640,9 @@ def test_a_log_that_cannot_be_compared_is_one_line_and_status_2(
         ('{"verdict": "nothing_missing", "ranking": []}', "the diagnosis has no effect to add"),
     ],
 )
-def test_a_bad_diagnosis_is_one_line_and_status_2(content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_a_bad_diagnosis_is_one_line_and_status_2(
+    content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+):
     if content is not None:
         (tmp_path / "diagnosis.json").write_text(content)
     assert main(["add", "squat", str(tmp_path), "--out", str(tmp_path / "new.yaml")]) == BAD_INPUT

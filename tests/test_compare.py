@@ -26,7 +26,9 @@ def made_residual(seed: int = 0) -> Residual:
     time = (np.arange(BLOCKS) + 0.5) * PERIOD
     shape = (BLOCKS, len(ROWS))
     white = random.normal(size=(BLOCKS + 1, len(ROWS)))
-    value = 0.8 * NOISE * random.normal(size=shape) + 0.6 * NOISE / np.sqrt(2) * np.diff(white, axis=0)
+    value = 0.8 * NOISE * random.normal(size=shape) + 0.6 * NOISE / np.sqrt(2) * np.diff(
+        white, axis=0
+    )
     variance, covariance = np.full(shape, NOISE**2), np.full(shape, -0.5 * (0.6 * NOISE) ** 2)
     # Left leg, both, right leg, both.
     phase = (time / 0.7).astype(int) % 4
@@ -86,7 +88,12 @@ def test_intervals_hold_the_mean_that_is_there():
 
 def test_noise_of_a_mean_is_that_of_many_logs():
     """The noise of neighbouring blocks partly cancels in their mean."""
-    joints = [channel for seed in range(12) for channel in compared(made_residual(seed)).channels if channel.row.kind == "joint"]
+    joints = [
+        channel
+        for seed in range(12)
+        for channel in compared(made_residual(seed)).channels
+        if channel.row.kind == "joint"
+    ]
     whole = [channel.bins["none"][0] for channel in joints]
     assert np.std([b.error for b in whole]) == pytest.approx(whole[0].noise_floor, rel=0.2)
     assert whole[0].noise_floor < 0.85 * NOISE / np.sqrt(BLOCKS)
@@ -101,7 +108,9 @@ def test_dry_friction_follows_the_speed():
     assert failure.row.name == "left_knee_pitch"
     assert failure.where.variable == "speed"
     assert failure.where.error == pytest.approx(0.9, abs=0.03)
-    assert failure.text.startswith("left knee pitch: model torque 0.9 Nm too low along the motion, ")
+    assert failure.text.startswith(
+        "left knee pitch: model torque 0.9 Nm too low along the motion, "
+    )
     assert failure.where.ratio == pytest.approx(0.9 / failure.where.noise_floor, rel=0.05)
 
 
@@ -110,7 +119,9 @@ def test_an_error_at_low_speed_in_one_phase_is_said_to_be_there():
     knee = JOINTS.index("left_knee_pitch")
     speed = np.abs(residual.signals.joint_velocity[:, knee])
     swing = ~residual.standing[:, 0]
-    (failure,) = compared(with_error(residual, "left_knee_pitch", -0.9 * (swing & (speed < 0.3)))).failures
+    (failure,) = compared(
+        with_error(residual, "left_knee_pitch", -0.9 * (swing & (speed < 0.3)))
+    ).failures
     assert failure.where.phase == "swing"
     assert failure.where.variable in ("speed", "velocity")
     assert -0.95 < failure.where.error < -0.5
@@ -144,11 +155,31 @@ def test_a_drift_follows_the_time():
     ("row", "error", "text"),
     [
         ("base/force_z", -4.0, "base: the feet push 4 N less upwards than the model's masses need"),
-        ("base/force_y", 4.0, "base: the feet push 4 N more to the left than the model's masses need"),
-        ("base/moment_y", -4.0, "base: the feet's moment about the y axis is 4 Nm smaller than the model's masses need"),
-        ("left_sole/angular_velocity_x", 4.0, "left sole: turns at 4 rad/s about its x axis although it stands"),
-        ("right_sole/specific_force_y", 4.0, "right sole: 4 m/s² along its y axis that a level sole at rest has not"),
-        ("soles/relative_velocity_x", 4.0, "soles: move at 4 m/s along x against each other although both stand"),
+        (
+            "base/force_y",
+            4.0,
+            "base: the feet push 4 N more to the left than the model's masses need",
+        ),
+        (
+            "base/moment_y",
+            -4.0,
+            "base: the feet's moment about the y axis is 4 Nm smaller than the model's masses need",
+        ),
+        (
+            "left_sole/angular_velocity_x",
+            4.0,
+            "left sole: turns at 4 rad/s about its x axis although it stands",
+        ),
+        (
+            "right_sole/specific_force_y",
+            4.0,
+            "right sole: 4 m/s² along its y axis that a level sole at rest has not",
+        ),
+        (
+            "soles/relative_velocity_x",
+            4.0,
+            "soles: move at 4 m/s along x against each other although both stand",
+        ),
         ("right_knee_pitch", 4.0, "right knee pitch: model torque 4 Nm too low"),
     ],
 )
@@ -172,7 +203,9 @@ def test_an_error_in_one_support_is_said_to_be_there():
 
 def test_an_error_that_follows_nothing_is_a_failure_too():
     random = np.random.default_rng(5)
-    (failure,) = compared(with_error(made_residual(), "left_ankle_roll", 0.6 * random.choice([-1.0, 1.0], BLOCKS))).failures
+    (failure,) = compared(
+        with_error(made_residual(), "left_ankle_roll", 0.6 * random.choice([-1.0, 1.0], BLOCKS))
+    ).failures
     assert failure.where.variable == "scatter"
     assert failure.where.error == pytest.approx(np.hypot(0.6, NOISE), rel=0.05)
     assert failure.where.interval[0] < failure.where.error < failure.where.interval[1]
@@ -181,7 +214,10 @@ def test_an_error_that_follows_nothing_is_a_failure_too():
 def test_worst_comes_first_and_the_smallest_errors_do_not_count():
     residual = with_error(with_error(made_residual(), "left_hip_roll", 0.5), "right_hip_roll", 2.0)
     comparison = compared(with_error(residual, "left_hip_pitch", 0.2 * NOISE))
-    assert [failure.row.name for failure in comparison.failures] == ["right_hip_roll", "left_hip_roll"]
+    assert [failure.row.name for failure in comparison.failures] == [
+        "right_hip_roll",
+        "left_hip_roll",
+    ]
 
 
 def test_json_has_the_contracts_keys_and_numbers():
@@ -202,13 +238,29 @@ def test_json_has_the_contracts_keys_and_numbers():
     assert knee["worst"]["ratio"] > 20
     assert np.isnan(content["channels"]["left_sole/angular_velocity_x"]["nrmse"])
     (failure,) = content["failures"]
-    assert {"channel", "phase", "variable", "range", "error", "unit", "noise_floor", "ratio", "text"} <= set(failure)
-    assert (failure["channel"], failure["phase"], failure["range"]) == ("left_knee_pitch", "swing", [None, None])
+    assert {
+        "channel",
+        "phase",
+        "variable",
+        "range",
+        "error",
+        "unit",
+        "noise_floor",
+        "ratio",
+        "text",
+    } <= set(failure)
+    assert (failure["channel"], failure["phase"], failure["range"]) == (
+        "left_knee_pitch",
+        "swing",
+        [None, None],
+    )
 
 
 def test_a_walk_with_the_right_model_has_no_failures(run):
     """The whole way from a simulated log: sensors, equation of motion, noise."""
-    comparison = compare(Predictor(load_scenario("frictionless_walk"), run("frictionless_walk", "duration=3")))
+    comparison = compare(
+        Predictor(load_scenario("frictionless_walk"), run("frictionless_walk", "duration=3"))
+    )
     assert [failure.text for failure in comparison.failures] == []
     assert comparison.rmse == pytest.approx(1.0, abs=0.05)
     force = next(c for c in comparison.channels if c.row.name == "base/force_z")
@@ -222,11 +274,15 @@ def test_a_walk_with_friction_that_the_model_lacks_fails_in_every_joint_and_nowh
     assert {failure.row.name for failure in comparison.failures} == set(log.joints)
     truth = log["truth/joint/friction_torque"]
     for channel, friction in zip(comparison.channels, truth.T, strict=False):
-        assert channel.rmse == pytest.approx(np.hypot(np.sqrt(np.mean(friction**2)), channel.noise_floor), rel=0.1)
+        assert channel.rmse == pytest.approx(
+            np.hypot(np.sqrt(np.mean(friction**2)), channel.noise_floor), rel=0.1
+        )
 
 
 def test_a_robot_in_a_gantry_is_compared_by_its_joints(run):
-    comparison = compare(Predictor(load_scenario("leg_swing_gantry"), run("leg_swing_gantry", "duration=3")))
+    comparison = compare(
+        Predictor(load_scenario("leg_swing_gantry"), run("leg_swing_gantry", "duration=3"))
+    )
     assert {channel.row.kind for channel in comparison.channels} == {"joint"}
     assert comparison.failures
     # Its feet never stand: nothing is said of phases.

@@ -9,9 +9,19 @@ from conftest import scenario
 from rig import CLOCK, TICK, Rig, rms
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
-from fbse_drake.control.compensation import FeedforwardCompensation, FrictionCompensation, IntegralCompensation, NoCompensation
+from fbse_drake.control.compensation import (
+    FeedforwardCompensation,
+    FrictionCompensation,
+    IntegralCompensation,
+    NoCompensation,
+)
 from fbse_drake.estimators.estimator import Fbse
-from fbse_drake.estimators.reference_methods import NoEstimator, TorqueSensor, TorqueSensorEstimator, TrueFriction
+from fbse_drake.estimators.reference_methods import (
+    NoEstimator,
+    TorqueSensor,
+    TorqueSensorEstimator,
+    TrueFriction,
+)
 from fbse_drake.report.metrics import joint_tracking_rms
 from fbse_drake.robot.description import load_description
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
@@ -35,7 +45,9 @@ def test_integral_law_is_a_low_pass():
     rate, step = np.array([2.0, 2, 1, 3, 2, 4, 2, 2, 1, 3, 2, 0]), np.linspace(-5, 6, 12)
     for k in range(1001):
         torque = rig.tick(friction_estimate=step)["torque"]
-        np.testing.assert_allclose(torque, step * (1 - np.exp(-rate * k * TICK)), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            torque, step * (1 - np.exp(-rate * k * TICK)), rtol=1e-9, atol=1e-12
+        )
     assert torque[-1] == 0
 
 
@@ -43,7 +55,14 @@ def test_feedforward_has_its_cutoff_share_and_limit():
     config = FeedforwardCompensation(cutoff=20.0, share=0.8, limit=10.0)
     rig = Rig(FrictionCompensation(config, NAMES, CLOCK))
     time, amplitude = np.arange(2000) * TICK, 6.0
-    torque = np.array([rig.tick(friction_estimate=amplitude * np.sin(2 * np.pi * 20 * t) * np.ones(12))["torque"][4] for t in time])
+    torque = np.array(
+        [
+            rig.tick(friction_estimate=amplitude * np.sin(2 * np.pi * 20 * t) * np.ones(12))[
+                "torque"
+            ][4]
+            for t in time
+        ]
+    )
     # At the cut-off a first-order low-pass passes 1 / sqrt(2).
     assert np.abs(torque[1000:]).max() == pytest.approx(0.8 * amplitude / np.sqrt(2), rel=0.05)
     for _ in range(200):
@@ -58,7 +77,9 @@ def test_torque_sensor_measures_command_minus_link_torque():
     command = generator.normal(size=(20, 12))
     friction = generator.normal(size=(20, 12))
     for k in range(1, 20):
-        posterior = rig.tick(torque_command=command[k], measured_torque=command[k - 1] - friction[k - 1])
+        posterior = rig.tick(
+            torque_command=command[k], measured_torque=command[k - 1] - friction[k - 1]
+        )
         if k > 1:
             np.testing.assert_allclose(posterior["friction"], friction[k - 1], atol=1e-12)
 
@@ -67,7 +88,9 @@ def test_torque_sensor_measures_command_minus_link_torque():
 def tracking(run: Run) -> dict[str, np.ndarray]:
     """Root mean square tracking error of each joint [rad] in the first 2 s of the walk with HRP-2's friction."""
     walk = load_scenario("hrp2_walk_fbse", overrides=("duration=2",))
-    ideal = dataclasses.replace(walk, compensation=NoCompensation(), robot=dataclasses.replace(walk.robot, effects={}))
+    ideal = dataclasses.replace(
+        walk, compensation=NoCompensation(), robot=dataclasses.replace(walk.robot, effects={})
+    )
     logs = {
         "none": run("hrp2_friction_walk", "duration=2"),
         "fbse": run("hrp2_walk_fbse", "duration=2"),
@@ -94,17 +117,25 @@ def test_oracle_makes_the_robot_frictionless(tracking: dict[str, np.ndarray]):
 def test_estimate_in_the_loop_is_the_friction(run: Run):
     """Feeding the estimate forward does not spoil the estimate."""
     log = run("hrp2_walk_fbse", "duration=2")
-    error = (log["estimate/joint/friction_torque"][1:] - log["truth/joint/friction_torque"][:-1])[300:]
+    error = (log["estimate/joint/friction_torque"][1:] - log["truth/joint/friction_torque"][:-1])[
+        300:
+    ]
     truth = log["truth/joint/friction_torque"][300:]
     # The hip's yaw hardly moves; what is left there is noise.
-    assert np.all(np.sqrt(np.mean(error**2, axis=0)) < 0.05 * np.sqrt(np.mean(truth**2, axis=0)) + 0.2)
+    assert np.all(
+        np.sqrt(np.mean(error**2, axis=0)) < 0.05 * np.sqrt(np.mean(truth**2, axis=0)) + 0.2
+    )
     assert rms(truth) > 5
 
 
 def test_oracle_is_the_truth():
-    short = dataclasses.replace(load_scenario("paper_walk_integral", overrides=("duration=0.3",)), estimator=TrueFriction())
+    short = dataclasses.replace(
+        load_scenario("paper_walk_integral", overrides=("duration=0.3",)), estimator=TrueFriction()
+    )
     log = simulate(short).log
-    np.testing.assert_array_equal(log["estimate/joint/friction_torque"][1:], log["truth/joint/friction_torque"][:-1])
+    np.testing.assert_array_equal(
+        log["estimate/joint/friction_torque"][1:], log["truth/joint/friction_torque"][:-1]
+    )
 
 
 def test_integral_compensation_reaches_the_command():
@@ -113,12 +144,16 @@ def test_integral_compensation_reaches_the_command():
     log = simulate(short).log
     kp = NAMES.per_joint(short.control.kp, key="kp")
     kd = NAMES.per_joint(short.control.kd, key="kd")
-    loop = kp * (log["reference/joint/position"] - log["joint/position"]) + kd * (log["reference/joint/velocity"] - log["joint/velocity"])
+    loop = kp * (log["reference/joint/position"] - log["joint/position"]) + kd * (
+        log["reference/joint/velocity"] - log["joint/velocity"]
+    )
     added = log["joint/torque_command"] - loop - log["reference/joint/feedforward_torque"]
     gain = NAMES.per_joint(short.compensation.gain, key="gain")
     expected = np.zeros_like(added)
     for k in range(1, len(added)):
-        expected[k] = expected[k - 1] + (1 - np.exp(-gain * TICK)) * (log["estimate/joint/friction_torque"][k] - expected[k - 1])
+        expected[k] = expected[k - 1] + (1 - np.exp(-gain * TICK)) * (
+            log["estimate/joint/friction_torque"][k] - expected[k - 1]
+        )
     np.testing.assert_allclose(added, expected, atol=1e-9)
     assert np.abs(expected[-1]).max() > 0.05
 
@@ -127,7 +162,9 @@ def test_torque_sensor_in_the_loop():
     """With noise-free sensors its estimate is the friction behind a low-pass."""
     base = scenario("paper_walk", "duration=0.5", noise=False)
     sensors = dataclasses.replace(base.sensors, joint_torque=JointTorqueConfig())
-    log = simulate(dataclasses.replace(base, sensors=sensors, estimator=TorqueSensor(cutoff=50.0))).log
+    log = simulate(
+        dataclasses.replace(base, sensors=sensors, estimator=TorqueSensor(cutoff=50.0))
+    ).log
     keep = np.exp(-2 * np.pi * 50.0 * TICK)
     expected = np.zeros(12)
     for k in range(1, len(log.time)):
@@ -146,8 +183,12 @@ def test_refusals():
     assert "needs an estimator" in refusal(lambda: Scenario(compensation=IntegralCompensation()))
     assert "needs an estimator" in refusal(lambda: Scenario(compensation=FeedforwardCompensation()))
     assert "sensors.joint_torque" in refusal(lambda: Scenario(estimator=TorqueSensor()))
-    assert "hip_yw" in refusal(lambda: FrictionCompensation(IntegralCompensation(gain={"hip_yw": 1.0}), NAMES, CLOCK))
-    assert "no value for" in refusal(lambda: FrictionCompensation(IntegralCompensation(gain={"hip_yaw": 1.0}), NAMES, CLOCK))
+    assert "hip_yw" in refusal(
+        lambda: FrictionCompensation(IntegralCompensation(gain={"hip_yw": 1.0}), NAMES, CLOCK)
+    )
+    assert "no value for" in refusal(
+        lambda: FrictionCompensation(IntegralCompensation(gain={"hip_yaw": 1.0}), NAMES, CLOCK)
+    )
     assert "cutoff" in refusal(lambda: FeedforwardCompensation(cutoff=0.0))
     assert "share" in refusal(lambda: FeedforwardCompensation(share=1.1))
     assert "gain.hip_yaw" in refusal(lambda: IntegralCompensation(gain={"hip_yaw": -1.0}))

@@ -67,11 +67,27 @@ def diagnosis_of(hidden: str) -> Diagnosis:
 
 
 HIDDEN = {
-    "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}": ("TorqueGain", "left_knee_pitch", {"shortfall": 0.04}),
-    "!CoulombFriction {coulomb: {right_hip_pitch: 1.5}}": ("CoulombFriction", "right_hip_pitch", {"coulomb": 1.5}),
-    "!LoadDependentFriction {coefficient: {left_knee_pitch: 0.03}}": ("LoadDependentFriction", "left_knee_pitch", {"coefficient": 0.03}),
+    "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}": (
+        "TorqueGain",
+        "left_knee_pitch",
+        {"shortfall": 0.04},
+    ),
+    "!CoulombFriction {coulomb: {right_hip_pitch: 1.5}}": (
+        "CoulombFriction",
+        "right_hip_pitch",
+        {"coulomb": 1.5},
+    ),
+    "!LoadDependentFriction {coefficient: {left_knee_pitch: 0.03}}": (
+        "LoadDependentFriction",
+        "left_knee_pitch",
+        {"coefficient": 0.03},
+    ),
     "!BodyMass {mass: {trunk: 2.0}}": ("BodyMass", "trunk", {"mass": 2.0}),
-    "!AccelerometerBias {x: 0.1, y: -0.05}": ("AccelerometerBias", "robot", {"x": 0.1, "y": -0.05, "z": 0.0}),
+    "!AccelerometerBias {x: 0.1, y: -0.05}": (
+        "AccelerometerBias",
+        "robot",
+        {"x": 0.1, "y": -0.05, "z": 0.0},
+    ),
 }
 
 
@@ -92,7 +108,11 @@ def test_what_is_hidden_is_found(hidden: str) -> None:
         assert half < 0.1 * max(abs(v) for v in truth.values())
     statuses = diagnosis.effects
     assert statuses[name].verdict == "present"
-    assert all(status.verdict in ("absent", "confusable", "not_visible") for other, status in statuses.items() if other != name)
+    assert all(
+        status.verdict in ("absent", "confusable", "not_visible")
+        for other, status in statuses.items()
+        if other != name
+    )
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
@@ -138,9 +158,13 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
 
 def test_a_standing_robot_shows_no_friction() -> None:
     """Too little excitation reads `not_visible`, never `absent`, with the experiment that would show it."""
-    standing = load_scenario("squat", overrides=["duration=2.5", "reference.amplitude=1e-6", "robot.effects=null"])
+    standing = load_scenario(
+        "squat", overrides=["duration=2.5", "reference.amplitude=1e-6", "robot.effects=null"]
+    )
     names = ("ViscousFriction", "QuadraticDrag")
-    diagnosis = diagnose(Predictor(standing, planned_log(standing)), [library()[name] for name in names])
+    diagnosis = diagnose(
+        Predictor(standing, planned_log(standing)), [library()[name] for name in names]
+    )
     assert diagnosis.verdict == "not_visible"
     for status in diagnosis.effects.values():
         assert status.verdict == "not_visible"
@@ -160,13 +184,17 @@ class Grip(JointTorqueEffect):
 
     @staticmethod
     def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple:  # noqa: ARG004
-        return (np.exp(-(((motion.position - 0.9) / 0.05) ** 2)) * np.sin(25 * motion.time),), (0.0,)
+        return (np.exp(-(((motion.position - 0.9) / 0.05) ** 2)) * np.sin(25 * motion.time),), (
+            0.0,
+        )
 
 
 def test_what_the_library_does_not_know_is_called_unknown() -> None:
     log = log_with("")
     joint = log.joints.index("left_knee_pitch")
-    motion = JointMotion(log["joint/velocity"], position=log["joint/position"], time=log.time[:, None])
+    motion = JointMotion(
+        log["joint/velocity"], position=log["joint/position"], time=log.time[:, None]
+    )
     command = log["joint/torque_command"].copy()
     command[:, joint] += 4.0 * Grip.basis(motion, np.zeros(0))[0][0][:, joint]
     strange = replace(log, channels=log.channels | {"joint/torque_command": command})
@@ -188,17 +216,30 @@ def test_two_effects_at_once_are_both_found() -> None:
 def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
     """One offset alone explains less than a turned IMU with a moved mass; both together explain all."""
     log = log_with("!EncoderOffset {offset: {hip_roll: 0.007}}")
-    candidates = [library()[name] for name in ("EncoderOffset", "ImuMisalignment", "BodyCentreOfMass", "TorqueBias")]
+    candidates = [
+        library()[name]
+        for name in ("EncoderOffset", "ImuMisalignment", "BodyCentreOfMass", "TorqueBias")
+    ]
     diagnosis = diagnose(Predictor(scenario(), log), candidates)
     assert diagnosis.verdict == "effect_found"
-    assert sorted((f.effect, *f.targets) for f in diagnosis.chosen) == [("EncoderOffset", f"{side}_hip_roll") for side in ("left", "right")]
-    assert all(f.parameters["offset"].value == pytest.approx(0.007, rel=0.02) for f in diagnosis.chosen)
+    assert sorted((f.effect, *f.targets) for f in diagnosis.chosen) == [
+        ("EncoderOffset", f"{side}_hip_roll") for side in ("left", "right")
+    ]
+    assert all(
+        f.parameters["offset"].value == pytest.approx(0.007, rel=0.02) for f in diagnosis.chosen
+    )
 
 
 def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
     """Planned anew with the mass that was found, it would walk otherwise than the robot did."""
     clean, log = scenario(), log_with("!BodyMass {mass: {trunk: 2.0}}")
-    heavier = replace(clean, model=replace(clean.model, effects={**clean.model.effects, "found": library()["BodyMass"]({"trunk": 2.0})}))
+    heavier = replace(
+        clean,
+        model=replace(
+            clean.model,
+            effects={**clean.model.effects, "found": library()["BodyMass"]({"trunk": 2.0})},
+        ),
+    )
     before, after = (rollout(model, log, planned_with=clean.believed) for model in (clean, heavier))
     assert after.mean_position < 0.1 * before.mean_position
     assert after.mean_torque_command < 0.1 * before.mean_torque_command
@@ -214,9 +255,13 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
 
 
 def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_difference() -> None:
-    search = Search(Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}")), [JointSpring, TorqueBias])
+    search = Search(
+        Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}")),
+        [JointSpring, TorqueBias],
+    )
     spring, bias = (
-        next(e for e in search.best_additions(search.explain([])) if e.candidates[0].effect is c) for c in (JointSpring, TorqueBias)
+        next(e for e in search.best_additions(search.explain([])) if e.candidates[0].effect is c)
+        for c in (JointSpring, TorqueBias)
     )
     for charge, equals in ((11.0, True), (60.0, False)):
         assert _equals(search, bias, replace(spring, deviance=bias.deviance - charge)) == equals
@@ -224,10 +269,16 @@ def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_dif
         assert not _equals(search, spring, replace(bias, deviance=spring.deviance - charge))
 
 
-@pytest.mark.parametrize("hidden", ["!BodyMass {mass: {left_foot: 3.5}}", "!FootForceLag {time_constant: {right: 0.045}}"])
+@pytest.mark.parametrize(
+    "hidden",
+    ["!BodyMass {mass: {left_foot: 3.5}}", "!FootForceLag {time_constant: {right: 0.045}}"],
+)
 def test_what_a_large_effect_leaves_over_is_noise(hidden: str) -> None:
     """A heavy foot hits the ground harder than smoothed accelerations tell; a foot that reads late seems to stand while it lifts."""
-    candidates = [library()[name] for name in (hidden[1:].split()[0], "CoulombFriction", "TorqueBias", "FootForceGain")]
+    candidates = [
+        library()[name]
+        for name in (hidden[1:].split()[0], "CoulombFriction", "TorqueBias", "FootForceGain")
+    ]
     diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), candidates)
     assert diagnosis.verdict == "effect_found"
     assert [f.effect for f in diagnosis.chosen] == [hidden[1:].split()[0]]
@@ -251,7 +302,10 @@ def test_a_ripple_is_not_seen_in_a_joint_that_stands_still() -> None:
 def test_no_body_loses_more_than_it_weighs() -> None:
     predictor, mass = Predictor(scenario(), log_with("")), library()["BodyMass"]
     foot = predictor.robot.body("left_foot").default_mass()
-    assert [predictor.is_possible(mass, "left_foot", np.array([share * foot])) for share in (-1.1, -0.9, 5.0)] == [False, True, True]
+    assert [
+        predictor.is_possible(mass, "left_foot", np.array([share * foot]))
+        for share in (-1.1, -0.9, 5.0)
+    ] == [False, True, True]
 
 
 def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
@@ -259,7 +313,9 @@ def test_study_adds_what_it_finds_and_the_errors_fall() -> None:
     result = study(scenario(), log_with(hidden), effects())
     before, after = result.steps
     assert after.held_out_rmse < 1.2 < before.held_out_rmse
-    assert after.rollout.position["left_knee_pitch"] < 0.5 * before.rollout.position["left_knee_pitch"]
+    assert (
+        after.rollout.position["left_knee_pitch"] < 0.5 * before.rollout.position["left_knee_pitch"]
+    )
     assert "noise floor" in result.stopped_because
     added = result.scenario.believed.effects["torque_gain"]
     assert added.shortfall["left_knee_pitch"] == pytest.approx(0.04, rel=0.05)

@@ -25,27 +25,65 @@ FRICTION = Finding(
     KNEES,
     8.1,
     1.02,
-    {"coulomb": Estimate(1.5, (1.4, 1.6), "Nm"), "transition": Estimate(0.004, (0.001, 0.007), "rad/s")},
+    {
+        "coulomb": Estimate(1.5, (1.4, 1.6), "Nm"),
+        "transition": Estimate(0.004, (0.001, 0.007), "rad/s"),
+    },
     ("PreslidingHysteresis",),
     chosen=True,
 )
-RIVAL = Finding("PreslidingHysteresis", KNEES, 8.1, 1.03, {"coulomb": Estimate(1.5, (1.4, 1.6), "Nm")}, (), chosen=False)
-MASS = Finding("BodyMass", ("trunk",), 5.0, 1.01, {"mass": Estimate(2.0, (1.9, 2.1), "kg")}, (), chosen=True)
+RIVAL = Finding(
+    "PreslidingHysteresis",
+    KNEES,
+    8.1,
+    1.03,
+    {"coulomb": Estimate(1.5, (1.4, 1.6), "Nm")},
+    (),
+    chosen=False,
+)
+MASS = Finding(
+    "BodyMass", ("trunk",), 5.0, 1.01, {"mass": Estimate(2.0, (1.9, 2.1), "kg")}, (), chosen=True
+)
 STATUSES = {
-    "CoulombFriction": EffectStatus("present", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move each joint to and fro."),
-    "PreslidingHysteresis": EffectStatus("confusable", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move by small amounts.", "squat"),
-    "TorqueBias": EffectStatus("absent", "bias", "Nm", {"left_knee_pitch": 0.02, "right_knee_pitch": 1e9}, "Hold each joint still."),
-    "ThermalDrift": EffectStatus("not_visible", "change", "Nm", dict.fromkeys(KNEES, np.inf), "Repeat one motion."),
+    "CoulombFriction": EffectStatus(
+        "present", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move each joint to and fro."
+    ),
+    "PreslidingHysteresis": EffectStatus(
+        "confusable", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move by small amounts.", "squat"
+    ),
+    "TorqueBias": EffectStatus(
+        "absent",
+        "bias",
+        "Nm",
+        {"left_knee_pitch": 0.02, "right_knee_pitch": 1e9},
+        "Hold each joint still.",
+    ),
+    "ThermalDrift": EffectStatus(
+        "not_visible", "change", "Nm", dict.fromkeys(KNEES, np.inf), "Repeat one motion."
+    ),
 }
 
 
-def made_diagnosis(verdict: str = "effect_found", ranking: tuple[Finding, ...] = (FRICTION, RIVAL), **changes: object) -> Diagnosis:
-    content = {"effects": STATUSES, "unexplained": (), "path": (), "held_out_before": 4.2, "held_out_after": 1.01, "train_after": 1.0}
+def made_diagnosis(
+    verdict: str = "effect_found",
+    ranking: tuple[Finding, ...] = (FRICTION, RIVAL),
+    **changes: object,
+) -> Diagnosis:
+    content = {
+        "effects": STATUSES,
+        "unexplained": (),
+        "path": (),
+        "held_out_before": 4.2,
+        "held_out_after": 1.01,
+        "train_after": 1.0,
+    }
     return Diagnosis(verdict=verdict, ranking=ranking, **(content | changes))
 
 
 NOTHING = made_diagnosis("nothing_missing", (), held_out_before=1.0)
-UNKNOWN = made_diagnosis("unknown_effect", (), unexplained=(Structure("left_knee_pitch", 3, 6.2, "position", 0.8),))
+UNKNOWN = made_diagnosis(
+    "unknown_effect", (), unexplained=(Structure("left_knee_pitch", 3, 6.2, "position", 0.8),)
+)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +119,9 @@ def test_study_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp
     rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
     better = dataclasses.replace(rolled, position={"left_knee_pitch": 0.002})
     steps = (StudyStep((), 4.2, 4.2, rolled), StudyStep((FRICTION,), 1.01, 1.0, better))
-    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    study = Study(
+        steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario
+    )
     reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert pages(text) == 10
@@ -101,7 +141,10 @@ def test_study_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """All figures are empty, which saves the time to draw them."""
     for name, function in vars(figures).items():
-        if not name.startswith("_") and getattr(function, "__annotations__", {}).get("return") is figures.Figure:
+        if (
+            not name.startswith("_")
+            and getattr(function, "__annotations__", {}).get("return") is figures.Figure
+        ):
             monkeypatch.setattr(figures, name, lambda *_, **__: figures.Figure())
 
 
@@ -127,7 +170,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         (
             UNKNOWN,
             False,
-            ["Something is missing that no effect of the library explains, in left knee pitch (follows position).", "register an effect"],
+            [
+                "Something is missing that no effect of the library explains, in left knee pitch (follows position).",
+                "register an effect",
+            ],
         ),
         (
             made_diagnosis("not_visible", ()),
@@ -140,12 +186,18 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         (
             made_diagnosis(ranking=(FRICTION, MASS)),
             True,
-            ["The model lacks Coulomb friction in left and right knee pitch and body mass in trunk"],
+            [
+                "The model lacks Coulomb friction in left and right knee pitch and body mass in trunk"
+            ],
         ),
     ],
 )
 def test_diagnosis_report_says_what_how_sure_what_else_and_what_next(
-    diagnosis: Diagnosis, passed: bool, texts: list[str], walk: tuple[Predictor, Comparison], tmp_path: Path
+    diagnosis: Diagnosis,
+    passed: bool,
+    texts: list[str],
+    walk: tuple[Predictor, Comparison],
+    tmp_path: Path,
 ):
     reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -156,7 +208,9 @@ def test_diagnosis_report_says_what_how_sure_what_else_and_what_next(
 
 @pytest.mark.usefixtures("undrawn")
 def test_study_that_finds_nothing_says_so(walk: tuple[Predictor, Comparison], tmp_path: Path):
-    study = Study((StudyStep((), 1.0, 1.0, None),), (NOTHING,), "the noise floor is reached", walk[0].scenario)
+    study = Study(
+        (StudyStep((), 1.0, 1.0, None),), (NOTHING,), "the noise floor is reached", walk[0].scenario
+    )
     reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Nothing is missing" in text
@@ -164,7 +218,11 @@ def test_study_that_finds_nothing_says_so(walk: tuple[Predictor, Comparison], tm
 
 
 def test_falling_error_shows_both_errors_and_the_noise():
-    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((MASS,), 1.01, 1.0, None))
+    steps = (
+        StudyStep((), 4.2, 4.2, None),
+        StudyStep((FRICTION,), 1.3, 1.2, None),
+        StudyStep((MASS,), 1.01, 1.0, None),
+    )
     (axes,) = figures.falling_error(steps, "mrad").axes
     lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
     np.testing.assert_allclose(lines["held-out data"], [4.2, 1.3, 1.01])
@@ -173,7 +231,9 @@ def test_falling_error_shows_both_errors_and_the_noise():
     assert [label.get_text() for label in axes.get_xticklabels()][2] == "+ Body mass\n(trunk)"
 
 
-def test_torques_over_time_are_those_of_motors_and_of_both_models(walk: tuple[Predictor, Comparison]):
+def test_torques_over_time_are_those_of_motors_and_of_both_models(
+    walk: tuple[Predictor, Comparison],
+):
     residual = walk[0].residual
     halved = dataclasses.replace(residual, value=0.5 * residual.value)
     knee, pitch = (residual.row_index[name] for name in ("left_knee_pitch", "left_ankle_pitch"))
@@ -185,21 +245,28 @@ def test_torques_over_time_are_those_of_motors_and_of_both_models(walk: tuple[Pr
     np.testing.assert_allclose(lines["measured"], measured)
     np.testing.assert_allclose(lines["the model as given"], measured - left)
     np.testing.assert_allclose(lines["the completed model"], measured - 0.5 * left)
-    np.testing.assert_allclose([line.get_ydata() for line in errors.get_lines()], [left, 0.5 * left])
+    np.testing.assert_allclose(
+        [line.get_ydata() for line in errors.get_lines()], [left, 0.5 * left]
+    )
     before, after = map(float, re.findall(r"([\d.]+) %", torques.get_title(loc="right")))
     assert before == pytest.approx(100 * np.linalg.norm(left) / np.linalg.norm(measured), rel=0.05)
     assert after == pytest.approx(0.5 * before, rel=0.1)
     assert torques.get_ylabel() == "torque [Nm]"
 
 
-def test_channels_that_got_better_are_drawn_from_before_to_after(walk: tuple[Predictor, Comparison]):
+def test_channels_that_got_better_are_drawn_from_before_to_after(
+    walk: tuple[Predictor, Comparison],
+):
     channels = walk[1].channels[:2]
     better = [dataclasses.replace(channels[0], rmse=channels[0].noise_floor), channels[1]]
     (axes,) = figures.channel_errors(channels, better).axes
     ratios = [channel.rmse / channel.noise_floor for channel in channels]
     dots = [float(line.get_xdata()[0]) for line in axes.get_lines() if line.get_marker() == "o"]
     np.testing.assert_allclose(dots, [ratios[0], 1.0, ratios[1]])
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["left hip yaw", "left hip roll"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == [
+        "left hip yaw",
+        "left hip roll",
+    ]
 
 
 def rolled(size: float) -> RolloutError:
@@ -208,7 +275,9 @@ def rolled(size: float) -> RolloutError:
     errors = {"knee": size, "slide": 2 * size}
     shares = {"knee": 0.1 * size, "slide": 0.2 * size}
     series = np.stack([np.full(200, error) for error in errors.values()], axis=1)
-    return RolloutError(errors, {}, {"knee": 3.0, "slide": 3.0}, 3.0, None, errors, shares, time, series)
+    return RolloutError(
+        errors, {}, {"knee": 3.0, "slide": 3.0}, 3.0, None, errors, shares, time, series
+    )
 
 
 def test_errors_of_the_simulated_model_over_time_are_not_joined_over_gaps():
@@ -223,65 +292,124 @@ def test_errors_of_the_simulated_model_over_time_are_not_joined_over_gaps():
 
 
 def test_wide_intervals_do_not_hide_values():
-    wide = dataclasses.replace(FRICTION, parameters=FRICTION.parameters | {"coulomb": Estimate(2.0, (-1e6, 1e6), "Nm")})
+    wide = dataclasses.replace(
+        FRICTION, parameters=FRICTION.parameters | {"coulomb": Estimate(2.0, (-1e6, 1e6), "Nm")}
+    )
     axes = figures.parameters([(FRICTION, "first"), (wide, "second")]).axes[0]
     low, high = axes.get_xlim()
     assert -10 < low < high < 10
-    marks = {line.get_marker(): line.get_ydata().tolist() for line in axes.get_lines() if line.get_label() == "interval goes on"}
+    marks = {
+        line.get_marker(): line.get_ydata().tolist()
+        for line in axes.get_lines()
+        if line.get_label() == "interval goes on"
+    }
     assert marks == {"<": [1], ">": [1]}
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_errors_on_logs_that_were_not_fitted_are_told(walk: tuple[Predictor, Comparison], tmp_path: Path):
-    given = {"train": ModelError(0.142, {"hip": 0.2, "knee": 0.1}, {}), "pulses": ModelError(0.25, {"hip": 0.3, "knee": 0.2}, {})}
-    completed = {name: ModelError(error.relative / 2, {"hip": 0.1, "knee": 0.05}, {}) for name, error in given.items()}
-    steps = (StudyStep((), 4.2, 4.2, None, given), StudyStep((FRICTION,), 1.3, 1.2, None, completed))
-    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+def test_errors_on_logs_that_were_not_fitted_are_told(
+    walk: tuple[Predictor, Comparison], tmp_path: Path
+):
+    given = {
+        "train": ModelError(0.142, {"hip": 0.2, "knee": 0.1}, {}),
+        "pulses": ModelError(0.25, {"hip": 0.3, "knee": 0.2}, {}),
+    }
+    completed = {
+        name: ModelError(error.relative / 2, {"hip": 0.1, "knee": 0.05}, {})
+        for name, error in given.items()
+    }
+    steps = (
+        StudyStep((), 4.2, 4.2, None, given),
+        StudyStep((FRICTION,), 1.3, 1.2, None, completed),
+    )
+    study = Study(
+        steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario
+    )
     inputs = dataclasses.replace(INPUTS, tests=("pulses.npz",))
-    reports.write_study_report(tmp_path / "report.html", study, walk, walk, inputs, {"pulses": walk[0].motion.log})
+    reports.write_study_report(
+        tmp_path / "report.html", study, walk, walk, inputs, {"pulses": walk[0].motion.log}
+    )
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "On the log that was fitted 14.2 % before, 7.10 % after; on pulses (not fitted) 25.0 % before, 12.5 % after." in text
-    numbers = "".join(f'<td class="number">{value}</td>' for value in ("20.0", "10.0", "30.0", "10.0"))
+    assert (
+        "On the log that was fitted 14.2 % before, 7.10 % after; on pulses (not fitted) 25.0 % before, 12.5 % after."
+        in text
+    )
+    numbers = "".join(
+        f'<td class="number">{value}</td>' for value in ("20.0", "10.0", "30.0", "10.0")
+    )
     assert f"<tr><td>hip</td>{numbers}</tr>" in text
     assert "3.0 s of pulses (not fitted). Right above" in text
     assert "fbse study out/a_walk/scenario.yaml walk.npz --test pulses.npz --out" in text
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_positions_of_the_simulated_model_are_told_by_joint(walk: tuple[Predictor, Comparison], tmp_path: Path):
+def test_positions_of_the_simulated_model_are_told_by_joint(
+    walk: tuple[Predictor, Comparison], tmp_path: Path
+):
     def error(size: float) -> RolloutError:
         by_joint = dict.fromkeys(walk[0].robot.joint_names, size)
-        return RolloutError(by_joint, {}, by_joint, 3.0, None, by_joint, by_joint, np.arange(3.0), np.full((3, 12), size))
+        return RolloutError(
+            by_joint,
+            {},
+            by_joint,
+            3.0,
+            None,
+            by_joint,
+            by_joint,
+            np.arange(3.0),
+            np.full((3, 12), size),
+        )
 
     steps = (StudyStep((), 4.2, 4.2, error(0.02)), StudyStep((FRICTION,), 1.01, 1.0, error(0.005)))
-    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    study = Study(
+        steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario
+    )
     reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    numbers = "".join(f'<td class="number">{value}</td>' for value in ("20.0", "5.00", "20.0", "5.00", "2.00", "0.500"))
+    numbers = "".join(
+        f'<td class="number">{value}</td>'
+        for value in ("20.0", "5.00", "20.0", "5.00", "2.00", "0.500")
+    )
     assert f"<tr><td>left hip yaw</td><td>mrad</td>{numbers}</tr>" in text
     assert "The simulated model, before and after" in text
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_of_a_long_log_the_worst_stretch_is_shown(walk: tuple[Predictor, Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_of_a_long_log_the_worst_stretch_is_shown(
+    walk: tuple[Predictor, Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     shown = []
-    monkeypatch.setattr(figures, "torques_over_time", lambda *arguments: shown.append(arguments) or figures.Figure())
+    monkeypatch.setattr(
+        figures, "torques_over_time", lambda *arguments: shown.append(arguments) or figures.Figure()
+    )
     monkeypatch.setattr(reports, "_SHOWN", 100)
     steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.01, 1.0, None))
-    study = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario)
+    study = Study(
+        steps, (made_diagnosis(), NOTHING), "the noise floor is reached", walk[0].scenario
+    )
     reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
     (_, _, joints, stretch) = shown[0]
     residual = walk[0].residual
     power = (residual.value**2 / residual.variance)[:, joints].sum(axis=1)
     assert stretch.stop - stretch.start == 100
-    assert power[stretch].sum() == pytest.approx(max(power[start : start + 100].sum() for start in range(len(power) - 99)))
-    assert "the part in which the model as given errs most" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert power[stretch].sum() == pytest.approx(
+        max(power[start : start + 100].sum() for start in range(len(power) - 99))
+    )
+    assert "the part in which the model as given errs most" in (tmp_path / "report.html").read_text(
+        encoding="utf-8"
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_rounds_are_told_apart_and_what_is_left_is_said_once(walk: tuple[Predictor, Comparison], tmp_path: Path):
+def test_rounds_are_told_apart_and_what_is_left_is_said_once(
+    walk: tuple[Predictor, Comparison], tmp_path: Path
+):
     again = dataclasses.replace(FRICTION, targets=("left_knee_pitch",), confusable_with=())
-    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((again,), 1.2, 1.1, None))
+    steps = (
+        StudyStep((), 4.2, 4.2, None),
+        StudyStep((FRICTION,), 1.3, 1.2, None),
+        StudyStep((again,), 1.2, 1.1, None),
+    )
     last = dataclasses.replace(UNKNOWN, ranking=(again,))
     study = Study(steps, (made_diagnosis(), last), "no effect explains the rest", walk[0].scenario)
     reports.write_study_report(tmp_path / "report.html", study, walk, walk, INPUTS)
@@ -296,7 +424,9 @@ def test_rounds_are_told_apart_and_what_is_left_is_said_once(walk: tuple[Predict
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_effects_without_a_place_on_the_robot_are_not_spoken_of(walk: tuple[Predictor, Comparison], tmp_path: Path):
+def test_effects_without_a_place_on_the_robot_are_not_spoken_of(
+    walk: tuple[Predictor, Comparison], tmp_path: Path
+):
     """As feet on an arm."""
     feet = EffectStatus("not_visible", "gain", "1", {}, "Stand on one foot.")
     diagnosis = made_diagnosis(effects=STATUSES | {"FootForceGain": feet})
@@ -309,12 +439,16 @@ def test_effects_without_a_place_on_the_robot_are_not_spoken_of(walk: tuple[Pred
 def test_effects_in_one_place_are_named_together():
     bias = dataclasses.replace(FRICTION, effect="TorqueBias")
     text = reports.diagnosis_outcome(made_diagnosis(ranking=(FRICTION, MASS, bias)))
-    assert text.startswith("The model lacks Coulomb friction and torque bias in left and right knee pitch and body mass in trunk;")
+    assert text.startswith(
+        "The model lacks Coulomb friction and torque bias in left and right knee pitch and body mass in trunk;"
+    )
 
 
 def test_detectability_is_relative_to_what_is_plausible():
     (axes,) = figures.detectability(STATUSES).axes
-    dots = {line.get_label(): line.get_xdata() for line in axes.get_lines() if line.get_marker() == "o"}
+    dots = {
+        line.get_label(): line.get_xdata() for line in axes.get_lines() if line.get_marker() == "o"
+    }
     # Biases of up to 20 Nm are plausible; what is beyond the picture is at its edge.
     np.testing.assert_allclose(dots["absent"], [0.02 / 20, 30.0])
     np.testing.assert_allclose(dots["not visible"], [30.0, 30.0])
@@ -322,9 +456,15 @@ def test_detectability_is_relative_to_what_is_plausible():
 
 def test_errors_over_time_show_supports_and_noise(walk: tuple[Predictor, Comparison]):
     predictor, comparison = walk
-    channels = [channel for channel in comparison.channels if channel.row.name in ("left_knee_pitch", "left_sole/specific_force_z")]
+    channels = [
+        channel
+        for channel in comparison.channels
+        if channel.row.name in ("left_knee_pitch", "left_sole/specific_force_z")
+    ]
     knee, sole = figures.errors_over_time(predictor.residual, ["left", "right"], channels).axes
-    assert {"left leg supports", "right leg supports", "error"} <= set(knee.get_legend_handles_labels()[1])
+    assert {"left leg supports", "right leg supports", "error"} <= set(
+        knee.get_legend_handles_labels()[1]
+    )
     drawn = next(line for line in sole.get_lines() if line.get_label() == "error").get_ydata()
     known = predictor.residual.known[:, predictor.residual.row_index["left_sole/specific_force_z"]]
     # Not while the foot swings.
@@ -332,11 +472,21 @@ def test_errors_over_time_show_supports_and_noise(walk: tuple[Predictor, Compari
     np.testing.assert_array_equal(np.isfinite(drawn), known)
 
 
-def test_an_effect_that_is_found_in_several_rounds_is_named_once(walk: tuple[Predictor, Comparison]):
+def test_an_effect_that_is_found_in_several_rounds_is_named_once(
+    walk: tuple[Predictor, Comparison],
+):
     again = dataclasses.replace(FRICTION, targets=("left_knee_pitch", "left_hip_yaw"))
-    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.3, 1.2, None), StudyStep((again,), 5.0, 1.0, None))
-    text = reports.study_outcome(Study(steps, (made_diagnosis(), made_diagnosis()), "", walk[0].scenario))
-    assert text.startswith("The model lacked Coulomb friction in left knee pitch, right knee pitch, left hip yaw.")
+    steps = (
+        StudyStep((), 4.2, 4.2, None),
+        StudyStep((FRICTION,), 1.3, 1.2, None),
+        StudyStep((again,), 5.0, 1.0, None),
+    )
+    text = reports.study_outcome(
+        Study(steps, (made_diagnosis(), made_diagnosis()), "", walk[0].scenario)
+    )
+    assert text.startswith(
+        "The model lacked Coulomb friction in left knee pitch, right knee pitch, left hip yaw."
+    )
     assert "the held-out error rises from 4.20 to 5.00 times" in text
 
 

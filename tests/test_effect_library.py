@@ -10,7 +10,13 @@ from pydrake.multibody.tree import MultibodyForces
 from scipy.signal import lfilter
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
-from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag, TorqueSaturation
+from fbse_drake.effects.actuation import (
+    TorqueBias,
+    TorqueDelay,
+    TorqueGain,
+    TorqueLag,
+    TorqueSaturation,
+)
 from fbse_drake.effects.effect import Effect, in_library, library
 from fbse_drake.effects.friction import (
     CoulombFriction,
@@ -23,7 +29,12 @@ from fbse_drake.effects.friction import (
     ViscousFriction,
 )
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
-from fbse_drake.effects.transmission import Backlash, JointSpring, PreslidingHysteresis, TorqueRipple
+from fbse_drake.effects.transmission import (
+    Backlash,
+    JointSpring,
+    PreslidingHysteresis,
+    TorqueRipple,
+)
 from fbse_drake.robot.description import load_description
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import RobotConfig, dump_scenario
@@ -37,7 +48,10 @@ def recorded(samples: int = 300, joints: int = 2) -> JointMotion:
     """A made-up motion: fast and slow, to and fro, under a command that changes sign."""
     generator = np.random.default_rng(3)
     time = np.arange(samples)[:, None] * H
-    rate, phase = generator.uniform(10, 40, size=(2, joints)), generator.uniform(0, 6, size=(2, joints))
+    rate, phase = (
+        generator.uniform(10, 40, size=(2, joints)),
+        generator.uniform(0, 6, size=(2, joints)),
+    )
     velocity = 0.3 * np.sin(rate[0] * time + phase[0])
     position = 0.1 + np.cumsum(velocity, axis=0) * H
     command = 20.0 * np.sin(rate[1] * time + phase[1]) + generator.normal(size=(samples, joints))
@@ -47,7 +61,11 @@ def recorded(samples: int = 300, joints: int = 2) -> JointMotion:
 def law(effect: JointTorqueEffect, motion: JointMotion) -> np.ndarray:
     """Torque loss of an effect of which all joints have the same values, (N, n)."""
     whole, n = effect.resolve(NAMES), motion.velocity.shape[1]
-    return np.einsum("pn,pNn->Nn", whole.linear[:, :n], basis_over_time(type(effect), motion, whole.nonlinear[:, :n]))
+    return np.einsum(
+        "pn,pNn->Nn",
+        whole.linear[:, :n],
+        basis_over_time(type(effect), motion, whole.nonlinear[:, :n]),
+    )
 
 
 M = recorded()
@@ -60,17 +78,32 @@ TRANSITION = {"all": 0.02}
     [
         (CoulombFriction(coulomb={"all": 3.0}, transition=TRANSITION), 3.0 * SIGN),
         (ViscousFriction(viscous={"all": 2.0}), 2.0 * M.velocity),
-        (CoulombViscousFriction({"all": 3.0}, {"all": 2.0}, TRANSITION), 3.0 * SIGN + 2.0 * M.velocity),
+        (
+            CoulombViscousFriction({"all": 3.0}, {"all": 2.0}, TRANSITION),
+            3.0 * SIGN + 2.0 * M.velocity,
+        ),
         (DirectionalFriction(asymmetry={"all": -1.5}, transition=TRANSITION), -1.5 * SIGN**2),
         (DirectionalViscousFriction(asymmetry={"all": -0.7}), -0.7 * np.abs(M.velocity)),
-        (LoadDependentFriction(coefficient={"all": 0.1}, transition=TRANSITION), 0.1 * np.abs(M.load) * SIGN),
+        (
+            LoadDependentFriction(coefficient={"all": 0.1}, transition=TRANSITION),
+            0.1 * np.abs(M.load) * SIGN,
+        ),
         (QuadraticDrag(drag={"all": 4.0}), 4.0 * M.velocity**2 * np.sign(M.velocity)),
-        (ThermalDrift({"all": -2.0}, {"all": 30.0}, TRANSITION), -2.0 * (1 - np.exp(-M.time / 30.0)) * SIGN),
-        (TorqueRipple({"all": 1.0}, {"all": -0.5}, {"all": 80.0}), np.sin(80 * M.position) - 0.5 * np.cos(80 * M.position)),
+        (
+            ThermalDrift({"all": -2.0}, {"all": 30.0}, TRANSITION),
+            -2.0 * (1 - np.exp(-M.time / 30.0)) * SIGN,
+        ),
+        (
+            TorqueRipple({"all": 1.0}, {"all": -0.5}, {"all": 80.0}),
+            np.sin(80 * M.position) - 0.5 * np.cos(80 * M.position),
+        ),
         (JointSpring(stiffness={"all": 50.0}, preload={"all": -3.0}), 50.0 * M.position - 3.0),
         (TorqueGain(shortfall={"all": 0.1}), 0.1 * M.command),
         (TorqueBias(bias={"all": -2.0}), -2.0 + 0 * M.command),
-        (TorqueSaturation(limit={"all": 12.0}), np.where(np.abs(M.command) > 12, M.command - 12 * np.sign(M.command), 0.0)),
+        (
+            TorqueSaturation(limit={"all": 12.0}),
+            np.where(np.abs(M.command) > 12, M.command - 12 * np.sign(M.command), 0.0),
+        ),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Effect) else "",
 )
@@ -83,7 +116,9 @@ def test_delay_shifts_the_command(steps: float):
     whole, share = int(steps), steps - int(steps)
     before = np.concatenate([np.repeat(M.command[:1], 31, axis=0), M.command])
     late = (1 - share) * before[31 - whole :][:300] + share * before[30 - whole :][:300]
-    np.testing.assert_allclose(law(TorqueDelay(delay={"all": steps * H}), M), M.command - late, atol=1e-9)
+    np.testing.assert_allclose(
+        law(TorqueDelay(delay={"all": steps * H}), M), M.command - late, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,7 +128,9 @@ def test_delay_shifts_the_command(steps: float):
         (Backlash, [[[1e-3, 2e-3], [0.0, 2e-2]], [[0.1, 0.3], [0.02, 1.0]]]),
     ],
 )
-def test_memory_at_once_is_that_of_the_steps(monkeypatch: pytest.MonkeyPatch, effect: type[JointTorqueEffect], sets: list):
+def test_memory_at_once_is_that_of_the_steps(
+    monkeypatch: pytest.MonkeyPatch, effect: type[JointTorqueEffect], sets: list
+):
     at_once = basis_over_time(effect, M, np.array(sets))
     monkeypatch.setattr(effect, "memory_over_time", JointTorqueEffect.memory_over_time)
     np.testing.assert_array_equal(at_once, basis_over_time(effect, M, np.array(sets)))
@@ -107,13 +144,20 @@ def test_lag_is_a_low_pass(time_constant: float):
     starts = np.concatenate([M.command[:1], ends[:-1]])
     # The integral of y' = (command - y) / T over the step.
     mean = M.command - time_constant * (ends - starts) / H
-    np.testing.assert_allclose(law(TorqueLag(time_constant={"all": time_constant}), M), M.command - mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        law(TorqueLag(time_constant={"all": time_constant}), M),
+        M.command - mean,
+        rtol=1e-9,
+        atol=1e-12,
+    )
 
 
 def test_bristles_bend_like_a_spring_and_slip_like_coulomb_friction():
     effect = PreslidingHysteresis(coulomb={"all": 3.0}, displacement={"all": 1e-3})
     creep = JointMotion(np.full((10, 1), 1e-3), time_step=H)
-    np.testing.assert_allclose(np.diff(law(effect, creep), axis=0) / (1e-3 * H), 3.0 / 1e-3, rtol=0.02)
+    np.testing.assert_allclose(
+        np.diff(law(effect, creep), axis=0) / (1e-3 * H), 3.0 / 1e-3, rtol=0.02
+    )
     slip = JointMotion(np.full((100, 1), -0.1), time_step=H)
     angle = 0.1 * H * np.arange(1, 101)[:, None]
     np.testing.assert_allclose(law(effect, slip), -3.0 * (1 - np.exp(-angle / 1e-3)), rtol=1e-9)
@@ -152,44 +196,76 @@ def sample(effect: type[JointTorqueEffect], joints: dict[str, float]) -> JointTo
     for name, parameter in effect.parameters.items():
         low, high = parameter.plausible
         middle[name] = 0.3 * high if parameter.linear else np.sqrt(low * high)
-    values = {name: [value * factor for factor in joints.values()] for name, value in middle.items()}
+    values = {
+        name: [value * factor for factor in joints.values()] for name, value in middle.items()
+    }
     if effect is TorqueSaturation:
         values["limit"] = [8.0 * factor for factor in joints.values()]
-    every = {name: {"all": value} for name, value in middle.items() if effect.parameters[name].neutral is None}
+    every = {
+        name: {"all": value}
+        for name, value in middle.items()
+        if effect.parameters[name].neutral is None
+    }
     chosen = effect.from_values(list(joints), values)
-    nonlinear = [name for name, parameter in effect.parameters.items() if not parameter.linear and parameter.neutral is None]
-    return dataclasses.replace(chosen, **{name: every[name] | getattr(chosen, name) for name in nonlinear})
+    nonlinear = [
+        name
+        for name, parameter in effect.parameters.items()
+        if not parameter.linear and parameter.neutral is None
+    ]
+    return dataclasses.replace(
+        chosen, **{name: every[name] | getattr(chosen, name) for name in nonlinear}
+    )
 
 
 @pytest.mark.parametrize("effect", JOINT_EFFECTS, ids=lambda effect: effect.__name__)
 def test_slope_is_the_derivative(effect: type[JointTorqueEffect]):
     resolved = sample(effect, dict.fromkeys(NAMES.joint_names, 1.0)).resolve(NAMES)
     nonlinear, generator, e = resolved.nonlinear, np.random.default_rng(7), 1e-7
-    motion = JointMotion(generator.normal(scale=0.02, size=12), generator.normal(size=12), generator.normal(size=12), 5.0, H)
+    motion = JointMotion(
+        generator.normal(scale=0.02, size=12),
+        generator.normal(size=12),
+        generator.normal(size=12),
+        5.0,
+        H,
+    )
     if effect.has_memory:
         memory = effect.start(motion, nonlinear)
         motion = motion._replace(memory=memory)
         for _ in range(3):
-            motion = motion._replace(memory=effect.advance(motion, nonlinear), command=generator.normal(size=12))
-    after, before = (resolved.torque_and_slope(motion._replace(velocity=motion.velocity + d))[0] for d in (e, -e))
-    np.testing.assert_allclose(resolved.torque_and_slope(motion)[1], (after - before) / (2 * e), rtol=1e-5, atol=1e-5)
+            motion = motion._replace(
+                memory=effect.advance(motion, nonlinear), command=generator.normal(size=12)
+            )
+    after, before = (
+        resolved.torque_and_slope(motion._replace(velocity=motion.velocity + d))[0] for d in (e, -e)
+    )
+    np.testing.assert_allclose(
+        resolved.torque_and_slope(motion)[1], (after - before) / (2 * e), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("effect", JOINT_EFFECTS, ids=lambda effect: effect.__name__)
 def test_many_values_at_once_are_each_by_itself(effect: type[JointTorqueEffect]):
     motion = recorded(40, 2)
-    low = np.array([parameter.plausible for parameter in effect.parameters.values() if not parameter.linear]).reshape(-1, 2)
-    sets = np.exp(np.random.default_rng(1).uniform(*np.log(low).T[:, :, None, None], size=(len(low), 3, 2)))
+    low = np.array(
+        [parameter.plausible for parameter in effect.parameters.values() if not parameter.linear]
+    ).reshape(-1, 2)
+    sets = np.exp(
+        np.random.default_rng(1).uniform(*np.log(low).T[:, :, None, None], size=(len(low), 3, 2))
+    )
     together = basis_over_time(effect, motion, sets)
     assert together.shape[1:] == (3, 40, 2)
     for k in range(3):
-        np.testing.assert_allclose(together[:, k], basis_over_time(effect, motion, sets[:, k]), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            together[:, k], basis_over_time(effect, motion, sets[:, k]), rtol=1e-12, atol=1e-12
+        )
 
 
 def swinging(effects: dict[str, Effect], *overrides: str) -> Log:
     """The legs swinging free with these effects."""
     base = scenario("leg_swing_gantry", "duration=0.6", *overrides, noise=False)
-    return simulate(dataclasses.replace(base, robot=dataclasses.replace(base.robot, effects=effects))).log
+    return simulate(
+        dataclasses.replace(base, robot=dataclasses.replace(base.robot, effects=effects))
+    ).log
 
 
 def by_the_law(effects: dict[str, Effect], log: Log) -> np.ndarray:
@@ -207,11 +283,25 @@ def by_the_law(effects: dict[str, Effect], log: Log) -> np.ndarray:
     return sum(law(effect, motion) for effect in effects.values())
 
 
-FOUR = {"left_hip_yaw": 1.0, "left_knee_pitch": 0.8, "right_hip_pitch": 0.9, "right_ankle_roll": 0.7}
+FOUR = {
+    "left_hip_yaw": 1.0,
+    "left_knee_pitch": 0.8,
+    "right_hip_pitch": 0.9,
+    "right_ankle_roll": 0.7,
+}
 
 
 def test_simulated_torque_is_the_law_where_it_does_not_depend_on_velocity():
-    kinds = (TorqueGain, TorqueBias, TorqueDelay, TorqueLag, TorqueSaturation, TorqueRipple, JointSpring, Backlash)
+    kinds = (
+        TorqueGain,
+        TorqueBias,
+        TorqueDelay,
+        TorqueLag,
+        TorqueSaturation,
+        TorqueRipple,
+        JointSpring,
+        Backlash,
+    )
     effects = {kind.__name__: sample(kind, FOUR) for kind in kinds}
     log = swinging(effects)
     loss = log["truth/joint/friction_torque"]
@@ -221,7 +311,11 @@ def test_simulated_torque_is_the_law_where_it_does_not_depend_on_velocity():
     assert np.all(loss[:, np.logical_not(named)] == 0)
 
 
-@pytest.mark.parametrize("kind", [effect for effect in JOINT_EFFECTS if effect is not Backlash], ids=lambda effect: effect.__name__)
+@pytest.mark.parametrize(
+    "kind",
+    [effect for effect in JOINT_EFFECTS if effect is not Backlash],
+    ids=lambda effect: effect.__name__,
+)
 def test_every_effect_alone_spares_the_joints_that_are_not_named(kind: type[JointTorqueEffect]):
     motion = recorded(60, 12)
     loss = law(sample(kind, FOUR), motion)
@@ -253,10 +347,18 @@ def test_simulated_torque_follows_the_law_of_the_velocity_that_comes_out(effect:
 
 def test_links_get_what_is_commanded_less_the_loss():
     """Drake's inverse dynamics of the motion that came out: (1 - shortfall) command - bias - stiffness angle."""
-    effects = {"gain": TorqueGain(shortfall={"all": 0.1}), "bias": TorqueBias(bias={"all": -1.0}), "spring": JointSpring({"all": 20.0})}
+    effects = {
+        "gain": TorqueGain(shortfall={"all": 0.1}),
+        "bias": TorqueBias(bias={"all": -1.0}),
+        "spring": JointSpring({"all": 20.0}),
+    }
     log = swinging(effects)
     robot, _ = make_robot("biped", gantry_height=1.2)
-    plant, context, forces = robot.plant, robot.plant.CreateDefaultContext(), MultibodyForces(robot.plant)
+    plant, context, forces = (
+        robot.plant,
+        robot.plant.CreateDefaultContext(),
+        MultibodyForces(robot.plant),
+    )
     q, v, a = (log[f"truth/joint/{name}"] for name in ("position", "velocity", "acceleration"))
     for k in range(0, len(q) - 1, 25):
         robot.set_state(context, q[k], v[k])
@@ -264,7 +366,9 @@ def test_links_get_what_is_commanded_less_the_loss():
         acceleration[robot.velocity_index] = a[k + 1]
         plant.CalcForceElementsContribution(context, forces)
         needed = plant.CalcInverseDynamics(context, acceleration, forces)[robot.velocity_index]
-        np.testing.assert_allclose(needed, 0.9 * log["joint/torque_command"][k] + 1.0 - 20.0 * q[k], atol=1e-9)
+        np.testing.assert_allclose(
+            needed, 0.9 * log["joint/torque_command"][k] + 1.0 - 20.0 * q[k], atol=1e-9
+        )
 
 
 def test_a_held_command_is_delayed_by_time_not_by_ticks():
@@ -277,14 +381,28 @@ def test_a_held_command_is_delayed_by_time_not_by_ticks():
 
 @pytest.mark.parametrize("effect", list(library().values()), ids=lambda effect: effect.__name__)
 def test_values_survive_resolving(effect: type[Effect]):
-    targets = {"joint": NAMES.joint_names, "foot": NAMES.sides, "body": ["trunk", "left_foot"], "robot": ["robot"]}[effect.acts_on]
+    targets = {
+        "joint": NAMES.joint_names,
+        "foot": NAMES.sides,
+        "body": ["trunk", "left_foot"],
+        "robot": ["robot"],
+    }[effect.acts_on]
     generator = np.random.default_rng(5)
-    values = {name: generator.uniform(*parameter.plausible, size=len(targets)) for name, parameter in effect.parameters.items()}
+    values = {
+        name: generator.uniform(*parameter.plausible, size=len(targets))
+        for name, parameter in effect.parameters.items()
+    }
     resolved = effect.from_values(targets, values).resolve(NAMES)
     assert resolved.targets == targets
     for linear, rows in ((True, resolved.linear), (False, resolved.nonlinear)):
-        expected = [values[name] for name, parameter in effect.parameters.items() if parameter.linear == linear]
-        np.testing.assert_array_equal(rows, expected or (np.ones((1, 12)) if linear else np.zeros((0, len(targets)))))
+        expected = [
+            values[name]
+            for name, parameter in effect.parameters.items()
+            if parameter.linear == linear
+        ]
+        np.testing.assert_array_equal(
+            rows, expected or (np.ones((1, 12)) if linear else np.zeros((0, len(targets))))
+        )
 
 
 @pytest.mark.parametrize("effect", list(library().values()), ids=lambda effect: effect.__name__)
@@ -301,11 +419,23 @@ def test_every_effect_says_what_it_is(effect: type[Effect]):
 
 @pytest.mark.parametrize("effect", list(library().values()), ids=lambda effect: effect.__name__)
 def test_every_effect_survives_being_written_and_read(effect: type[Effect], tmp_path: Path):
-    target = {"joint": "left_knee_pitch", "foot": "left", "body": "trunk", "robot": "robot"}[effect.acts_on]
-    value = effect.from_values([target], {name: [0.5 * sum(p.plausible) + 0.125] for name, p in effect.parameters.items()})
-    nonlinear = [name for name, p in effect.parameters.items() if not p.linear and p.neutral is None and effect.acts_on == "joint"]
-    value = dataclasses.replace(value, **{name: {"all": 1.0, **getattr(value, name)} for name in nonlinear})
-    original = Scenario(robot=RobotConfig(effects={"hidden": value}), model=RobotConfig(effects={"found": value}))
+    target = {"joint": "left_knee_pitch", "foot": "left", "body": "trunk", "robot": "robot"}[
+        effect.acts_on
+    ]
+    value = effect.from_values(
+        [target], {name: [0.5 * sum(p.plausible) + 0.125] for name, p in effect.parameters.items()}
+    )
+    nonlinear = [
+        name
+        for name, p in effect.parameters.items()
+        if not p.linear and p.neutral is None and effect.acts_on == "joint"
+    ]
+    value = dataclasses.replace(
+        value, **{name: {"all": 1.0, **getattr(value, name)} for name in nonlinear}
+    )
+    original = Scenario(
+        robot=RobotConfig(effects={"hidden": value}), model=RobotConfig(effects={"found": value})
+    )
     path = tmp_path / "mine.yaml"
     path.write_text(dump_scenario(original, "mine"))
     again = load_scenario(path)
@@ -361,7 +491,11 @@ def test_an_effect_of_a_user_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     mine = load_scenario(path)
     log = simulate(mine).log
     knee = NAMES.joint_names.index("left_knee_pitch")
-    np.testing.assert_allclose(log["truth/joint/friction_torque"][:, knee], 3.0 * np.cos(log["truth/joint/position"][:, knee]), rtol=1e-12)
+    np.testing.assert_allclose(
+        log["truth/joint/friction_torque"][:, knee],
+        3.0 * np.cos(log["truth/joint/position"][:, knee]),
+        rtol=1e-12,
+    )
     # The scenario of the log can be read from anywhere.
     copy.parent.mkdir()
     copy.write_text(log.meta["scenario"])
@@ -376,7 +510,10 @@ def test_an_effect_of_a_user_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     [
         (None, r"effect_modules: .*mine\.py: cannot be imported: FileNotFoundError"),
         ("def", r"effect_modules: .*mine\.py: cannot be imported: SyntaxError: .*line 1"),
-        ("import no_such_thing", r"cannot be imported: ModuleNotFoundError: No module named 'no_such_thing'"),
+        (
+            "import no_such_thing",
+            r"cannot be imported: ModuleNotFoundError: No module named 'no_such_thing'",
+        ),
         (
             MINE.replace("GravityOfACable", "TorqueGain"),
             r"effect TorqueGain: the library has another effect of this name",
@@ -385,8 +522,14 @@ def test_an_effect_of_a_user_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             MINE.replace("    weight: dict[str, float] = field(default_factory=dict)\n", ""),
             r"expected a dataclass with the fields",
         ),
-        (MINE.replace("    signature:", "    sign:"), r"effect GravityOfACable: the class variable signature is missing"),
-        (MINE.replace("def basis", "def bases"), r"effect GravityOfACable: the method basis is missing"),
+        (
+            MINE.replace("    signature:", "    sign:"),
+            r"effect GravityOfACable: the class variable signature is missing",
+        ),
+        (
+            MINE.replace("def basis", "def bases"),
+            r"effect GravityOfACable: the method basis is missing",
+        ),
     ],
 )
 def test_a_bad_module_gets_one_line(tmp_path: Path, module: str | None, message: str):
@@ -403,12 +546,30 @@ def test_a_bad_module_gets_one_line(tmp_path: Path, module: str | None, message:
     ("text", "message"),
     [
         ("effect_modules: cable.py", r"effect_modules: expected a list, found 'cable\.py'"),
-        ("effect_modules: [no.such.module]", r"effect_modules: no\.such\.module: cannot be imported: ModuleNotFoundError"),
-        ("robot: {effects: {f: !Magic {}}}", r"robot\.effects\.f: expected one of .*!TorqueGain.*, found the tag !Magic"),
-        ("robot: {effects: {f: !TorqueGain {shortfal: {}}}}", r"f\.shortfal: unknown key, did you mean shortfall\?"),
-        ("robot: {effects: {f: !TorqueGain {shortfall: {knee: 1}}}}", r"robot\.effects\.f\.shortfall\.knee: unknown joint"),
-        ("robot: {effects: {f: !TorqueDelay {delay: {all: -1}}}}", r"robot\.effects\.f\.delay: expected values in \[0, inf\] s"),
-        ("model: {effects: {f: !Backlash {gap: {foot: 1}}}}", r"model\.effects\.f\.gap\.foot: unknown joint"),
+        (
+            "effect_modules: [no.such.module]",
+            r"effect_modules: no\.such\.module: cannot be imported: ModuleNotFoundError",
+        ),
+        (
+            "robot: {effects: {f: !Magic {}}}",
+            r"robot\.effects\.f: expected one of .*!TorqueGain.*, found the tag !Magic",
+        ),
+        (
+            "robot: {effects: {f: !TorqueGain {shortfal: {}}}}",
+            r"f\.shortfal: unknown key, did you mean shortfall\?",
+        ),
+        (
+            "robot: {effects: {f: !TorqueGain {shortfall: {knee: 1}}}}",
+            r"robot\.effects\.f\.shortfall\.knee: unknown joint",
+        ),
+        (
+            "robot: {effects: {f: !TorqueDelay {delay: {all: -1}}}}",
+            r"robot\.effects\.f\.delay: expected values in \[0, inf\] s",
+        ),
+        (
+            "model: {effects: {f: !Backlash {gap: {foot: 1}}}}",
+            r"model\.effects\.f\.gap\.foot: unknown joint",
+        ),
     ],
 )
 def test_bad_effects_get_one_line(tmp_path: Path, text: str, message: str):
@@ -421,7 +582,9 @@ def test_bad_effects_get_one_line(tmp_path: Path, text: str, message: str):
 
 def test_a_nonlinear_value_that_is_not_given_is_refused():
     with pytest.raises(InputError, match=r"f\.transition: no value for left_hip_yaw"):
-        CoulombFriction(coulomb={"all": 1.0}, transition={"knee_pitch": 0.1}).resolve(NAMES, key="f")
+        CoulombFriction(coulomb={"all": 1.0}, transition={"knee_pitch": 0.1}).resolve(
+            NAMES, key="f"
+        )
 
 
 def test_the_same_class_can_be_registered_again():

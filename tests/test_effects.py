@@ -9,26 +9,38 @@ from fbse_drake.robot.description import load_description
 NAMES, _ = load_description("biped")
 TABLE_1 = StribeckFriction(gamma1={"all": 0.7}, gamma4={"all": 0.6}, gamma6={"all": 0.9})
 # Coulomb 40 Nm with a slope of 5000 Nm s/rad at rest.
-HARMONIC_DRIVE = CoulombViscousFriction(coulomb={"all": 40.0}, viscous={"all": 20.0}, transition={"all": 40.0 / 4980.0})
+HARMONIC_DRIVE = CoulombViscousFriction(
+    coulomb={"all": 40.0}, viscous={"all": 20.0}, transition={"all": 40.0 / 4980.0}
+)
 
 
 def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedJointTorque:
     whole = effect.resolve(NAMES)
-    return ResolvedJointTorque(type(effect), whole.targets[:joints], whole.linear[:, :joints], whole.nonlinear[:, :joints])
+    return ResolvedJointTorque(
+        type(effect), whole.targets[:joints], whole.linear[:, :joints], whole.nonlinear[:, :joints]
+    )
 
 
 def test_equation_56_at_table_1():
     w = np.full(12, 0.02)
-    by_hand = 0.7 * (np.tanh(100 * 0.02) - np.tanh(10 * 0.02)) + 0.6 * np.tanh(100 * 0.02) + 0.9 * 0.02
-    np.testing.assert_allclose(resolved(TABLE_1).torque_and_slope(JointMotion(w))[0], by_hand, rtol=1e-12)
+    by_hand = (
+        0.7 * (np.tanh(100 * 0.02) - np.tanh(10 * 0.02)) + 0.6 * np.tanh(100 * 0.02) + 0.9 * 0.02
+    )
+    np.testing.assert_allclose(
+        resolved(TABLE_1).torque_and_slope(JointMotion(w))[0], by_hand, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
 def test_slope_is_the_derivative(effect: JointTorqueEffect):
     w, h = np.linspace(-0.3, 0.3, 12), 1e-6
     law = resolved(effect)
-    difference = (law.torque_and_slope(JointMotion(w + h))[0] - law.torque_and_slope(JointMotion(w - h))[0]) / (2 * h)
-    np.testing.assert_allclose(law.torque_and_slope(JointMotion(w))[1], difference, rtol=1e-5, atol=1e-5)
+    difference = (
+        law.torque_and_slope(JointMotion(w + h))[0] - law.torque_and_slope(JointMotion(w - h))[0]
+    ) / (2 * h)
+    np.testing.assert_allclose(
+        law.torque_and_slope(JointMotion(w))[1], difference, rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("effect", [TABLE_1, HARMONIC_DRIVE])
@@ -53,7 +65,9 @@ def test_linear_parameters_are_recovered_from_the_basis(effect: JointTorqueEffec
     w = np.random.default_rng(1).normal(scale=0.2, size=(400, 12))
     torque = law.torque_and_slope(JointMotion(w))[0]
     basis, _ = law.effect.basis(JointMotion(w), law.nonlinear[:, None, :])
-    theta, *_ = np.linalg.lstsq(np.stack([b[:, 3] for b in basis], axis=1), torque[:, 3], rcond=None)
+    theta, *_ = np.linalg.lstsq(
+        np.stack([b[:, 3] for b in basis], axis=1), torque[:, 3], rcond=None
+    )
     np.testing.assert_allclose(theta, law.linear[:, 3], rtol=1e-9)
 
 

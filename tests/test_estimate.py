@@ -24,11 +24,19 @@ WALK = scenario("paper_walk_fbse", "duration=0.1")
 
 def cut(log: Log, rows: slice | np.ndarray, **channels: np.ndarray) -> Log:
     """Some rows of a log, with other values in some channels (`time`, ...)."""
-    return dataclasses.replace(log, channels={name: channels.get(name, values)[rows] for name, values in log.channels.items()})
+    return dataclasses.replace(
+        log,
+        channels={name: channels.get(name, values)[rows] for name, values in log.channels.items()},
+    )
 
 
 def without(log: Log, *prefixes: str) -> Log:
-    return dataclasses.replace(log, channels={name: values for name, values in log.channels.items() if not name.startswith(prefixes)})
+    return dataclasses.replace(
+        log,
+        channels={
+            name: values for name, values in log.channels.items() if not name.startswith(prefixes)
+        },
+    )
 
 
 def estimates(log: Log) -> dict[str, np.ndarray]:
@@ -38,7 +46,9 @@ def estimates(log: Log) -> dict[str, np.ndarray]:
 def assert_same(found: Log, expected: Log, atol: float = 1e-9) -> None:
     assert estimates(found).keys() == estimates(expected).keys()
     for name, values in estimates(expected).items():
-        np.testing.assert_allclose(found[name], values, rtol=0, atol=atol * max(1.0, np.abs(values).max()), err_msg=name)
+        np.testing.assert_allclose(
+            found[name], values, rtol=0, atol=atol * max(1.0, np.abs(values).max()), err_msg=name
+        )
 
 
 def error(log: Log) -> float:
@@ -55,7 +65,10 @@ def error(log: Log) -> float:
         load_scenario("paper_walk_fbse", overrides=("duration=1.2",)),
         load_scenario("paper_walk_fbse", "paper_method", overrides=("duration=1.2",)),
         load_scenario("hrp2_walk_fbse", overrides=("duration=0.8",)),
-        dataclasses.replace(load_scenario("paper_walk", overrides=("duration=0.8",)), estimator=DisturbanceObserver()),
+        dataclasses.replace(
+            load_scenario("paper_walk", overrides=("duration=0.8",)),
+            estimator=DisturbanceObserver(),
+        ),
     ],
     ids=["best", "paper", "compensated", "observer"],
 )
@@ -105,7 +118,12 @@ def test_without_joint_velocities(run: Run):
     assert all(np.isfinite(values).all() for values in estimates(result).values())
     # Velocities that come late deny that the feet stand; this method does not listen.
     gyro = Fbse(joint_acceleration=JointAccelerationConfig(method="gyro"))
-    assert error(estimate(dataclasses.replace(WALK, estimator=gyro), without(log, "joint/velocity")).log) < 0.6
+    assert (
+        error(
+            estimate(dataclasses.replace(WALK, estimator=gyro), without(log, "joint/velocity")).log
+        )
+        < 0.6
+    )
 
 
 def test_differentiation():
@@ -125,11 +143,23 @@ def test_refusals(run: Run):
     log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 5))
     for scenario_, bad, message in (
         (WALK, without(log, "imu/"), "imu/linear_acceleration"),
-        (WALK, without(log, "foot/left/pad_force"), "no channel foot/left/pad_force, nor foot/left/wrench"),
+        (
+            WALK,
+            without(log, "foot/left/pad_force"),
+            "no channel foot/left/pad_force, nor foot/left/wrench",
+        ),
         (WALK, without(log, "foot/"), "foot/<side>/pad_force"),
         (dataclasses.replace(WALK, estimator=NoEstimator()), log, "the scenario has none"),
-        (WALK, dataclasses.replace(log, meta={**log.meta, "joints": log.joints[::-1]}), "the log's joints"),
-        (WALK, cut(log, slice(0, 5), **{"foot/left/pad_force": log["foot/left/pad_force"][:, :3]}), "expected 4 pads"),
+        (
+            WALK,
+            dataclasses.replace(log, meta={**log.meta, "joints": log.joints[::-1]}),
+            "the log's joints",
+        ),
+        (
+            WALK,
+            cut(log, slice(0, 5), **{"foot/left/pad_force": log["foot/left/pad_force"][:, :3]}),
+            "expected 4 pads",
+        ),
     ):
         with pytest.raises(InputError) as refused:
             estimate(scenario_, bad)
@@ -141,14 +171,19 @@ def test_without_torque_commands_all_but_the_friction(run: Run):
     """What needs no torques is what it is with them."""
     log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 400))
     told, untold = (estimate(WALK, x) for x in (log, without(log, "joint/torque_command")))
-    assert untold.remarks == (*told.remarks, "The friction is not known: the log has no joint/torque_command.")
+    assert untold.remarks == (
+        *told.remarks,
+        "The friction is not known: the log has no joint/torque_command.",
+    )
     found = estimates(untold.log)
     assert "estimate/base/velocity" in found
     assert not [name for name in found if "friction" in name or "torque" in name]
     for name, values in found.items():
         np.testing.assert_array_equal(values, told.log[name])
     observer = dataclasses.replace(WALK, estimator=DisturbanceObserver())
-    with pytest.raises(InputError, match=r"^the log has no channel for .* torque_command \(joint/torque_command\)$"):
+    with pytest.raises(
+        InputError, match=r"^the log has no channel for .* torque_command \(joint/torque_command\)$"
+    ):
         estimate(observer, without(log, "joint/torque_command"))
 
 
@@ -169,7 +204,9 @@ def test_what_is_believed_of_the_sensors():
     assert believed.joint_position_noise == pytest.approx(4.8e-5 / np.sqrt(12))
     assert (believed.joint_velocity_noise, believed.acceleration_noise) == (5e-4, 0.02)
     assert (believed.angular_velocity_noise, believed.force_noise) == (1e-3, 0.5)
-    exact = scenario("paper_walk_fbse", "estimator.sensors.force_noise=3", noise=False).believed_sensors
+    exact = scenario(
+        "paper_walk_fbse", "estimator.sensors.force_noise=3", noise=False
+    ).believed_sensors
     assert exact.force_noise == 3
     assert exact.acceleration_noise == pytest.approx(0.002)
     assert not exact.joint_velocity_counted
@@ -180,13 +217,19 @@ def test_what_is_believed_of_the_sensors():
 
 
 def test_old_places_of_noise_are_refused():
-    for key in ("joint_acceleration.acceleration_noise", "attitude.acceleration_noise", "link_torque"):
+    for key in (
+        "joint_acceleration.acceleration_noise",
+        "attitude.acceleration_noise",
+        "link_torque",
+    ):
         with pytest.raises(InputError, match="unknown key"):
             scenario("paper_walk_fbse", f"estimator.{key}=0.1")
 
 
 def test_planned_support_needs_a_plan():
     robot, _ = make_robot("biped")
-    with pytest.raises(InputError, match=r"!PlannedSupport needs a planned walk or stand \(use !MeasuredSupport\)"):
+    with pytest.raises(
+        InputError, match=r"!PlannedSupport needs a planned walk or stand \(use !MeasuredSupport\)"
+    ):
         make_estimator(Fbse(support=PlannedSupport()), robot, period=1e-3)
     assert make_estimator(Fbse(), robot, period=1e-3) is not None

@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
-from fbse_drake.estimators.estimator import DisturbanceObserver, EstimatorConfig, Fbse, FixedFriction
+from fbse_drake.estimators.estimator import (
+    DisturbanceObserver,
+    EstimatorConfig,
+    Fbse,
+    FixedFriction,
+)
 from fbse_drake.estimators.recursive import RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 
@@ -34,7 +39,12 @@ SENSORS = {
     "left foot": ("measured_pad_force", slice(0, 12), 2),
     "one pad axis": ("measured_pad_force", slice(2, 3), 2),
 }
-FAULTS = [(sensor, kind) for sensor in SENSORS for kind in ("not finite", "stuck", "lost") if kind != "lost" or sensor == "left foot"]
+FAULTS = [
+    (sensor, kind)
+    for sensor in SENSORS
+    for kind in ("not finite", "stuck", "lost")
+    if kind != "lost" or sensor == "left foot"
+]
 
 
 def spoilt(inputs: dict[str, np.ndarray], sensor: str, kind: str) -> dict[str, np.ndarray]:
@@ -76,7 +86,11 @@ def before(walk: Log) -> Callable[[str], tuple[Replay, dict[str, np.ndarray]]]:
 
 def tilt(result: dict[str, np.ndarray]) -> np.ndarray:
     """The vertical in base axes; yaw, which no sensor restores, is not in it."""
-    return Rotation.from_quat(result["estimate/base/orientation"], scalar_first=True).inv().apply([0, 0, 1])
+    return (
+        Rotation.from_quat(result["estimate/base/orientation"], scalar_first=True)
+        .inv()
+        .apply([0, 0, 1])
+    )
 
 
 # What the estimates differ by from those without the fault [Nm], [m/s], [rad]: friction just after it and when healed, velocity, tilt.
@@ -91,9 +105,13 @@ TOLERANCE = {
 
 @pytest.mark.parametrize(("sensor", "kind"), FAULTS)
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_estimator_survives(walk: Log, before: Callable[..., tuple], name: str, sensor: str, kind: str):
+def test_estimator_survives(
+    walk: Log, before: Callable[..., tuple], name: str, sensor: str, kind: str
+):
     replay, undisturbed = before(name)
-    result = replay.fork().run(walk.time[START:LAST], from_start(spoilt(inputs_of(walk), sensor, kind)))
+    result = replay.fork().run(
+        walk.time[START:LAST], from_start(spoilt(inputs_of(walk), sensor, kind))
+    )
     for channel, values in result.items():
         assert np.isfinite(values).all(), channel
     # It is noticed in time, and so is its end.
@@ -224,7 +242,9 @@ def test_nothing_to_start_from(walk: Log, name: str):
     if "estimate/base/position" in result:
         # The paper's filter takes longer to settle.
         atol = 0.03 if name == "paper" else 3e-3
-        np.testing.assert_allclose(result["estimate/base/position"][-1], walk["truth/base/position"][149], atol=atol)
+        np.testing.assert_allclose(
+            result["estimate/base/position"][-1], walk["truth/base/position"][149], atol=atol
+        )
         started = {channel: values[20:] for channel, values in result.items()}
         np.testing.assert_allclose(tilt(started)[-1], [0, 0, 1], atol=0.02)
 
@@ -255,10 +275,14 @@ def test_hard_walks_are_trusted(run: Run, overrides: tuple[str, ...]):
     assert (replay.run(log.time, inputs_of(log), channel)[channel] == 0).all()
 
 
-def recorded(walk: Log, config: EstimatorConfig, ticks: int) -> tuple[Replay, dict[RecursiveEstimator, dict[str, np.ndarray]]]:
+def recorded(
+    walk: Log, config: EstimatorConfig, ticks: int
+) -> tuple[Replay, dict[RecursiveEstimator, dict[str, np.ndarray]]]:
     """The diagram's systems, each with samples (ticks, size) of all its input ports. They live as long as the diagram."""
     replay = Replay(diagram(config, scenario("paper_walk_fbse", "duration=3")))
-    systems = [system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)]
+    systems = [
+        system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)
+    ]
     samples: dict[RecursiveEstimator, dict[str, list]] = {system: {} for system in systems}
     inputs = inputs_of(walk)
     for k in range(ticks):
@@ -269,7 +293,10 @@ def recorded(walk: Log, config: EstimatorConfig, ticks: int) -> tuple[Replay, di
                 port = system.get_input_port(i)
                 samples[system].setdefault(port.get_name(), []).append(port.Eval(context).copy())
         replay.estimator.ExecuteForcedEvents(replay.context, publish=False)
-    return replay, {system: {port: np.array(rows) for port, rows in ports.items()} for system, ports in samples.items()}
+    return replay, {
+        system: {port: np.array(rows) for port, rows in ports.items()}
+        for system, ports in samples.items()
+    }
 
 
 # What of a posterior is compared, and how far it may be off [its unit] 35 ticks after the fault.
@@ -309,10 +336,17 @@ def test_each_system_alone_survives_what_is_no_number(walk: Log, name: str):
                 posterior = rig.tick(**values)
                 assert np.isfinite(numbers(posterior)).all(), where
                 noticed.append(bool(posterior["status"] > 0))
-            unused = bad_port == "planned_support" or (name == "paper" and where in ("attitude.model", "friction.link_torque"))
+            unused = bad_port == "planned_support" or (
+                name == "paper" and where in ("attitude.model", "friction.link_torque")
+            )
             # A command counts in the tick after its own.
             assert noticed[bad.start + (bad_port == "torque_command")] or unused, where
             assert posterior["status"] == 0, where
             for field, tolerance in REMAINS.items():
                 if field in posterior.dtype.names:
-                    np.testing.assert_allclose(posterior[field], undisturbed[field], atol=tolerance, err_msg=f"{where}: {field}")
+                    np.testing.assert_allclose(
+                        posterior[field],
+                        undisturbed[field],
+                        atol=tolerance,
+                        err_msg=f"{where}: {field}",
+                    )

@@ -46,7 +46,9 @@ def with_mcap(path: Path) -> Iterator[tuple[str, int, Any]]:
 
 
 @pytest.mark.parametrize("read", [with_rosbags, with_mcap])
-def test_a_bag_is_read_back_equal(log: Log, bag: Path, read: Callable[[Path], Iterator[tuple[str, int, Any]]]):
+def test_a_bag_is_read_back_equal(
+    log: Log, bag: Path, read: Callable[[Path], Iterator[tuple[str, int, Any]]]
+):
     topics: dict[str, list[Any]] = {}
     times: dict[str, list[int]] = {}
     for topic, time, message in read(bag):
@@ -58,21 +60,38 @@ def test_a_bag_is_read_back_equal(log: Log, bag: Path, read: Callable[[Path], It
         np.testing.assert_array_equal(stamps, np.rint(1e9 * log.time))
     states = topics["/joint_states"]
     assert all(state.name == log.joints for state in states)
-    for field, channel in {"position": "position", "velocity": "velocity", "effort": "torque_command"}.items():
-        np.testing.assert_array_equal([getattr(state, field) for state in states], log[f"joint/{channel}"])
+    for field, channel in {
+        "position": "position",
+        "velocity": "velocity",
+        "effort": "torque_command",
+    }.items():
+        np.testing.assert_array_equal(
+            [getattr(state, field) for state in states], log[f"joint/{channel}"]
+        )
     for field in ("angular_velocity", "linear_acceleration"):
-        np.testing.assert_array_equal([vector(getattr(message, field)) for message in topics["/imu"]], log[f"imu/{field}"])
+        np.testing.assert_array_equal(
+            [vector(getattr(message, field)) for message in topics["/imu"]], log[f"imu/{field}"]
+        )
     assert all(message.orientation_covariance[0] == -1 for message in topics["/imu"])
     for side in ("left", "right"):
         messages = topics[f"/foot/{side}/wrench"]
         assert {message.header.frame_id for message in messages} == {f"{side}_sole"}
         forces = log[f"foot/{side}/pad_force"]
-        np.testing.assert_allclose([vector(message.wrench.force) for message in messages], forces.sum(axis=1), atol=1e-12)
+        np.testing.assert_allclose(
+            [vector(message.wrench.force) for message in messages], forces.sum(axis=1), atol=1e-12
+        )
         for row in (0, len(log.time) // 2):
             # Each pad's force, moved to the sole frame by Drake.
             places = log.meta["pads"][side]
-            pads = [SpatialForce(np.zeros(3), f).Shift(-np.array(p)) for p, f in zip(places, forces[row], strict=True)]
-            np.testing.assert_allclose(vector(messages[row].wrench.torque), sum(pad.rotational() for pad in pads), atol=1e-12)
+            pads = [
+                SpatialForce(np.zeros(3), f).Shift(-np.array(p))
+                for p, f in zip(places, forces[row], strict=True)
+            ]
+            np.testing.assert_allclose(
+                vector(messages[row].wrench.torque),
+                sum(pad.rotational() for pad in pads),
+                atol=1e-12,
+            )
 
 
 def vector(message: Any) -> list[float]:
@@ -82,16 +101,38 @@ def vector(message: Any) -> list[float]:
 def test_a_log_survives_the_bag(log: Log, bag: Path):
     again = read_log(bag)
     np.testing.assert_allclose(again.time, log.time, rtol=0, atol=1e-12)
-    for name in ("joint/position", "joint/velocity", "joint/torque_command", "imu/linear_acceleration", "imu/angular_velocity"):
+    for name in (
+        "joint/position",
+        "joint/velocity",
+        "joint/torque_command",
+        "imu/linear_acceleration",
+        "imu/angular_velocity",
+    ):
         np.testing.assert_array_equal(again[name], log[name])
     for side in ("left", "right"):
-        np.testing.assert_allclose(again[f"foot/{side}/wrench"][:, 3:], log[f"foot/{side}/pad_force"].sum(axis=1), atol=1e-12)
-    assert (again.joints, again.sides, again.meta["period"], again.meta["findings"]) == (log.joints, log.sides, log.meta["period"], [])
+        np.testing.assert_allclose(
+            again[f"foot/{side}/wrench"][:, 3:],
+            log[f"foot/{side}/pad_force"].sum(axis=1),
+            atol=1e-12,
+        )
+    assert (again.joints, again.sides, again.meta["period"], again.meta["findings"]) == (
+        log.joints,
+        log.sides,
+        log.meta["period"],
+        [],
+    )
 
 
 def test_what_was_not_measured_is_not_written(tmp_path: Path):
-    channels = {"time": np.array([0.0, 0.1]), "joint/position": np.array([[1.0], [2.0]]), "foot/left/wrench": np.ones((2, 6))}
-    write_mcap(Log(channels, {"joints": ["slide"], "sides": ["left"], "period": 0.1}), tmp_path / "log.mcap")
+    channels = {
+        "time": np.array([0.0, 0.1]),
+        "joint/position": np.array([[1.0], [2.0]]),
+        "foot/left/wrench": np.ones((2, 6)),
+    }
+    write_mcap(
+        Log(channels, {"joints": ["slide"], "sides": ["left"], "period": 0.1}),
+        tmp_path / "log.mcap",
+    )
     messages = list(with_rosbags(tmp_path / "log.mcap"))
     assert [topic for topic, _, _ in messages] == ["/joint_states", "/foot/left/wrench"] * 2
     state = messages[0][2]
@@ -101,17 +142,26 @@ def test_what_was_not_measured_is_not_written(tmp_path: Path):
 
 def test_logs_that_cannot_be_messages_get_one_line(tmp_path: Path, log: Log):
     with pytest.raises(InputError, match=r"channel foot/left/pad_force: meta has no pads for it"):
-        write_mcap(Log(log.channels, {key: value for key, value in log.meta.items() if key != "pads"}), tmp_path / "log.mcap")
+        write_mcap(
+            Log(log.channels, {key: value for key, value in log.meta.items() if key != "pads"}),
+            tmp_path / "log.mcap",
+        )
     early = log.channels | {"time": log.time - 5.0}
-    with pytest.raises(InputError, match="messages cannot have times before 0; this log begins at -5 s"):
+    with pytest.raises(
+        InputError, match="messages cannot have times before 0; this log begins at -5 s"
+    ):
         write_mcap(Log(early, log.meta), tmp_path / "log.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_messages_are_made_piece_by_piece(log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_messages_are_made_piece_by_piece(
+    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("fbse_drake.interop.export._BLOCK", 300)
     write_mcap(log, tmp_path / "log.mcap")
-    np.testing.assert_array_equal(read_log(tmp_path / "log.mcap")["joint/torque_command"], log["joint/torque_command"])
+    np.testing.assert_array_equal(
+        read_log(tmp_path / "log.mcap")["joint/torque_command"], log["joint/torque_command"]
+    )
 
 
 def test_the_same_log_gives_the_same_bytes(log: Log, bag: Path, tmp_path: Path):
@@ -121,8 +171,14 @@ def test_the_same_log_gives_the_same_bytes(log: Log, bag: Path, tmp_path: Path):
 
 def test_csv_has_a_column_for_every_number(log: Log, tmp_path: Path):
     write_csv(log, tmp_path / "log.csv")
-    table = np.genfromtxt(tmp_path / "log.csv", delimiter=",", names=True, deletechars="", replace_space="_")
+    table = np.genfromtxt(
+        tmp_path / "log.csv", delimiter=",", names=True, deletechars="", replace_space="_"
+    )
     assert len(table) == len(log.time)
     assert len(table.dtype.names) == sum(values[0].size for values in log.values())
-    np.testing.assert_array_equal(table["joint/torque_command/left_knee_pitch"], log["joint/torque_command"][:, 3])
-    np.testing.assert_array_equal(table["foot/right/pad_force[4]"], log["foot/right/pad_force"][:, 1, 1])
+    np.testing.assert_array_equal(
+        table["joint/torque_command/left_knee_pitch"], log["joint/torque_command"][:, 3]
+    )
+    np.testing.assert_array_equal(
+        table["foot/right/pad_force[4]"], log["foot/right/pad_force"][:, 1, 1]
+    )

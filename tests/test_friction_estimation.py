@@ -21,7 +21,10 @@ from fbse_drake.estimators.friction import (
     RecursiveLeastSquaresEstimator,
     recursive_least_squares,
 )
-from fbse_drake.estimators.joint_acceleration import JointAccelerationConfig, JointAccelerationEstimator
+from fbse_drake.estimators.joint_acceleration import (
+    JointAccelerationConfig,
+    JointAccelerationEstimator,
+)
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 
 GRAVITY = 9.81
@@ -32,7 +35,9 @@ ACCELERATION = JointAccelerationEstimator(
     USUAL_SENSORS,
     BASE.robot,
     READINGS,
-    AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK).posterior_type,
+    AttitudeEstimator(
+        AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK
+    ).posterior_type,
     MODEL,
     CLOCK,
 )
@@ -64,11 +69,16 @@ def test_recursive_least_squares_of_all_parameters_at_once(forgetting: float):
         K = P @ Phi @ np.linalg.inv(S)
         e = u - Phi.T @ theta
         theta, P = theta + K @ e, (P - K @ Phi.T @ P) / forgetting
-        parameters, covariance, innovation, variance = recursive_least_squares(parameters, covariance, phi, u, forgetting)
+        parameters, covariance, innovation, variance = recursive_least_squares(
+            parameters, covariance, phi, u, forgetting
+        )
         np.testing.assert_allclose(parameters.ravel(), theta, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(innovation, e, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(variance, np.diag(S), rtol=1e-8)
-        information, weighted = forgetting * information + Phi @ Phi.T, forgetting * weighted + Phi @ u
+        information, weighted = (
+            forgetting * information + Phi @ Phi.T,
+            forgetting * weighted + Phi @ u,
+        )
     np.testing.assert_allclose(covariance[3], P[6:8, 6:8], rtol=1e-8)
     np.testing.assert_allclose(theta, np.linalg.solve(information, weighted), rtol=1e-6)
     assert np.abs(theta - truth).max() < 1.5
@@ -78,7 +88,11 @@ class Friction(Rig):
     """A friction estimator under made-up velocities and residuals."""
 
     def __init__(self, config: RecursiveLeastSquares | ModelAided):
-        kind = ModelAidedEstimator if isinstance(config, ModelAided) else RecursiveLeastSquaresEstimator
+        kind = (
+            ModelAidedEstimator
+            if isinstance(config, ModelAided)
+            else RecursiveLeastSquaresEstimator
+        )
         types = READINGS, MODEL, ACCELERATION.posterior_type
         self._link = LinkTorqueEstimator(USUAL_SENSORS, BASE.robot, *types, CLOCK)
         super().__init__(kind(config, BASE.robot, READINGS, self._link.posterior_type, CLOCK))
@@ -92,14 +106,23 @@ class Friction(Rig):
         valid: float = 1,
         support: tuple[float, float] = (1, 1),
     ):
-        noise = {"torque_variance": np.full(12, torque), "impulse_variance": np.full(12, impulse), "valid": np.full(12, valid)}
+        noise = {
+            "torque_variance": np.full(12, torque),
+            "impulse_variance": np.full(12, impulse),
+            "valid": np.full(12, valid),
+        }
         link = pack(self._link, residual=residual, **noise)
-        return self.tick(measurements=BASE.measurements(joint_velocity=velocity, support=support), link_torque=link)
+        return self.tick(
+            measurements=BASE.measurements(joint_velocity=velocity, support=support),
+            link_torque=link,
+        )
 
 
 def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_in_swing():
     generator = np.random.default_rng(3)
-    estimator = Friction(RecursiveLeastSquares(model=CoulombViscousFriction(transition={"all": 1e-6})))
+    estimator = Friction(
+        RecursiveLeastSquares(model=CoulombViscousFriction(transition={"all": 1e-6}))
+    )
     truth = generator.uniform(1, 5, size=(12, 2))
     for _ in range(400):
         velocity = generator.normal(scale=0.3, size=12)
@@ -112,7 +135,9 @@ def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_i
     # Now the right leg swings, and what is measured there is nonsense.
     posterior = estimator.see(velocity, np.full(12, 77.0), support=(1, 0))
     np.testing.assert_allclose(posterior["friction"][:6], 77.0)
-    np.testing.assert_allclose(posterior["friction"][6:], (phi * parameters).sum(axis=1)[6:], rtol=1e-9)
+    np.testing.assert_allclose(
+        posterior["friction"][6:], (phi * parameters).sum(axis=1)[6:], rtol=1e-9
+    )
     np.testing.assert_array_equal(posterior["parameters"][6:], parameters[6:])
 
 
@@ -127,12 +152,20 @@ def test_model_aided_filter_is_the_textbook_kalman_filter():
     estimator = Friction(config)
     last = generator.normal(scale=0.1, size=12)
     estimator.see(last, np.zeros(12), torque, impulse)
-    P = np.tile(np.diag([0, *[config.parameter_uncertainty**2] * 2, config.disturbance_uncertainty**2]), (12, 1, 1))
+    P = np.tile(
+        np.diag([0, *[config.parameter_uncertainty**2] * 2, config.disturbance_uncertainty**2]),
+        (12, 1, 1),
+    )
     X, y, H = np.zeros((12, 4)), np.zeros(12), np.array([[1.0, 0, 0, 0]])
-    Q = np.diag([T**2 * torque, *[config.parameter_walk**2 * T] * 2, config.disturbance_walk**2 * T])
+    Q = np.diag(
+        [T**2 * torque, *[config.parameter_walk**2 * T] * 2, config.disturbance_walk**2 * T]
+    )
     for _ in range(300):
         # Less noise than believed, or it would learn more.
-        velocity, residual = last + generator.normal(scale=0.02, size=12), generator.normal(scale=0.05, size=12)
+        velocity, residual = (
+            last + generator.normal(scale=0.02, size=12),
+            generator.normal(scale=0.05, size=12),
+        )
         y += T * residual
         phi = regressor(0.5 * (velocity + last))
         last = velocity
@@ -149,7 +182,9 @@ def test_model_aided_filter_is_the_textbook_kalman_filter():
         np.testing.assert_allclose(posterior["parameters"], X[:, 1:3], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(posterior["disturbance"], X[:, 3], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(posterior["impulse"], y - X[:, 0], rtol=1e-6, atol=1e-10)
-        np.testing.assert_allclose(posterior["friction"], (phi * X[:, 1:3]).sum(axis=1) + X[:, 3], rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(
+            posterior["friction"], (phi * X[:, 1:3]).sum(axis=1) + X[:, 3], rtol=1e-6, atol=1e-8
+        )
     np.testing.assert_allclose(posterior["covariance"], P, rtol=1e-5, atol=1e-12)
     np.testing.assert_allclose(posterior["parameter_variance"], P[:, [1, 2], [1, 2]], rtol=1e-6)
 
@@ -175,7 +210,9 @@ def believed_world(believed: float) -> tuple[float, float, float]:
         friction = (regressor(0.5 * (velocity[k] + velocity[k - 1])) * parameters).sum(axis=1) + d
         previous, noise = noise, generator.normal(scale=sigma_impulse, size=12)
         residual = friction + generator.normal(scale=sigma_torque, size=12) + (noise - previous) / T
-        posterior = estimator.see(velocity[k], residual, (believed * sigma_torque) ** 2, (believed * sigma_impulse) ** 2)
+        posterior = estimator.see(
+            velocity[k], residual, (believed * sigma_torque) ** 2, (believed * sigma_impulse) ** 2
+        )
         nis.append(posterior["innovation"] ** 2 / posterior["innovation_variance"])
         error.append(posterior["friction"] - friction)
         raw.append(residual - friction)
@@ -199,7 +236,9 @@ def test_model_aided_filter_is_consistent():
 
 def test_model_aided_filter_leaves_an_unmeasured_joint_to_its_model():
     generator = np.random.default_rng(6)
-    estimator = Friction(ModelAided(velocity_smoothing=0.0, disturbance_uncertainty=0.0, disturbance_walk=0.0))
+    estimator = Friction(
+        ModelAided(velocity_smoothing=0.0, disturbance_uncertainty=0.0, disturbance_walk=0.0)
+    )
     truth = np.array([3.0, 2.0])
     last = np.zeros(12)
     for _ in range(1000):

@@ -39,19 +39,40 @@ def walk() -> Scenario:
     return load_scenario("paper_walk", overrides=["duration=0.3"])
 
 
-def answer(effect: str = "TorqueBias", *targets: str, kind: str = "library", **parameters: float) -> Answer:
+def answer(
+    effect: str = "TorqueBias", *targets: str, kind: str = "library", **parameters: float
+) -> Answer:
     values = {name: dict.fromkeys(targets, value) for name, value in parameters.items()}
     return Answer(kind, "medium", 1.0, (HiddenEffect(effect, targets, 1.0, values),))
 
 
-def diagnosis(*findings: tuple[str, tuple[str, ...], dict], verdict: str = "effect_found", unexplained: tuple[str, ...] = ()) -> dict:
+def diagnosis(
+    *findings: tuple[str, tuple[str, ...], dict],
+    verdict: str = "effect_found",
+    unexplained: tuple[str, ...] = (),
+) -> dict:
     """What diagnosis.json has of such findings: effect, targets, and intervals or `confusable_with`."""
     ranking = []
     for effect, targets, more in findings:
-        parameters = {name: {"value": sum(i) / 2, "interval": list(i), "unit": ""} for name, i in more.get("intervals", {}).items()}
+        parameters = {
+            name: {"value": sum(i) / 2, "interval": list(i), "unit": ""}
+            for name, i in more.get("intervals", {}).items()
+        }
         confusable = more.get("confusable_with", [])
-        ranking.append({"effect": effect, "joints": list(targets), "parameters": parameters, "confusable_with": confusable, "chosen": True})
-    return {"verdict": verdict, "ranking": ranking, "unexplained": [{"row": row} for row in unexplained]}
+        ranking.append(
+            {
+                "effect": effect,
+                "joints": list(targets),
+                "parameters": parameters,
+                "confusable_with": confusable,
+                "chosen": True,
+            }
+        )
+    return {
+        "verdict": verdict,
+        "ranking": ranking,
+        "unexplained": [{"row": row} for row in unexplained],
+    }
 
 
 # Strangers.
@@ -68,15 +89,24 @@ def test_slope_of_a_stranger_is_the_derivative_of_its_torque(name: str):
     v, h = np.array([[-0.03, 0.002, 0.02]]), 1e-7
 
     def torque(velocity: np.ndarray) -> np.ndarray:
-        return np.asarray(effect.basis(JointMotion(velocity, np.array([0.3, 0.45, 0.6]), np.array([5.0, -3.0, 8.0]), 0.7), nonlinear)[0][0])
+        return np.asarray(
+            effect.basis(
+                JointMotion(velocity, np.array([0.3, 0.45, 0.6]), np.array([5.0, -3.0, 8.0]), 0.7),
+                nonlinear,
+            )[0][0]
+        )
 
-    slope = effect.basis(JointMotion(v, np.array([0.3, 0.45, 0.6]), np.array([5.0, -3.0, 8.0]), 0.7), nonlinear)[1][0]
+    slope = effect.basis(
+        JointMotion(v, np.array([0.3, 0.45, 0.6]), np.array([5.0, -3.0, 8.0]), 0.7), nonlinear
+    )[1][0]
     assert np.allclose((torque(v + h) - torque(v - h)) / (2 * h), slope, rtol=1e-5, atol=1e-6)
 
 
 def test_hum_has_one_frequency():
     time = np.arange(2000)[:, None] * 1e-3
-    (torque,), _ = STRANGERS["TorqueHum"].basis(JointMotion(np.zeros((2000, 1)), time=time), np.array([[7.0]]))
+    (torque,), _ = STRANGERS["TorqueHum"].basis(
+        JointMotion(np.zeros((2000, 1)), time=time), np.array([[7.0]])
+    )
     spectrum = np.abs(np.fft.rfft(torque[:, 0])) / 1000
     assert np.argmax(spectrum) == 14  # 7 Hz over 2 s
     assert spectrum[14] == pytest.approx(1.0)
@@ -84,13 +114,17 @@ def test_hum_has_one_frequency():
 
 
 def test_neighbour_torque_is_that_of_the_joint_before():
-    (torque,), _ = STRANGERS["NeighbourTorque"].basis(JointMotion(np.zeros(3), command=np.array([1.0, 2.0, 3.0])), np.zeros((0, 3)))
+    (torque,), _ = STRANGERS["NeighbourTorque"].basis(
+        JointMotion(np.zeros(3), command=np.array([1.0, 2.0, 3.0])), np.zeros((0, 3))
+    )
     assert torque.tolist() == [3.0, 1.0, 2.0]
 
 
 def test_dropouts_take_the_command_for_short_moments():
     time = np.arange(20000)[:, None] * 1e-3
-    (torque,), _ = STRANGERS["TorqueDropouts"].basis(JointMotion(np.zeros((20000, 1)), command=4.0, time=time), np.zeros((0, 1)))
+    (torque,), _ = STRANGERS["TorqueDropouts"].basis(
+        JointMotion(np.zeros((20000, 1)), command=4.0, time=time), np.zeros((0, 1))
+    )
     assert set(np.unique(torque)) == {0.0, 4.0}
     starts = np.flatnonzero(np.diff(torque[:, 0]) > 0)
     lengths = np.flatnonzero(np.diff(torque[:, 0]) < 0)[: len(starts)] - starts
@@ -103,13 +137,17 @@ def test_dropouts_take_the_command_for_short_moments():
 # What is drawn.
 
 
-@pytest.mark.parametrize("name", [name for name, effect in library().items() if not effect.composite] + list(STRANGERS))
+@pytest.mark.parametrize(
+    "name", [name for name, effect in library().items() if not effect.composite] + list(STRANGERS)
+)
 def test_every_effect_is_drawn_with_values_that_it_accepts(name: str, walk: Scenario):
     names, _ = load_description("biped")
     (hidden,) = draw(walk, 3, what=name, size="medium").effects
     assert hidden.effect == name
     resolved = hidden.make().resolve(names)
-    if resolved.effect.acts_on == "joint" and any(parameter.linear for parameter in resolved.effect.parameters.values()):
+    if resolved.effect.acts_on == "joint" and any(
+        parameter.linear for parameter in resolved.effect.parameters.values()
+    ):
         acts = np.any(resolved.linear != 0, axis=0)
         assert acts.tolist() == np.isin(names.joint_names, hidden.targets).tolist()
 
@@ -132,14 +170,18 @@ def test_sizes_are_thirds_and_shrinking_scales_them(name: str, walk: Scenario):
     half = draw(walk, 3, what=name, size="large", shrunk=0.5).effects[0]
     parameter = next(iter(half.parameters))
     for target in half.targets:
-        assert half.parameters[parameter][target] == pytest.approx(0.5 * sizes[2].parameters[parameter][target])
+        assert half.parameters[parameter][target] == pytest.approx(
+            0.5 * sizes[2].parameters[parameter][target]
+        )
 
 
 def test_saturation_cuts_off_a_share_of_the_planned_torque(walk: Scenario):
     hidden = draw(walk, 0, what="TorqueSaturation", size="large").effects[0]
     log = make_exercise(walk, "walk", 0, what="decoy").log
     for target, limit in hidden.parameters["limit"].items():
-        largest = np.abs(log["reference/joint/feedforward_torque"][:, log.joints.index(target)]).max()
+        largest = np.abs(
+            log["reference/joint/feedforward_torque"][:, log.joints.index(target)]
+        ).max()
         assert limit == pytest.approx((1 - hidden.size) * largest, rel=0.02)
 
 
@@ -158,7 +200,12 @@ def test_several_effects_differ_and_share_no_joint(walk: Scenario):
     for seed in range(5):
         hidden = draw(walk, seed, what="library", count=3).effects
         assert len({effect.effect for effect in hidden}) == 3
-        joints = [t for effect in hidden if library()[effect.effect].acts_on == "joint" for t in effect.targets]
+        joints = [
+            t
+            for effect in hidden
+            if library()[effect.effect].acts_on == "joint"
+            for t in effect.targets
+        ]
         assert len(joints) == len(set(joints))
 
 
@@ -186,7 +233,9 @@ def test_hidden_bias_is_what_the_command_has_more():
     bias = hidden.answer.effects[0].make().resolve(load_description("biped")[0]).linear[0]
     assert np.abs(bias).max() > 4
     rows = slice(300, None)
-    more = (hidden.log["joint/torque_command"] - without.log["joint/torque_command"])[rows].mean(axis=0)
+    more = (hidden.log["joint/torque_command"] - without.log["joint/torque_command"])[rows].mean(
+        axis=0
+    )
     assert np.allclose(more, bias, atol=0.02 * np.abs(bias).max())
 
 
@@ -201,7 +250,9 @@ def test_exercise_tells_nothing_but_what_a_robot_would(walk: Scenario, tmp_path:
     log, scenario = Log.load(tmp_path / "log.npz"), load_scenario(tmp_path / "scenario.yaml")
     assert not [name for name in log if name.startswith(("truth/", "estimate/"))]
     # The model has what the robot was known to have, and the robot in the file no more.
-    assert dump_scenario(scenario, "paper_walk") == dump_scenario(replace(walk, model=walk.robot), "paper_walk")
+    assert dump_scenario(scenario, "paper_walk") == dump_scenario(
+        replace(walk, model=walk.robot), "paper_walk"
+    )
     assert (tmp_path / "scenario.yaml").read_text() == log.meta["scenario"]
     sealed = (tmp_path / "answer.sealed").read_text()
     assert "Stribeck" not in sealed
@@ -231,7 +282,9 @@ def test_a_robot_that_falls_gets_half_the_size(walk: Scenario):
     assert exercise.answer.effects[0].size == pytest.approx(shrunk * whole.size)
     assert exercise.log.meta["outcome"]["finished"]
     with pytest.raises(InputError, match=r"nothing can be hidden in this scenario: t = .* s: fell"):
-        make_exercise(replace(walk, fall=replace(walk.fall, tilt=1e-7)), "walk", 1, what="EncoderOffset")
+        make_exercise(
+            replace(walk, fall=replace(walk.fall, tilt=1e-7)), "walk", 1, what="EncoderOffset"
+        )
 
 
 @pytest.mark.parametrize("coulomb", [0.3, 8.0])
@@ -259,7 +312,12 @@ def test_a_sealed_answer_opens_again_unless_it_was_touched():
     checksum, content = text.split()
     data = bytearray(base64.b64decode(content))
     data[-1] ^= 1
-    for damaged in (f"{checksum}\n{base64.b64encode(bytes(data)).decode()}\n", content, f"{checksum}\n???\n", ""):
+    for damaged in (
+        f"{checksum}\n{base64.b64encode(bytes(data)).decode()}\n",
+        content,
+        f"{checksum}\n???\n",
+        "",
+    ):
         with pytest.raises(InputError, match="the sealed answer is damaged"):
             unseal(damaged)
 
@@ -283,7 +341,13 @@ def test_interval_that_misses_and_joint_that_is_too_much():
 
 
 def test_an_interval_of_several_targets_counts_once_for_each_true_value():
-    found = diagnosis(("TorqueBias", (JOINT, "right_knee_pitch", "left_hip_yaw"), {"intervals": {"bias": (1.5, 2.5)}}))
+    found = diagnosis(
+        (
+            "TorqueBias",
+            (JOINT, "right_knee_pitch", "left_hip_yaw"),
+            {"intervals": {"bias": (1.5, 2.5)}},
+        )
+    )
     hidden = answer("TorqueBias", JOINT, "right_knee_pitch", bias=2.0)
     assert list(score(hidden, [found]).covered.values()) == [True]
     values = {"bias": {JOINT: 2.0, "right_knee_pitch": 3.0}}
@@ -301,13 +365,18 @@ def test_declared_alternative_is_neither_found_nor_wrong():
 
 
 def test_wrong_name():
-    result = score(answer("TorqueBias", JOINT, bias=2.0), [diagnosis(("JointSpring", (JOINT,), {}))])
+    result = score(
+        answer("TorqueBias", JOINT, bias=2.0), [diagnosis(("JointSpring", (JOINT,), {}))]
+    )
     assert result.confusable == {"TorqueBias": False}
     assert result.wrong == ("JointSpring",)
 
 
 def test_what_a_later_round_finds_counts():
-    two = replace(answer("TorqueBias", JOINT), effects=answer("TorqueBias", JOINT).effects + answer("BodyMass", "trunk").effects)
+    two = replace(
+        answer("TorqueBias", JOINT),
+        effects=answer("TorqueBias", JOINT).effects + answer("BodyMass", "trunk").effects,
+    )
     rounds = [diagnosis(("BodyMass", ("trunk",), {})), diagnosis(("TorqueBias", (JOINT,), {}))]
     assert score(two, rounds).found == {"TorqueBias": True, "BodyMass": True}
     assert score(two, rounds[:1]).found == {"TorqueBias": False, "BodyMass": True}
@@ -324,10 +393,15 @@ def test_decoy():
 def test_stranger():
     hum = answer("TorqueHum", JOINT, kind="stranger")
     # Rows that are no joints do not count.
-    admitted = score(hum, [diagnosis(verdict="unknown_effect", unexplained=(JOINT, "left_sole/angular_velocity_x"))])
+    admitted = score(
+        hum,
+        [diagnosis(verdict="unknown_effect", unexplained=(JOINT, "left_sole/angular_velocity_x"))],
+    )
     assert admitted.verdict
     assert admitted.joints
-    elsewhere = score(hum, [diagnosis(verdict="unknown_effect", unexplained=(JOINT, "left_hip_yaw"))])
+    elsewhere = score(
+        hum, [diagnosis(verdict="unknown_effect", unexplained=(JOINT, "left_hip_yaw"))]
+    )
     assert not elsewhere.joints
     named = score(hum, [diagnosis(("TorqueRipple", (JOINT,), {}))])
     assert not named.verdict
@@ -345,12 +419,16 @@ def test_reveal_scores_what_is_in_the_folder(tmp_path: Path):
     (tmp_path / "study.json").write_text(json.dumps({"diagnoses": [right]}))
     assert reveal(tmp_path)["score"]["first"]
     (tmp_path / "study.json").write_text("{}")
-    with pytest.raises(InputError, match=r"study.json: not the contents of a study.json \(at 'diagnoses'\)"):
+    with pytest.raises(
+        InputError, match=r"study.json: not the contents of a study.json \(at 'diagnoses'\)"
+    ):
         reveal(tmp_path)
 
 
 def test_reveal_without_an_exercise(tmp_path: Path):
-    with pytest.raises(InputError, match=r"answer.sealed: No such file or directory; fbse hide makes one"):
+    with pytest.raises(
+        InputError, match=r"answer.sealed: No such file or directory; fbse hide makes one"
+    ):
         reveal(tmp_path)
     (tmp_path / "answer.sealed").write_text("nothing")
     with pytest.raises(InputError, match=r"answer.sealed: the sealed answer is damaged"):

@@ -24,7 +24,11 @@ Run = Callable[..., Log]
 
 
 def changed(log: Log, **channels: np.ndarray) -> Log:
-    return replace(log, channels=log.channels | {name.replace("__", "/"): values for name, values in channels.items()})
+    return replace(
+        log,
+        channels=log.channels
+        | {name.replace("__", "/"): values for name, values in channels.items()},
+    )
 
 
 def findings(which: tuple[str, str], log: Log) -> list[HygieneFinding]:
@@ -58,15 +62,25 @@ def test_a_good_log_shows_nothing(run: Run, which: tuple[str, str]) -> None:
 
 @pytest.mark.parametrize("which", [WALK, GANTRY], ids=["walk", "gantry"])
 def test_noise_is_that_of_the_sensors(run: Run, which: tuple[str, str]) -> None:
-    levels = {level.channel: level for level in estimated_noise(Predictor(scenario(*which), run(*which)).motion)}
-    for channel in ("joint/position", "imu/linear_acceleration", "imu/angular_velocity", "foot/left/pad_force"):
+    levels = {
+        level.channel: level
+        for level in estimated_noise(Predictor(scenario(*which), run(*which)).motion)
+    }
+    for channel in (
+        "joint/position",
+        "imu/linear_acceleration",
+        "imu/angular_velocity",
+        "foot/left/pad_force",
+    ):
         assert levels[channel].level == pytest.approx(levels[channel].believed, rel=0.25), channel
     assert levels["joint/position"].believed == pytest.approx(4.8e-5 / np.sqrt(12))
 
 
 def test_more_noise_than_is_believed(run: Run) -> None:
     log = run(*GANTRY)
-    noisier = log["joint/velocity"] + np.random.default_rng(1).normal(scale=0.02, size=log["joint/velocity"].shape)
+    noisier = log["joint/velocity"] + np.random.default_rng(1).normal(
+        scale=0.02, size=log["joint/velocity"].shape
+    )
     found = of_kind("noise_level", findings(GANTRY, changed(log, joint__velocity=noisier)))
     assert found.size == pytest.approx(0.02 / 5e-4, rel=0.2)
     assert found.severity == "warning"
@@ -81,27 +95,42 @@ def test_gaps_and_jitter(run: Run) -> None:
     assert gap.kind == "gap"
     assert gap.size == pytest.approx(0.24, abs=2e-3)
     assert gap.severity == "note"
-    jittered = of_kind("jitter", findings(GANTRY, changed(log, time=log.time + random.normal(scale=0.05 * H, size=len(log.time)))))
+    jittered = of_kind(
+        "jitter",
+        findings(
+            GANTRY, changed(log, time=log.time + random.normal(scale=0.05 * H, size=len(log.time)))
+        ),
+    )
     # Two neighbouring stamps are off.
     assert jittered.size == pytest.approx(np.sqrt(2) * 0.05 * H, rel=0.1)
 
 
 def test_velocity_that_comes_late(run: Run) -> None:
     log = run(*GANTRY)
-    found = of_kind("clock_offset", findings(GANTRY, changed(log, joint__velocity=late(log["joint/velocity"], 7))))
+    found = of_kind(
+        "clock_offset",
+        findings(GANTRY, changed(log, joint__velocity=late(log["joint/velocity"], 7))),
+    )
     assert (found.channel, found.severity) == ("joint/velocity", "warning")
     assert found.size == pytest.approx(7 * H, abs=0.5 * H)
 
 
 def test_gyroscope_that_comes_late(run: Run) -> None:
     log = run(*WALK)
-    found = of_kind("clock_offset", findings(WALK, changed(log, imu__angular_velocity=late(log["imu/angular_velocity"], 6))))
+    found = of_kind(
+        "clock_offset",
+        findings(WALK, changed(log, imu__angular_velocity=late(log["imu/angular_velocity"], 6))),
+    )
     assert found.channel == "imu/angular_velocity"
     assert found.size == pytest.approx(6 * H, abs=H)
 
 
-def forces(log: Log, change: Callable[[np.ndarray], np.ndarray], sides: tuple[str, ...] = ("left", "right")) -> Log:
-    return changed(log, **{f"foot__{side}__pad_force": change(log[f"foot/{side}/pad_force"]) for side in sides})
+def forces(
+    log: Log, change: Callable[[np.ndarray], np.ndarray], sides: tuple[str, ...] = ("left", "right")
+) -> Log:
+    return changed(
+        log, **{f"foot__{side}__pad_force": change(log[f"foot/{side}/pad_force"]) for side in sides}
+    )
 
 
 def test_forces_that_come_late_are_told_from_forces_behind_a_low_pass(run: Run) -> None:
@@ -111,7 +140,10 @@ def test_forces_that_come_late_are_told_from_forces_behind_a_low_pass(run: Run) 
     assert of_kind("clock_offset", delayed).size == pytest.approx(8 * H, abs=1.5 * H)
     assert "low_pass" not in [f.kind for f in delayed]
     stays = np.exp(-1 / 20)
-    smooth = findings(WALK, forces(log, lambda f: lfilter([1 - stays], [1, -stays], f, axis=0, zi=stays * f[:1])[0]))
+    smooth = findings(
+        WALK,
+        forces(log, lambda f: lfilter([1 - stays], [1, -stays], f, axis=0, zi=stays * f[:1])[0]),
+    )
     assert of_kind("low_pass", smooth).size == pytest.approx(0.020, rel=0.35)
     assert "clock_offset" not in [f.kind for f in smooth]
 
@@ -120,7 +152,9 @@ def test_a_torque_after_its_motion_is_a_clock_before_it_the_robot_s_own(run: Run
     """No motor moves a joint before it is told to; that it does so later is a delay as robots have it."""
     log = run(*GANTRY)
     torque = log["joint/torque_command"]
-    after = of_kind("clock_offset", findings(GANTRY, changed(log, joint__torque_command=late(torque, 40))))
+    after = of_kind(
+        "clock_offset", findings(GANTRY, changed(log, joint__torque_command=late(torque, 40)))
+    )
     assert after.channel == "joint/torque_command"
     assert after.size == pytest.approx(0.040, rel=0.3)
     before = findings(GANTRY, changed(log, joint__torque_command=early(torque, 40)))
@@ -151,7 +185,12 @@ def test_clipped_torque_and_coarse_velocity_and_held_samples(run: Run) -> None:
     assert found.where == ("left_knee_pitch",)
     # At a limit that is reached more than once.
     assert 9 < found.size < 21
-    coarse = of_kind("quantised", findings(GANTRY, changed(log, joint__velocity=0.05 * np.rint(log["joint/velocity"] / 0.05))))
+    coarse = of_kind(
+        "quantised",
+        findings(
+            GANTRY, changed(log, joint__velocity=0.05 * np.rint(log["joint/velocity"] / 0.05))
+        ),
+    )
     assert coarse.size == pytest.approx(0.05)
     assert len(coarse.where) == 12
     fourth = np.repeat(log["joint/torque_command"][::4], 4, axis=0)[: len(log.time)]
@@ -167,10 +206,15 @@ def test_filtered_before_it_was_recorded(run: Run) -> None:
     assert 30 < found.size < 250
 
 
-@pytest.mark.parametrize(("factor", "severity"), [(0.1, "untrustworthy"), (5.0, "untrustworthy"), (0.6, "warning")])
+@pytest.mark.parametrize(
+    ("factor", "severity"), [(0.1, "untrustworthy"), (5.0, "untrustworthy"), (0.6, "warning")]
+)
 def test_scale_of_the_torque(run: Run, factor: float, severity: str) -> None:
     log = run(*GANTRY)
-    found = of_kind("torque_scale", findings(GANTRY, changed(log, joint__torque_command=factor * log["joint/torque_command"])))
+    found = of_kind(
+        "torque_scale",
+        findings(GANTRY, changed(log, joint__torque_command=factor * log["joint/torque_command"])),
+    )
     assert found.severity == severity
     assert found.size == pytest.approx(factor, rel=0.25)
     assert "left_knee_pitch" in found.where
@@ -195,7 +239,9 @@ def test_dead_torque_and_a_joint_that_does_not_move(run: Run) -> None:
     found = of_kind("dead_torque", findings(GANTRY, changed(log, joint__torque_command=torque)))
     assert found.where == ("left_knee_pitch",)
     resting = "reference.amplitude={hip_yaw: 0.0}"
-    held = findings(("leg_swing_gantry", resting), run("leg_swing_gantry", "duration=1", resting, noise=False))
+    held = findings(
+        ("leg_swing_gantry", resting), run("leg_swing_gantry", "duration=1", resting, noise=False)
+    )
     assert set(of_kind("no_motion", held).where) == {"left_hip_yaw", "right_hip_yaw"}
 
 
@@ -214,9 +260,13 @@ def exchanged(values: np.ndarray, first: list[int], second: list[int]) -> np.nda
         (("joint__position", "joint__velocity", "joint__torque_command"), [HIP], [KNEE + 6]),
     ],
 )
-def test_swapped_joints(run: Run, which: tuple[str, str], channels: tuple[str, ...], first: list[int], second: list[int]) -> None:
+def test_swapped_joints(
+    run: Run, which: tuple[str, str], channels: tuple[str, ...], first: list[int], second: list[int]
+) -> None:
     log = run(*which)
-    wrong = changed(log, **{name: exchanged(log[name.replace("__", "/")], first, second) for name in channels})
+    wrong = changed(
+        log, **{name: exchanged(log[name.replace("__", "/")], first, second) for name in channels}
+    )
     found = of_kind("swapped_joints", findings(which, wrong))
     assert set(found.where) == {log.joints[k] for k in (*first, *second)}
     assert found.severity == "untrustworthy"
@@ -231,12 +281,23 @@ def test_swapped_legs(run: Run) -> None:
 
 def test_what_makes_the_equation_meaningless_is_refused(run: Run) -> None:
     gantry, walk = run(*GANTRY), run(*WALK)
-    both = {"joint__position": np.rad2deg(gantry["joint/position"]), "joint__velocity": np.rad2deg(gantry["joint/velocity"])}
+    both = {
+        "joint__position": np.rad2deg(gantry["joint/position"]),
+        "joint__velocity": np.rad2deg(gantry["joint/velocity"]),
+    }
     for which, wrong, words in (
         (GANTRY, changed(gantry, **both), "degrees"),
         (WALK, forces(walk, lambda f: -f, ("right",)), "foot/right: this foot pulls at the ground"),
-        (WALK, changed(walk, imu__angular_velocity=np.rad2deg(walk["imu/angular_velocity"])), "degrees per second"),
-        (WALK, changed(walk, imu__angular_velocity=-walk["imu/angular_velocity"]), "imu/angular_velocity.*sign is reversed"),
+        (
+            WALK,
+            changed(walk, imu__angular_velocity=np.rad2deg(walk["imu/angular_velocity"])),
+            "degrees per second",
+        ),
+        (
+            WALK,
+            changed(walk, imu__angular_velocity=-walk["imu/angular_velocity"]),
+            "imu/angular_velocity.*sign is reversed",
+        ),
     ):
         with pytest.raises(InputError, match=words) as error:
             check_sensors(Predictor(scenario(*which), wrong).motion)
@@ -253,7 +314,9 @@ def test_weight_direction_and_offset_of_the_foot_forces(run: Run) -> None:
     assert abs(leaning.size) == pytest.approx(0.08, rel=0.2)
     assert "sole stands level" in leaning.text
     # Four pads.
-    offset = of_kind("air_reading", findings(WALK, forces(log, lambda f: f + [0, 0, 5.0], ("right",))))
+    offset = of_kind(
+        "air_reading", findings(WALK, forces(log, lambda f: f + [0, 0, 5.0], ("right",)))
+    )
     assert (offset.channel, offset.where) == ("foot/right", ("force_z",))
     assert offset.size == pytest.approx(20, rel=0.1)
 
@@ -268,23 +331,36 @@ def test_force_that_moves_against_the_motion(run: Run) -> None:
         return result
 
     log = run("paper_walk", "duration=2.8")
-    found = [f for f in findings(("paper_walk", "duration=2.8"), forces(log, mirrored, ("left",))) if f.kind == "force_against_motion"]
+    found = [
+        f
+        for f in findings(("paper_walk", "duration=2.8"), forces(log, mirrored, ("left",)))
+        if f.kind == "force_against_motion"
+    ]
     assert only(found).channel == "foot/left"
     assert only(found).where == ("force_y",)
 
 
 def test_gravity_on_the_accelerometer(run: Run) -> None:
     log = run(*WALK)
-    found = of_kind("gravity", findings(WALK, changed(log, imu__linear_acceleration=1.03 * log["imu/linear_acceleration"])))
+    found = of_kind(
+        "gravity",
+        findings(
+            WALK, changed(log, imu__linear_acceleration=1.03 * log["imu/linear_acceleration"])
+        ),
+    )
     assert found.size == pytest.approx(0.03 * 9.81, rel=0.05)
 
 
 def test_json_and_the_words_of_a_summary(run: Run) -> None:
     log = run(*GANTRY)
-    motion = Predictor(scenario(*GANTRY), changed(log, joint__torque_command=0.1 * log["joint/torque_command"])).motion
+    motion = Predictor(
+        scenario(*GANTRY), changed(log, joint__torque_command=0.1 * log["joint/torque_command"])
+    ).motion
     hygiene = inspect(motion)
     content = hygiene_json(hygiene)
     assert content["findings"][0]["kind"] == "torque_scale"
     assert content["noise"][0]["channel"] == "joint/position"
-    assert hygiene.before("The model lacks nothing.").startswith("Not to be trusted: joint/torque_command")
+    assert hygiene.before("The model lacks nothing.").startswith(
+        "Not to be trusted: joint/torque_command"
+    )
     assert Hygiene().before("The model lacks nothing.") == "The model lacks nothing."

@@ -43,7 +43,11 @@ def test_a_joint_that_rests_tells_nothing():
 def test_identifies_the_stribeck_curve_with_its_nonlinear_parameters():
     velocity = swing()
     # Eq. (56) written out, with the values of Table I for the hip roll joint.
-    true = 0.6 * (np.tanh(100 * velocity) - np.tanh(10 * velocity)) + 0.5 * np.tanh(100 * velocity) + 0.9 * velocity
+    true = (
+        0.6 * (np.tanh(100 * velocity) - np.tanh(10 * velocity))
+        + 0.5 * np.tanh(100 * velocity)
+        + 0.9 * velocity
+    )
     noisy = true + 0.02 * np.random.default_rng(2).normal(size=len(velocity))
     found = identify(StribeckFriction, ["joint"], velocity[:, None], noisy[:, None])
     for name, value in {"gamma1": 0.6, "gamma3": 10, "gamma4": 0.5, "gamma6": 0.9}.items():
@@ -57,7 +61,12 @@ def test_identifies_the_stribeck_curve_with_its_nonlinear_parameters():
 def test_values_stay_physical_and_become_a_scenario_entry():
     velocity = 1e-3 * swing()
     torque = -0.2 * velocity + 0.01 * np.random.default_rng(3).normal(size=len(velocity))
-    found = identify(CoulombViscousFriction, ["a", "b"], np.stack([velocity, swing()], axis=1), np.stack([torque, 0.9 * swing()], axis=1))
+    found = identify(
+        CoulombViscousFriction,
+        ["a", "b"],
+        np.stack([velocity, swing()], axis=1),
+        np.stack([torque, 0.9 * swing()], axis=1),
+    )
     assert found.values["coulomb"][0] >= 0
     assert found.values["viscous"][0] >= 0
     config = found.config()

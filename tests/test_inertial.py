@@ -16,12 +16,23 @@ from fbse_drake import InputError, Log, Scenario, load_scenario
 from fbse_drake.discrepancy.add import add
 from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.identify import Identification, identification_json, identify
-from fbse_drake.discrepancy.inertial import PARAMETERS, base_columns, body_wrench, consistent_parameters, inertial_regressor
+from fbse_drake.discrepancy.inertial import (
+    PARAMETERS,
+    base_columns,
+    body_wrench,
+    consistent_parameters,
+    inertial_regressor,
+)
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import EquationOfMotion, Instants
 from fbse_drake.discrepancy.study import model_error, study
 from fbse_drake.effects.effect import library
-from fbse_drake.effects.inertia import InertialParameters, equal_point_masses, inertial_parameters, pseudo_inertia
+from fbse_drake.effects.inertia import (
+    InertialParameters,
+    equal_point_masses,
+    inertial_parameters,
+    pseudo_inertia,
+)
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, build_robot
 
@@ -45,7 +56,10 @@ def urdf(links: dict[str, tuple[float, float, float, float]]) -> str:
     joints = "".join(
         f'<joint name="{joint}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/>'
         '<axis xyz="0 -1 0"/><limit lower="-9" upper="9" effort="99" velocity="99"/></joint>'
-        for joint, parent, child, x in (("shoulder", "stand", "upper", 0.0), ("elbow", "upper", "lower", LENGTH))
+        for joint, parent, child, x in (
+            ("shoulder", "stand", "upper", 0.0),
+            ("elbow", "upper", "lower", LENGTH),
+        )
     )
     return f'<robot name="arm"><link name="stand"/>{bodies}{joints}</robot>'
 
@@ -55,7 +69,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("arm")
     for name, links in (("believed", BELIEVED), ("true", TRUE)):
         (folder / f"{name}.urdf").write_text(urdf(links))
-        description = {"urdf": f"{name}.urdf", "base": "stand", "fixed_base": True, "joints": ["shoulder", "elbow"]}
+        description = {
+            "urdf": f"{name}.urdf",
+            "base": "stand",
+            "fixed_base": True,
+            "joints": ["shoulder", "elbow"],
+        }
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(description))
     return folder
 
@@ -63,17 +82,30 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scenario(folder: Path, **recording: object) -> Scenario:
     """Believes in the wrong links and in no friction."""
     believed = RobotConfig(str(folder / "believed.yaml"))
-    reading = RecordingConfig(**({"rows": "instantaneous", "block": 0.05, "torque_noise": {"all": NOISE}} | recording))
-    return Scenario(robot=believed, model=believed, recording=reading, identify=IdentifyConfig(["all"]))
+    reading = RecordingConfig(
+        **({"rows": "instantaneous", "block": 0.05, "torque_noise": {"all": NOISE}} | recording)
+    )
+    return Scenario(
+        robot=believed, model=believed, recording=reading, identify=IdentifyConfig(["all"])
+    )
 
 
 @cache
 def motion(duration: float = 16.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Time (N,), angles, velocities and accelerations (N, 2) of an exciting motion."""
     t = np.arange(round(duration / PERIOD)) * PERIOD
-    waves = [[(0.9, 2.1, 0.0), (0.5, 4.7, 1.0), (0.2, 9.1, 2.0)], [(1.1, 2.9, 0.5), (0.6, 5.3, 2.0), (0.2, 8.3, 0.3)]]
+    waves = [
+        [(0.9, 2.1, 0.0), (0.5, 4.7, 1.0), (0.2, 9.1, 2.0)],
+        [(1.1, 2.9, 0.5), (0.6, 5.3, 2.0), (0.2, 8.3, 0.3)],
+    ]
     q, v, a = (
-        np.stack([sum(size * w**k * np.sin(w * t + p + k * np.pi / 2) for size, w, p in joint) for joint in waves], axis=1)
+        np.stack(
+            [
+                sum(size * w**k * np.sin(w * t + p + k * np.pi / 2) for size, w, p in joint)
+                for joint in waves
+            ],
+            axis=1,
+        )
         for k in range(3)
     )
     return t, q, v, a
@@ -97,7 +129,9 @@ def torque(combinations: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray
     return np.stack([shoulder, lower + LENGTH * (along * a1 + across * v1**2)], axis=1)
 
 
-def recording(*, friction: bool = True, cutoff: float = 0.0, bias: float = 0.0, duration: float = 16.0) -> Log:
+def recording(
+    *, friction: bool = True, cutoff: float = 0.0, bias: float = 0.0, duration: float = 16.0
+) -> Log:
     """What a robot with the true links records."""
     t, q, v, a = motion(duration)
     tau = torque(planar(TRUE), q, v, a) + bias
@@ -107,19 +141,26 @@ def recording(*, friction: bool = True, cutoff: float = 0.0, bias: float = 0.0, 
     if cutoff:
         tau = sosfiltfilt(butter(4, cutoff, fs=1 / PERIOD, output="sos"), tau, axis=0)
     channels = {"time": t, "joint/position": q, "joint/velocity": v, "joint/torque_command": tau}
-    return Log(channels, {"joints": ["shoulder", "elbow"], "sides": [], "period": PERIOD, "source": "closed form"})
+    return Log(
+        channels,
+        {"joints": ["shoulder", "elbow"], "sides": [], "period": PERIOD, "source": "closed form"},
+    )
 
 
 @pytest.fixture(scope="module")
 def identified(folder: Path) -> Identification:
     log = recording()
     half = len(log.time) // 2
-    return identify(scenario(folder), log.part(slice(0, half)), {"rest": log.part(slice(half, None))})
+    return identify(
+        scenario(folder), log.part(slice(0, half)), {"rest": log.part(slice(half, None))}
+    )
 
 
 def test_base_parameters_are_those_of_the_closed_form(identified: Identification) -> None:
     base = identified.inertia.base_parameters
-    assert [(b.body, b.parameter) for b in base] == [(body, name) for body in BODIES for name in ("mx", "mz", "iyy")]
+    assert [(b.body, b.parameter) for b in base] == [
+        (body, name) for body in BODIES for name in ("mx", "mz", "iyy")
+    ]
     assert base[0].others == pytest.approx({("lower", "mass"): LENGTH}, rel=1e-3)
     assert base[2].others == pytest.approx({("lower", "mass"): LENGTH**2}, rel=1e-3)
     assert [b.model for b in base] == pytest.approx(planar(BELIEVED), abs=1e-3)
@@ -130,7 +171,11 @@ def test_true_combinations_and_friction_lie_in_their_intervals(identified: Ident
     for base, truth in zip(identified.inertia.base_parameters, planar(TRUE), strict=True):
         assert base.interval[0] <= truth <= base.interval[1], base.text
         assert base.value == pytest.approx(truth, rel=0.02, abs=2e-3)
-    friction = {f.targets[0]: f.parameters for f in identified.findings if f.effect == "CoulombViscousFriction"}
+    friction = {
+        f.targets[0]: f.parameters
+        for f in identified.findings
+        if f.effect == "CoulombViscousFriction"
+    }
     for joint, coulomb, viscous in zip(("shoulder", "elbow"), COULOMB, VISCOUS, strict=True):
         assert friction[joint]["coulomb"].value == pytest.approx(coulomb, rel=0.03)
         assert friction[joint]["viscous"].value == pytest.approx(viscous, rel=0.05)
@@ -156,7 +201,9 @@ def test_what_the_plane_does_not_show_stays_with_the_model(identified: Identific
     assert not inertia.at_the_edge
 
 
-def test_identified_bodies_are_physical_and_the_scenario_holds_them(identified: Identification) -> None:
+def test_identified_bodies_are_physical_and_the_scenario_holds_them(
+    identified: Identification,
+) -> None:
     inertia = identified.inertia
     assert np.linalg.eigvalsh(pseudo_inertia(inertia.model + inertia.change)).min() > 0
     effects = identified.scenario.believed.effects
@@ -172,7 +219,9 @@ def test_bodies_at_the_edge_of_what_is_physical(folder: Path) -> None:
     impossible = {**TRUE, "lower": (1.8, 0.22, 0.0, 0.02 - 1.8 * 0.22**2)}
     _, q, v, a = motion()
     log = recording()
-    channels = {name: log[name] for name in log} | {"joint/torque_command": torque(planar(impossible), q, v, a)}
+    channels = {name: log[name] for name in log} | {
+        "joint/torque_command": torque(planar(impossible), q, v, a)
+    }
     log = Log(channels, log.meta)
     result = identify(scenario(folder), log)
     assert "lower" in result.inertia.at_the_edge
@@ -199,7 +248,9 @@ def test_base_columns_say_what_the_others_are() -> None:
     W = np.column_stack([W[:, 0], W[:, 1], 2 * W[:, 0] - W[:, 1], 1e-6 * W[:, 2], W[:, 2]])
     kept, factors = base_columns(W, np.ones(5))
     assert kept == [0, 1, 4]
-    assert factors == pytest.approx(np.array([[1, 0, 2, 0, 0], [0, 1, -1, 0, 0], [0, 0, 0, 1e-6, 1]]), abs=1e-9)
+    assert factors == pytest.approx(
+        np.array([[1, 0, 2, 0, 0], [0, 1, -1, 0, 0], [0, 0, 0, 1e-6, 1]]), abs=1e-9
+    )
 
 
 def test_an_inertia_effect_makes_the_body_that_another_file_describes(folder: Path) -> None:
@@ -207,12 +258,22 @@ def test_an_inertia_effect_makes_the_body_that_another_file_describes(folder: Pa
     changes = {name: {} for name in PARAMETERS}
     robots = [make_robot(str(folder / f"{name}.yaml"))[0] for name in ("believed", "true")]
     for body in BODIES:
-        old, new = (inertial_parameters(robot.body(body).default_spatial_inertia()) for robot in robots)
+        old, new = (
+            inertial_parameters(robot.body(body).default_spatial_inertia()) for robot in robots
+        )
         for name, value in zip(PARAMETERS, new - old, strict=True):
             changes[name][body] = float(value)
-    changed = build_robot(RobotConfig(str(folder / "believed.yaml"), effects={"inertia": InertialParameters(**changes)}))
-    assert _inverse_dynamics(changed.plant) == pytest.approx(_inverse_dynamics(robots[1].plant), abs=1e-9)
-    assert _inverse_dynamics(changed.plant) != pytest.approx(_inverse_dynamics(robots[0].plant), abs=0.1)
+    changed = build_robot(
+        RobotConfig(
+            str(folder / "believed.yaml"), effects={"inertia": InertialParameters(**changes)}
+        )
+    )
+    assert _inverse_dynamics(changed.plant) == pytest.approx(
+        _inverse_dynamics(robots[1].plant), abs=1e-9
+    )
+    assert _inverse_dynamics(changed.plant) != pytest.approx(
+        _inverse_dynamics(robots[0].plant), abs=0.1
+    )
 
 
 def _inverse_dynamics(plant: MultibodyPlant) -> np.ndarray:
@@ -223,13 +284,23 @@ def _inverse_dynamics(plant: MultibodyPlant) -> np.ndarray:
 
 
 def test_an_impossible_body_is_refused_in_one_line(folder: Path) -> None:
-    config = RobotConfig(str(folder / "believed.yaml"), effects={"inertia": InertialParameters(iyy={"lower": -0.2})})
-    with pytest.raises(InputError, match=r"effects\.inertia: lower: expected the inertia of a body"):
+    config = RobotConfig(
+        str(folder / "believed.yaml"), effects={"inertia": InertialParameters(iyy={"lower": -0.2})}
+    )
+    with pytest.raises(
+        InputError, match=r"effects\.inertia: lower: expected the inertia of a body"
+    ):
         build_robot(config)
     with pytest.raises(InputError, match=r"identify\.inertia"):
-        identify(dataclasses.replace(scenario(folder), identify=IdentifyConfig()), recording(duration=2.0))
+        identify(
+            dataclasses.replace(scenario(folder), identify=IdentifyConfig()),
+            recording(duration=2.0),
+        )
     with pytest.raises(InputError, match="hand: the model has no body"):
-        identify(dataclasses.replace(scenario(folder), identify=IdentifyConfig(["hand"])), recording(duration=2.0))
+        identify(
+            dataclasses.replace(scenario(folder), identify=IdentifyConfig(["hand"])),
+            recording(duration=2.0),
+        )
 
 
 def test_four_point_masses_have_any_inertia() -> None:
@@ -246,11 +317,19 @@ def test_wrench_of_a_spinning_dumbbell() -> None:
     m, r, spin = 1.5, 0.3, 4.0
     phi = np.zeros(10)
     phi[[PARAMETERS.index(n) for n in ("mass", "iyy", "izz")]] = 2 * m, 2 * m * r**2, 2 * m * r**2
-    w, alpha, a = np.array([[0.0, 0.0, spin]]), np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, 9.81]])
-    assert body_wrench(w, alpha, a)[0] @ phi == pytest.approx([0, 0, 2 * m * r**2 * 2.0, 0, 0, 2 * m * 9.81])
+    w, alpha, a = (
+        np.array([[0.0, 0.0, spin]]),
+        np.array([[0.0, 0.0, 2.0]]),
+        np.array([[0.0, 0.0, 9.81]]),
+    )
+    assert body_wrench(w, alpha, a)[0] @ phi == pytest.approx(
+        [0, 0, 2 * m * r**2 * 2.0, 0, 0, 2 * m * 9.81]
+    )
     # About an axis between, the dumbbell wants to stand across: w x I w.
     tilted = np.array([[spin, spin, 0.0]])
-    assert (body_wrench(tilted, 0 * alpha, 0 * a)[0] @ phi)[:3] == pytest.approx([0, 0, 2 * m * r**2 * spin**2])
+    assert (body_wrench(tilted, 0 * alpha, 0 * a)[0] @ phi)[:3] == pytest.approx(
+        [0, 0, 2 * m * r**2 * spin**2]
+    )
 
 
 def test_columns_of_a_floating_robot_are_what_changing_the_model_does() -> None:
@@ -262,7 +341,9 @@ def test_columns_of_a_floating_robot_are_what_changing_the_model_does() -> None:
     vectors = (random.standard_normal((5, k)) for k in (n, n, n, 3, 3, 3))
     at = Instants(*vectors, np.zeros((5, len(equation.pads.foot), 3)), np.zeros((5, n)))
     delta = random.uniform(-1e-3, 1e-3, 10)
-    effect = InertialParameters.from_values([body], dict(zip(PARAMETERS, delta[:, None], strict=True)))
+    effect = InertialParameters.from_values(
+        [body], dict(zip(PARAMETERS, delta[:, None], strict=True))
+    )
     changed = EquationOfMotion(build_robot(RobotConfig("biped", effects={"change": effect})))
     expected = equation.residual(at, kinematic=False) - changed.residual(at, kinematic=False)
     assert inertial_regressor(equation, at, body) @ delta == pytest.approx(expected, abs=1e-9)
@@ -278,11 +359,17 @@ def diagnosis(folder: Path) -> Diagnosis:
     return diagnose(Predictor(scenario(folder), recording()), [library()[name] for name in EFFECTS])
 
 
-def test_friction_is_found_beside_inertia_that_is_not_trusted(folder: Path, diagnosis: Diagnosis) -> None:
+def test_friction_is_found_beside_inertia_that_is_not_trusted(
+    folder: Path, diagnosis: Diagnosis
+) -> None:
     assert diagnosis.verdict == "effect_found"
     friction = [f for f in diagnosis.chosen if f.effect != "InertialParameters"]
-    assert {(f.effect, f.targets) for f in friction} == {("CoulombViscousFriction", (joint,)) for joint in ("shoulder", "elbow")}
-    for f, coulomb in zip(sorted(friction, key=lambda f: f.targets, reverse=True), COULOMB, strict=True):
+    assert {(f.effect, f.targets) for f in friction} == {
+        ("CoulombViscousFriction", (joint,)) for joint in ("shoulder", "elbow")
+    }
+    for f, coulomb in zip(
+        sorted(friction, key=lambda f: f.targets, reverse=True), COULOMB, strict=True
+    ):
         low, high = f.parameters["coulomb"].interval
         assert low <= coulomb <= high
     completed = add(scenario(folder), diagnosis.chosen)
@@ -292,7 +379,10 @@ def test_friction_is_found_beside_inertia_that_is_not_trusted(folder: Path, diag
 
 def test_friction_that_is_trusted_away_is_not_named(folder: Path) -> None:
     """A robot without friction, whose inertia is wrong: inertia alone explains it, and nothing else is named."""
-    result = diagnose(Predictor(scenario(folder), recording(friction=False)), [library()[name] for name in EFFECTS])
+    result = diagnose(
+        Predictor(scenario(folder), recording(friction=False)),
+        [library()[name] for name in EFFECTS],
+    )
     assert {f.effect for f in result.chosen} == {"InertialParameters"}
     assert result.held_out_after < 1.2
 
@@ -309,7 +399,9 @@ def test_load_dependent_friction_is_told_from_torque_that_explains_itself(folder
     log = Log({name: log[name] for name in log} | {"joint/torque_command": tau}, log.meta)
     result = diagnose(Predictor(scenario(folder), log), [library()[name] for name in EFFECTS])
     found = {(f.effect, f.targets): f.parameters for f in result.chosen}
-    assert found["LoadDependentFriction", ("shoulder",)]["coefficient"].value == pytest.approx(0.12, abs=0.02)
+    assert found["LoadDependentFriction", ("shoulder",)]["coefficient"].value == pytest.approx(
+        0.12, abs=0.02
+    )
     assert {effect for effect, _ in found} <= {*FRICTION, "InertialParameters"}
     assert model_error(Predictor(add(scenario(folder), result.chosen), log)).relative < 0.015
 
@@ -322,8 +414,12 @@ def test_inertia_that_is_trusted_stays(folder: Path) -> None:
 
 
 def test_a_study_ends_with_one_change_of_inertia(folder: Path) -> None:
-    result = study(scenario(folder), recording(), [library()[name] for name in EFFECTS], rollouts=False)
-    changes = [e for e in result.scenario.believed.effects.values() if isinstance(e, InertialParameters)]
+    result = study(
+        scenario(folder), recording(), [library()[name] for name in EFFECTS], rollouts=False
+    )
+    changes = [
+        e for e in result.scenario.believed.effects.values() if isinstance(e, InertialParameters)
+    ]
     assert len(changes) == 1
     assert result.steps[-1].held_out_rmse < 0.01 * result.steps[0].held_out_rmse
 
@@ -331,17 +427,23 @@ def test_a_study_ends_with_one_change_of_inertia(folder: Path) -> None:
 def test_torques_that_were_filtered_by_who_recorded_them(folder: Path) -> None:
     """Friction jumps, recorded torques do not: read as they are the rest is many times larger than through the same low-pass."""
     log = recording(cutoff=3.0)
-    as_is, through = (identify(scenario(folder, recorded_cutoff=corner), log) for corner in (0.0, 3.0))
+    as_is, through = (
+        identify(scenario(folder, recorded_cutoff=corner), log) for corner in (0.0, 3.0)
+    )
     assert through.after["train"].relative < 0.01
     assert as_is.after["train"].relative > 3 * through.after["train"].relative
-    friction = {f.targets[0]: f.parameters for f in through.findings if f.effect == "CoulombViscousFriction"}
+    friction = {
+        f.targets[0]: f.parameters for f in through.findings if f.effect == "CoulombViscousFriction"
+    }
     assert friction["shoulder"]["coulomb"].value == pytest.approx(COULOMB[0], rel=0.05)
 
 
 def test_a_walking_robot_can_doubt_a_body(run: Callable[..., Log]) -> None:
     """The mass of the trunk is told by the base rows, its product of inertia by nothing much."""
     log = run("squat", "duration=1.5")
-    believed = dataclasses.replace(load_scenario("squat", overrides=["duration=1.5"]), identify=IdentifyConfig(["trunk"]))
+    believed = dataclasses.replace(
+        load_scenario("squat", overrides=["duration=1.5"]), identify=IdentifyConfig(["trunk"])
+    )
     believed = dataclasses.replace(believed, model=believed.robot)
     result = identify(believed, log)
     mass = PARAMETERS.index("mass")

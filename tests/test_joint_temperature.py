@@ -23,7 +23,13 @@ HEAT = {"copper_loss": {"all": 2.0}, "resistance": {"all": 1.5}, "time_constant"
 AMBIENT, START = 15.0, 25.0
 
 
-def temperatures(config: JointTemperature, torque: System, loss: float = 0.0, velocity: float = 0.0, end: float = 1.0) -> np.ndarray:
+def temperatures(
+    config: JointTemperature,
+    torque: System,
+    loss: float = 0.0,
+    velocity: float = 0.0,
+    end: float = 1.0,
+) -> np.ndarray:
     """What is read every 10 ms, from 0 to `end` [s], of a pendulum's motor."""
     builder = DiagramBuilder()
     thermometer = builder.AddSystem(config.system(ROBOT, Run(0.001, 3, end)))
@@ -112,7 +118,9 @@ def test_temperature_in_a_run_is_that_of_the_commanded_torque():
 
 def test_a_scenario_says_it_and_reads_it_back(tmp_path: Path):
     path = tmp_path / "warm.yaml"
-    path.write_text("warm:\n  sensors: {more: {winding: !JointTemperature {ambient: 30, noise: 0.2}}}\n")
+    path.write_text(
+        "warm:\n  sensors: {more: {winding: !JointTemperature {ambient: 30, noise: 0.2}}}\n"
+    )
     warm = load_scenario(path)
     expected = JointTemperature(ambient=30.0, noise=0.2, period=warm.usual_period)
     assert warm.sensors.more == {"winding": expected}
@@ -125,14 +133,35 @@ def test_a_scenario_says_it_and_reads_it_back(tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ("{a: !JointTemperature {}, b: !JointTemperature {}}", r"more\.b: gives measured_temperature, as a does"),
-        ("{a: !EncoderConfig {}}", r"more\.a: expected one of !JointTemperature, found the tag !EncoderConfig"),
+        (
+            "{a: !JointTemperature {}, b: !JointTemperature {}}",
+            r"more\.b: gives measured_temperature, as a does",
+        ),
+        (
+            "{a: !EncoderConfig {}}",
+            r"more\.a: expected one of !JointTemperature, found the tag !EncoderConfig",
+        ),
         ("{imu: !JointTemperature {}}", r"more\.imu: there is a sensor of this name already"),
-        ("{a: !JointTemperature {period: 0.0015}}", r"sensors\.more\.a\.period: expected a whole multiple"),
-        ("{a: !JointTemperature {resistance: {elbow: 1}}}", r"sensors\.more\.a\.resistance\.elbow: unknown joint"),
-        ("{a: !JointTemperature {resistance: {all: -1}}}", r"resistance\.all: expected a number >= 0"),
-        ("{a: !JointTemperature {time_constant: {all: 0}}}", r"time_constant\.all: expected a number > 0"),
-        ("{a: !Thermometer {}}", r"sensors\.more\.a: expected one of !JointTemperature, found the tag !Thermometer"),
+        (
+            "{a: !JointTemperature {period: 0.0015}}",
+            r"sensors\.more\.a\.period: expected a whole multiple",
+        ),
+        (
+            "{a: !JointTemperature {resistance: {elbow: 1}}}",
+            r"sensors\.more\.a\.resistance\.elbow: unknown joint",
+        ),
+        (
+            "{a: !JointTemperature {resistance: {all: -1}}}",
+            r"resistance\.all: expected a number >= 0",
+        ),
+        (
+            "{a: !JointTemperature {time_constant: {all: 0}}}",
+            r"time_constant\.all: expected a number > 0",
+        ),
+        (
+            "{a: !Thermometer {}}",
+            r"sensors\.more\.a: expected one of !JointTemperature, found the tag !Thermometer",
+        ),
     ],
 )
 def test_refusals(tmp_path: Path, more: str, message: str):
@@ -206,9 +235,17 @@ def test_a_sensor_of_a_user_s_own(tmp_path: Path):
     [
         ("signals:", "signs:", r"sensor StrainGauge: the class variable signals is missing"),
         ("def system", "def systems", r"sensor StrainGauge: the method system is missing"),
-        ("joint/strain", "joint/position", r"sensor StrainGauge: channel joint/position: there is one"),
+        (
+            "joint/strain",
+            "joint/position",
+            r"sensor StrainGauge: channel joint/position: there is one",
+        ),
         ("measured_strain", "measured_imu", r"sensor StrainGauge: port measured_imu: there is one"),
-        ("StrainGauge", "JointTemperature", r"sensor JointTemperature: there is another of this name"),
+        (
+            "StrainGauge",
+            "JointTemperature",
+            r"sensor JointTemperature: there is another of this name",
+        ),
     ],
 )
 def test_a_bad_sensor_gets_one_line(tmp_path: Path, old: str, new: str, message: str):
@@ -223,11 +260,21 @@ def test_a_bad_sensor_gets_one_line(tmp_path: Path, old: str, new: str, message:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"torque_command"', '"voltage"', r"sensor gauges: input voltage: there is no port of this name"),
-        ('Port("measured_strain"', 'Port("strain"', r"sensor gauges: expected the output ports measured_strain, found strain"),
+        (
+            '"torque_command"',
+            '"voltage"',
+            r"sensor gauges: input voltage: there is no port of this name",
+        ),
+        (
+            'Port("measured_strain"',
+            'Port("strain"',
+            r"sensor gauges: expected the output ports measured_strain, found strain",
+        ),
     ],
 )
-def test_a_sensor_that_does_not_fit_the_robot_gets_one_line(tmp_path: Path, old: str, new: str, message: str):
+def test_a_sensor_that_does_not_fit_the_robot_gets_one_line(
+    tmp_path: Path, old: str, new: str, message: str
+):
     (tmp_path / "strain.py").write_text(MINE.replace(old, new))
     path = tmp_path / "mine.yaml"
     path.write_text(
@@ -239,5 +286,7 @@ def test_a_sensor_that_does_not_fit_the_robot_gets_one_line(tmp_path: Path, old:
 
 
 def test_the_usual_sensors_are_in_the_library():
-    assert {"EncoderConfig", "ImuConfig", "FootForceConfig", "JointTorqueConfig"} < set(sensor.library())
+    assert {"EncoderConfig", "ImuConfig", "FootForceConfig", "JointTorqueConfig"} < set(
+        sensor.library()
+    )
     assert EncoderConfig.ports() == ["measured_joint_state"]

@@ -20,7 +20,11 @@ def channels(samples: int = 5) -> dict[str, np.ndarray]:
 
 
 def test_round_trip(tmp_path: Path):
-    log = Log(channels() | {"foot/left/pad_force": np.ones((5, 4, 3)), "truth/base/velocity": np.zeros((5, 3))}, META)
+    log = Log(
+        channels()
+        | {"foot/left/pad_force": np.ones((5, 4, 3)), "truth/base/velocity": np.zeros((5, 3))},
+        META,
+    )
     log.save(tmp_path / "log.npz")
     again = Log.load(tmp_path / "log.npz")
     assert again.meta == log.meta
@@ -36,10 +40,22 @@ def test_round_trip(tmp_path: Path):
     ("change", "message"),
     [
         ({"joint/position": None}, r"channel joint/position is missing"),
-        ({"joint/position": np.ones((5, 3))}, r"channel joint/position: expected shape 5 x 2, found 5 x 3"),
-        ({"joint/velocity": np.ones((4, 2))}, r"channel joint/velocity: expected shape 5 x 2, found 4 x 2"),
-        ({"joint/velocity": np.full((5, 2), np.nan)}, r"channel joint/velocity: not a finite number in row 0"),
-        ({"time": np.array([0.0, 0.01, 0.01, 0.02, 0.03])}, r"channel time: does not increase at row 2"),
+        (
+            {"joint/position": np.ones((5, 3))},
+            r"channel joint/position: expected shape 5 x 2, found 5 x 3",
+        ),
+        (
+            {"joint/velocity": np.ones((4, 2))},
+            r"channel joint/velocity: expected shape 5 x 2, found 4 x 2",
+        ),
+        (
+            {"joint/velocity": np.full((5, 2), np.nan)},
+            r"channel joint/velocity: not a finite number in row 0",
+        ),
+        (
+            {"time": np.array([0.0, 0.01, 0.01, 0.02, 0.03])},
+            r"channel time: does not increase at row 2",
+        ),
         ({"elbow/position": np.ones(5)}, r"channel elbow/position: not a channel of a log"),
     ],
 )
@@ -72,7 +88,9 @@ def test_foreign_files_get_one_line(tmp_path: Path):
     np.savez(tmp_path / "pickled.npz", x=np.array([{}], dtype=object))
     with pytest.raises(InputError, match=r"pickled\.npz"):
         Log.load(tmp_path / "pickled.npz")
-    np.savez(tmp_path / "newer.npz", meta=np.array(json.dumps({"format_version": 99})), **channels())
+    np.savez(
+        tmp_path / "newer.npz", meta=np.array(json.dumps({"format_version": 99})), **channels()
+    )
     with pytest.raises(InputError, match="log format version 99, this program reads 1"):
         Log.load(tmp_path / "newer.npz")
     with pytest.raises(InputError, match=r"absent\.npz: No such file"):
@@ -84,7 +102,9 @@ def test_foreign_files_get_one_line(tmp_path: Path):
 
 def test_same_scenario_and_seed_give_the_same_bytes(tmp_path: Path):
     for name in ("first", "second"):
-        simulate(scenario("paper_walk", "duration=0.8"), name="paper_walk").log.save(tmp_path / f"{name}.npz")
+        simulate(scenario("paper_walk", "duration=0.8"), name="paper_walk").log.save(
+            tmp_path / f"{name}.npz"
+        )
     assert (tmp_path / "first.npz").read_bytes() == (tmp_path / "second.npz").read_bytes()
 
 
@@ -92,11 +112,16 @@ def test_another_seed_changes_the_noise_and_nothing_else_at_first(run: Callable[
     one, other = run("squat", "duration=0.3"), run("squat", "duration=0.3", "seed=1")
     assert not np.array_equal(one["imu/linear_acceleration"], other["imu/linear_acceleration"])
     np.testing.assert_array_equal(one["truth/joint/position"][0], other["truth/joint/position"][0])
-    np.testing.assert_array_equal(one["reference/joint/position"], other["reference/joint/position"])
+    np.testing.assert_array_equal(
+        one["reference/joint/position"], other["reference/joint/position"]
+    )
 
 
 def test_noise_levels_are_the_scenarios(run: Callable[..., Log]):
-    noisy, exact = run("leg_swing_gantry", "duration=3"), run("leg_swing_gantry", "duration=3", noise=False)
+    noisy, exact = (
+        run("leg_swing_gantry", "duration=3"),
+        run("leg_swing_gantry", "duration=3", noise=False),
+    )
     gyro = noisy["imu/angular_velocity"] - exact["imu/angular_velocity"]
     assert gyro.std() == pytest.approx(1e-3, rel=0.05)
     pads = noisy["foot/left/pad_force"] - noisy["truth/foot/left/pad_force"]

@@ -30,7 +30,9 @@ def test_a_released_station_is_freed() -> None:
     assert reference() is None
 
 
-@pytest.mark.skipif(not _STATISTICS.exists(), reason="the memory of a process is read as Linux has it")
+@pytest.mark.skipif(
+    not _STATISTICS.exists(), reason="the memory of a process is read as Linux has it"
+)
 def test_memory_levels_off_over_simulations_and_estimates() -> None:
     """Each run has 20 MiB and more of diagrams and records."""
     walk = scenario("paper_walk_fbse", "duration=1")

@@ -53,7 +53,9 @@ def late(truth: np.ndarray) -> np.ndarray:
 
 
 def with_estimate(log: Log, estimate: np.ndarray) -> Log:
-    return dataclasses.replace(log, channels=log.channels | {"estimate/joint/friction_torque": estimate})
+    return dataclasses.replace(
+        log, channels=log.channels | {"estimate/joint/friction_torque": estimate}
+    )
 
 
 def every(figures: dict[str, dict[str, float]]) -> list[float]:
@@ -77,7 +79,9 @@ def test_nrmse_is_the_error_over_the_friction_and_rmse_in_nm():
     log = with_estimate(log, 1.1 * truth)
     assert every(friction_nrmse(log)) == pytest.approx([0.1] * 8)
     rows = np.arange(SETTLING, 1000)
-    assert friction_rmse(log)["stance"]["left_knee"] == pytest.approx(0.1 * np.sqrt(np.mean(truth[rows, 1] ** 2)))
+    assert friction_rmse(log)["stance"]["left_knee"] == pytest.approx(
+        0.1 * np.sqrt(np.mean(truth[rows, 1] ** 2))
+    )
 
 
 def test_phases_are_those_of_the_joints_own_leg():
@@ -96,7 +100,10 @@ def test_without_a_plan_the_estimated_support_tells_the_phase():
     estimate[:1000] += 1.0
     left = (log.time < 1.5).astype(float)
     channels = {name: values for name, values in log.items() if not name.startswith("reference/")}
-    channels |= {"estimate/joint/friction_torque": estimate, "estimate/support": np.stack([left, 1 - left], axis=1)}
+    channels |= {
+        "estimate/joint/friction_torque": estimate,
+        "estimate/support": np.stack([left, 1 - left], axis=1),
+    }
     rmse = friction_rmse(Log(channels, log.meta))
     assert rmse["swing"]["left_hip"] == pytest.approx(0.0)
     assert rmse["stance"]["left_hip"] == pytest.approx(math.sqrt(800 / 1300))
@@ -113,15 +120,29 @@ def test_settling_of_the_filters_is_left_out():
     attitude = np.tile([1.0, 0.0, 0.0, 0.0], (SAMPLES, 1))
     started = attitude.copy()
     started[:SETTLING] = [0.0, 1.0, 0.0, 0.0]
-    log = made_log(**{"estimate/joint/friction_torque": estimate, "estimate/base/orientation": started, "truth/base/orientation": attitude})
+    log = made_log(
+        **{
+            "estimate/joint/friction_torque": estimate,
+            "estimate/base/orientation": started,
+            "truth/base/orientation": attitude,
+        }
+    )
     assert every(friction_rmse(log)) == [0.0] * 8
     assert attitude_rmse_deg(log) == {"roll": 0.0, "pitch": 0.0}
     short = Log({name: values[:SETTLING] for name, values in log.items()}, log.meta)
-    assert all(math.isnan(value) for value in (*every(friction_rmse(short)), *attitude_rmse_deg(short).values()))
+    assert all(
+        math.isnan(value)
+        for value in (*every(friction_rmse(short)), *attitude_rmse_deg(short).values())
+    )
 
 
 def test_a_robot_without_friction_has_no_normalised_error():
-    log = made_log(**{"truth/joint/friction_torque": np.zeros((SAMPLES, 4)), "estimate/joint/friction_torque": np.ones((SAMPLES, 4))})
+    log = made_log(
+        **{
+            "truth/joint/friction_torque": np.zeros((SAMPLES, 4)),
+            "estimate/joint/friction_torque": np.ones((SAMPLES, 4)),
+        }
+    )
     assert all(math.isnan(value) for value in every(friction_nrmse(log)))
     assert every(friction_rmse(log)) == [1.0] * 8
 
@@ -189,14 +210,21 @@ def test_attitude_error_ignores_yaw_and_the_quaternions_sign():
     log = made_log(**{"estimate/base/orientation": estimate, "truth/base/orientation": truth})
     rmse = attitude_rmse_deg(log)
     assert (rmse["roll"], rmse["pitch"]) == pytest.approx((0.5, 0.3))
-    round_the_back = {"estimate/base/orientation": quaternion(179.0, 0.0, 0.0), "truth/base/orientation": quaternion(-179.0, 0.0, 0.0)}
-    log = made_log(**{name: np.tile(values, (SAMPLES, 1)) for name, values in round_the_back.items()})
+    round_the_back = {
+        "estimate/base/orientation": quaternion(179.0, 0.0, 0.0),
+        "truth/base/orientation": quaternion(-179.0, 0.0, 0.0),
+    }
+    log = made_log(
+        **{name: np.tile(values, (SAMPLES, 1)) for name, values in round_the_back.items()}
+    )
     np.testing.assert_allclose(attitude_error_deg(log)[:, 0], -2.0)
 
 
 def test_base_velocity_is_compared_at_the_same_time():
     truth = np.cumsum(np.full((SAMPLES, 3), 0.01), axis=0)
-    log = made_log(**{"estimate/base/velocity": truth + [0.1, -0.2, 0.0], "truth/base/velocity": truth})
+    log = made_log(
+        **{"estimate/base/velocity": truth + [0.1, -0.2, 0.0], "truth/base/velocity": truth}
+    )
     assert base_velocity_rmse(log) == pytest.approx({"x": 0.1, "y": 0.2, "z": 0.0}, abs=1e-12)
 
 
@@ -204,7 +232,9 @@ def innovations(scale: float) -> dict[str, np.ndarray]:
     """White innovations of the attitude's filters, `scale` times as large as they are said to be; no level feet."""
     random = np.random.default_rng(1)
     deviation = np.array([0.1, 0.1, 0.1, 2.0, 2.0, 2.0])
-    innovation = np.hstack([scale * deviation * random.standard_normal((SAMPLES, 6)), np.zeros((SAMPLES, 3))])
+    innovation = np.hstack(
+        [scale * deviation * random.standard_normal((SAMPLES, 6)), np.zeros((SAMPLES, 3))]
+    )
     return {
         "estimate/attitude/innovation": innovation,
         "estimate/attitude/innovation_variance": np.tile([0.01, 4.0, 0.0], (SAMPLES, 1)),
@@ -212,14 +242,19 @@ def innovations(scale: float) -> dict[str, np.ndarray]:
 
 
 def test_consistent_filters_are_within_the_bounds_and_others_are_not():
-    good, bad = consistency(made_log(**innovations(1.0)))["attitude"], consistency(made_log(**innovations(2.0)))["attitude"]
+    good, bad = (
+        consistency(made_log(**innovations(1.0)))["attitude"],
+        consistency(made_log(**innovations(2.0)))["attitude"],
+    )
     assert list(good) == ["gravity", "attitude by gravity"]
     for part, found in good.items():
         assert found.count == 3 * (SAMPLES - SETTLING)
         assert found.lower < found.nis < found.upper
         assert bad[part].nis == pytest.approx(4 * found.nis)
     # Half the width of the bounds is about 1.96 standard deviations of the mean of squares of normal variables.
-    assert (found.upper - found.lower) / 2 == pytest.approx(1.96 * math.sqrt(2 / found.count), rel=0.01)
+    assert (found.upper - found.lower) / 2 == pytest.approx(
+        1.96 * math.sqrt(2 / found.count), rel=0.01
+    )
     assert nis_bounds(np.array([1, 10])).shape == (2, 2)
 
 
@@ -253,7 +288,10 @@ def test_every_filter_is_named_by_what_it_measures():
     feet = ["left foot, angular", "left foot, linear", "right foot, angular", "right foot, linear"]
     assert list(found["joint_acceleration"]) == feet
     assert list(found["friction"]) == JOINTS
-    channels |= {name: channels[name][:, :2] for name in ("estimate/base_state/innovation", "estimate/base_state/innovation_variance")}
+    channels |= {
+        name: channels[name][:, :2]
+        for name in ("estimate/base_state/innovation", "estimate/base_state/innovation_variance")
+    }
     assert list(consistency(made_log(**channels))["base_state"]) == ["ZMP x", "ZMP y"]
 
 
@@ -262,11 +300,18 @@ def test_joints_belong_to_legs_by_name_or_by_place():
     assert joint_sides(log) == ["left", "left", "right", "right"]
     renamed = dataclasses.replace(log, meta=log.meta | {"joints": ["LH", "LK", "RH", "RK"]})
     assert joint_sides(renamed) == ["left", "left", "right", "right"]
-    assert joint_sides(dataclasses.replace(log, meta={"joints": JOINTS, "period": 0.001})) == [None] * 4
+    assert (
+        joint_sides(dataclasses.replace(log, meta={"joints": JOINTS, "period": 0.001}))
+        == [None] * 4
+    )
 
 
 def test_a_recording_has_nothing_but_its_length_and_cost():
-    channels = {name: values for name, values in made_log().items() if not name.startswith(("truth/", "reference/"))}
+    channels = {
+        name: values
+        for name, values in made_log().items()
+        if not name.startswith(("truth/", "reference/"))
+    }
     channels["estimate/joint/friction_torque"] = np.ones((SAMPLES, 4))
     ticks = np.full(SAMPLES, 0.0005)
     ticks[:40] = 0.002
@@ -274,9 +319,19 @@ def test_a_recording_has_nothing_but_its_length_and_cost():
     assert (metrics["fell"], metrics["outcome"]) == (None, "recorded")
     assert metrics["simulated_time"] == pytest.approx(1.999)
     assert metrics["tick_us"] == pytest.approx({"median": 500.0, "p99": 2000.0})
-    unknown = ("joint_tracking_rms", "com_rse_mean", "stance_creep_max", "attitude_rmse_deg", "base_velocity_rmse")
+    unknown = (
+        "joint_tracking_rms",
+        "com_rse_mean",
+        "stance_creep_max",
+        "attitude_rmse_deg",
+        "base_velocity_rmse",
+    )
     assert all(math.isnan(value) for key in unknown for value in metrics[key].values())
-    assert all(math.isnan(value) for key in ("friction_rmse", "friction_nrmse") for value in every(metrics[key]))
+    assert all(
+        math.isnan(value)
+        for key in ("friction_rmse", "friction_nrmse")
+        for value in every(metrics[key])
+    )
 
 
 def test_only_a_measured_tick_has_a_cost():

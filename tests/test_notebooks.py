@@ -45,8 +45,12 @@ def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
 
 
 def errors(notebook: nbformat.NotebookNode) -> list[str]:
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    return [f"{output.ename}: {output.evalue}" for output in outputs if output.output_type == "error"]
+    outputs = [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
+    return [
+        f"{output.ename}: {output.evalue}" for output in outputs if output.output_type == "error"
+    ]
 
 
 def test_there_are_notebooks():
@@ -56,7 +60,11 @@ def test_there_are_notebooks():
 @each_notebook
 def test_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
-    if "fbse" in notebook.metadata and notebook.metadata.fbse.needs_data and not os.environ.get("FBSE_DATA_DIR"):
+    if (
+        "fbse" in notebook.metadata
+        and notebook.metadata.fbse.needs_data
+        and not os.environ.get("FBSE_DATA_DIR")
+    ):
         pytest.skip("FBSE_DATA_DIR does not name the folder of the recordings that it shows")
     run(notebook, path.parent, tmp_path)
     assert errors(notebook) == []

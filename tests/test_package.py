@@ -12,7 +12,17 @@ ROOT = Path(__file__).resolve().parent.parent
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package as it is in a wheel, unpacked away from the checkout."""
     folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(folder),
+        str(ROOT),
+    ]
     subprocess.run(command, check=True, capture_output=True, timeout=300)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
@@ -20,7 +30,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def test_models_and_scenarios_are_found_by_name_from_an_installed_package(installed: Path, tmp_path: Path):
+def test_models_and_scenarios_are_found_by_name_from_an_installed_package(
+    installed: Path, tmp_path: Path
+):
     program = (
         "import fbse_drake, fbse_drake.resources as r;"
         "s = fbse_drake.load_scenario('paper_walk', overrides=['duration=0.05']);"
@@ -37,7 +49,10 @@ def test_models_and_scenarios_are_found_by_name_from_an_installed_package(instal
         check=False,
     )
     assert run.returncode == 0, run.stderr
-    assert run.stdout.split() == [str(installed / "fbse_drake/models"), str(installed / "fbse_drake/scenarios")]
+    assert run.stdout.split() == [
+        str(installed / "fbse_drake/models"),
+        str(installed / "fbse_drake/scenarios"),
+    ]
 
 
 def test_the_wheel_holds_every_model_scenario_and_template(installed: Path):

@@ -46,7 +46,9 @@ def test_imu_is_the_twice_differentiated_motion_minus_gravity(run: Run, name: st
     acceleration = (p_WI[2:] - 2 * p_WI[1:-1] + p_WI[:-2]) / h**2
     specific_force = R_WB[2:].inv().apply(acceleration + [0, 0, GRAVITY])
     measured = log["imu/linear_acceleration"][2:]
-    np.testing.assert_allclose(np.sqrt(np.mean((measured - specific_force) ** 2, axis=0)), 0, atol=0.01)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean((measured - specific_force) ** 2, axis=0)), 0, atol=0.01
+    )
     rate = (R_WB[:-1].inv() * R_WB[1:]).as_rotvec() / h
     np.testing.assert_allclose(log["imu/angular_velocity"][1:], rate, atol=1e-4)
 
@@ -69,7 +71,9 @@ def test_pad_forces_are_the_contact_forces():
         assert np.count_nonzero(contact_force[:, 2]) == (8 if time < 0.5 else 4)
         # Sole frames are level to a milliradian, world forces are up to 250 N.
         np.testing.assert_allclose(measured[:, 2], contact_force[:, 2], rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(np.linalg.norm(measured, axis=1), np.linalg.norm(contact_force, axis=1), rtol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(measured, axis=1), np.linalg.norm(contact_force, axis=1), rtol=1e-9
+        )
 
 
 def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
@@ -83,11 +87,19 @@ def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
 def tumbling_energy_drift(time_step: float) -> float:
     """Largest change of the total energy of a freely falling robot with moving joints, relative to its kinetic energy."""
     builder = DiagramBuilder()
-    robot, _ = make_robot("biped", builder=builder, config=MultibodyPlantConfig(time_step=time_step))
+    robot, _ = make_robot(
+        "biped", builder=builder, config=MultibodyPlantConfig(time_step=time_step)
+    )
     plant, simulator = robot.plant, Simulator(builder.Build())
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     posture = np.tile([0.0, 0.0, -0.4, 0.8, -0.4, 0.0], 2)
-    robot.set_state(context, posture, np.linspace(-1, 1, 12), RigidTransform([0, 0, 2.0]), np.array([1.0, 2.0, 0.5, 0.3, 0.0, 1.0]))
+    robot.set_state(
+        context,
+        posture,
+        np.linspace(-1, 1, 12),
+        RigidTransform([0, 0, 2.0]),
+        np.array([1.0, 2.0, 0.5, 0.3, 0.0, 1.0]),
+    )
 
     def energy() -> float:
         return plant.CalcKineticEnergy(context) + plant.CalcPotentialEnergy(context)
@@ -121,31 +133,52 @@ def closure(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
     Uses logged channels, true accelerations over the same step and Drake's model, nothing of the simulation.
     """
     config = scenario(name).robot
-    robot, _ = make_robot(config.description, rotor_inertia=config.rotor_inertia, gantry_height=config.gantry_height)
-    plant, context, world = robot.plant, robot.plant.CreateDefaultContext(), robot.plant.world_frame()
+    robot, _ = make_robot(
+        config.description, rotor_inertia=config.rotor_inertia, gantry_height=config.gantry_height
+    )
+    plant, context, world = (
+        robot.plant,
+        robot.plant.CreateDefaultContext(),
+        robot.plant.world_frame(),
+    )
     forces, floating = MultibodyForces(robot.plant), robot.has_floating_base
     joint_error, base_error = [], []
     for k in range(1, len(log.time)):
         before = k - 1
         X_WB = V_WB = None
         if floating:
-            X_WB = RigidTransform(Quaternion(log["truth/base/orientation"][before]), log["truth/base/position"][before])
-            V_WB = np.concatenate([log["truth/base/angular_velocity"][before], log["truth/base/velocity"][before]])
-        robot.set_state(context, log["joint/position"][before], log["joint/velocity"][before], X_WB, V_WB)
+            X_WB = RigidTransform(
+                Quaternion(log["truth/base/orientation"][before]),
+                log["truth/base/position"][before],
+            )
+            V_WB = np.concatenate(
+                [log["truth/base/angular_velocity"][before], log["truth/base/velocity"][before]]
+            )
+        robot.set_state(
+            context, log["joint/position"][before], log["joint/velocity"][before], X_WB, V_WB
+        )
         acceleration = np.zeros(plant.num_velocities())
         acceleration[robot.velocity_index] = log["truth/joint/acceleration"][k]
         if floating:
-            acceleration[:6] = np.concatenate([log["truth/base/angular_acceleration"][k], log["truth/base/acceleration"][k]])
+            acceleration[:6] = np.concatenate(
+                [log["truth/base/angular_acceleration"][k], log["truth/base/acceleration"][k]]
+            )
         plant.CalcForceElementsContribution(context, forces)
         needed = plant.CalcInverseDynamics(context, acceleration, forces)
         for side in log.sides:
             sole = robot.sole(side)
             R_WF = sole.CalcPoseInWorld(context).rotation().matrix()
             pads = robot.pad_positions(side).T
-            J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, sole, pads, world, world)
+            J = plant.CalcJacobianTranslationalVelocity(
+                context, JacobianWrtVariable.kV, sole, pads, world, world
+            )
             needed -= J.T @ (log[f"foot/{side}/pad_force"][k] @ R_WF.T).ravel()
         link_torque = needed[robot.velocity_index]
-        joint_error.append(log["joint/torque_command"][before] - link_torque - log["truth/joint/friction_torque"][before])
+        joint_error.append(
+            log["joint/torque_command"][before]
+            - link_torque
+            - log["truth/joint/friction_torque"][before]
+        )
         base_error.append(needed[:6] if floating else np.zeros(6))
     return np.abs(joint_error), np.abs(base_error)
 
@@ -163,7 +196,9 @@ def test_closure_with_contact(run: Run, name: str):
 
     The solver stops at a relative tolerance of 1e-6 of the momentum; what it leaves over shows in the base rows, where nothing else is.
     """
-    joint_error, base_error = (error.max(axis=1) for error in closure(run(name, "duration=3", noise=False), name))
+    joint_error, base_error = (
+        error.max(axis=1) for error in closure(run(name, "duration=3", noise=False), name)
+    )
     assert np.median(joint_error) < 1e-5
     assert joint_error.max() < 5e-3
     solved = base_error < 1e-7
@@ -171,16 +206,23 @@ def test_closure_with_contact(run: Run, name: str):
     assert joint_error[solved].max() < 1e-6
 
 
-@pytest.mark.parametrize(("name", "share"), [("squat", 0.99), ("sway", 0.99), ("paper_walk", 0.9), ("hrp2_friction_walk", 0.9)])
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [("squat", 0.99), ("sway", 0.99), ("paper_walk", 0.9), ("hrp2_friction_walk", 0.9)],
+)
 def test_closure_with_exactly_solved_contact(run: Run, name: str, share: float):
     """Drake's `sap` contact is linear as long as pads keep standing or sliding, and joints between the
     corners of their laws; then its solver's last step is exact."""
-    joint_error, _ = closure(run(name, "duration=3", "plant.discrete_contact_approximation=sap", noise=False), name)
+    joint_error, _ = closure(
+        run(name, "duration=3", "plant.discrete_contact_approximation=sap", noise=False), name
+    )
     assert np.mean(joint_error.max(axis=1) < 1e-6) >= share
 
 
 @pytest.mark.parametrize("seed", [0, 9])
-@pytest.mark.parametrize(("name", "largest_error"), [("paper_walk", 2e-3), ("hrp2_friction_walk", 3.5e-3)])
+@pytest.mark.parametrize(
+    ("name", "largest_error"), [("paper_walk", 2e-3), ("hrp2_friction_walk", 3.5e-3)]
+)
 def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
     log = run(name, f"seed={seed}")
     assert not log.meta["outcome"]["fell"]
@@ -191,14 +233,21 @@ def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
     assert [len(stances) for stances in creep.values()] == [4, 5]
     assert max(max(stances) for stances in creep.values()) < 0.5e-3
     # Seven single supports: seven times one foot carries everything.
-    unloaded = np.stack([log[f"truth/foot/{side}/pad_force"][:, :, 2].sum(axis=1) < 1.0 for side in log.sides], axis=1)[1:]
+    unloaded = np.stack(
+        [log[f"truth/foot/{side}/pad_force"][:, :, 2].sum(axis=1) < 1.0 for side in log.sides],
+        axis=1,
+    )[1:]
     assert not unloaded.all(axis=1).any()
-    lifted = np.stack([log[f"truth/foot/{side}/position"][:, 2] > 0.02 for side in log.sides], axis=1).astype(int)
+    lifted = np.stack(
+        [log[f"truth/foot/{side}/position"][:, 2] > 0.02 for side in log.sides], axis=1
+    ).astype(int)
     assert np.maximum(np.diff(lifted, axis=0), 0).sum() == 7
 
 
 def test_com_converges_under_step_halving(run: Run):
-    coarse, fine = (run("paper_walk", *changes, noise=False) for changes in ((), ("plant.time_step=0.0005",)))
+    coarse, fine = (
+        run("paper_walk", *changes, noise=False) for changes in ((), ("plant.time_step=0.0005",))
+    )
     np.testing.assert_allclose(fine.time, coarse.time, atol=1e-12)
     assert np.abs(coarse["truth/com/position"] - fine["truth/com/position"]).max() < 1e-3
 
@@ -235,7 +284,9 @@ _FOLLOWED = [
 
 
 @pytest.mark.parametrize(("name", "changes", "asked"), _FOLLOWED)
-def test_simulated_friction_follows_its_law(run: Run, name: str, changes: tuple[str, ...], asked: float):
+def test_simulated_friction_follows_its_law(
+    run: Run, name: str, changes: tuple[str, ...], asked: float
+):
     error = law_error(run(name, *changes))
     assert len(error) == 12
     assert error.max() < asked

@@ -19,30 +19,49 @@ from fbse_drake import InputError, Log
 from fbse_drake.interop.convert import convert
 from fbse_drake.interop.mapping import ChannelMap, LogMap
 
-MAP = LogMap(joints=["a"], channels={"joint/position": ChannelMap(columns=["q"]), "joint/torque_command": ChannelMap(columns=["tau"])})
+MAP = LogMap(
+    joints=["a"],
+    channels={
+        "joint/position": ChannelMap(columns=["q"]),
+        "joint/torque_command": ChannelMap(columns=["tau"]),
+    },
+)
 ROWS = 6
 
 
 def columns() -> dict[str, np.ndarray]:
-    return {"time": 0.1 * np.arange(ROWS), "q": np.arange(1.0, ROWS + 1), "tau": np.linspace(-1, 1, ROWS)}
+    return {
+        "time": 0.1 * np.arange(ROWS),
+        "q": np.arange(1.0, ROWS + 1),
+        "tau": np.linspace(-1, 1, ROWS),
+    }
 
 
 def joint_states(types: dict[str, Any]) -> list[tuple[int, Any]]:
     stamps = [10**9 + 10**8 * row for row in range(ROWS)]
     sequence = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__annotations__ else {}
     headers = [
-        types["std_msgs/msg/Header"](**sequence, stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id="")
+        types["std_msgs/msg/Header"](
+            **sequence,
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)),
+            frame_id="",
+        )
         for stamp in stamps
     ]
     numbers = [np.array([float(row)]) for row in range(ROWS)]
-    states = [types["sensor_msgs/msg/JointState"](header, ["a"], x, x, x) for header, x in zip(headers, numbers, strict=True)]
+    states = [
+        types["sensor_msgs/msg/JointState"](header, ["a"], x, x, x)
+        for header, x in zip(headers, numbers, strict=True)
+    ]
     return list(zip(stamps, states, strict=True))
 
 
 def ros2(folder: Path, plugin: StoragePlugin) -> bytes:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Ros2Writer(folder / "bag", version=9, storage_plugin=plugin) as writer:
-        connection = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        connection = writer.add_connection(
+            "/joint_states", "sensor_msgs/msg/JointState", typestore=store
+        )
         for stamp, message in joint_states(store.types):
             writer.write(connection, stamp, store.serialize_cdr(message, message.__msgtype__))
     return next(path for path in (folder / "bag").iterdir() if path.suffix != ".yaml").read_bytes()
@@ -51,7 +70,9 @@ def ros2(folder: Path, plugin: StoragePlugin) -> bytes:
 def ros1(folder: Path) -> bytes:
     store = get_typestore(Stores.ROS1_NOETIC)
     with Ros1Writer(folder / "log.bag") as writer:
-        connection = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        connection = writer.add_connection(
+            "/joint_states", "sensor_msgs/msg/JointState", typestore=store
+        )
         for stamp, message in joint_states(store.types):
             writer.write(connection, stamp, store.serialize_ros1(message, message.__msgtype__))
     return (folder / "log.bag").read_bytes()
@@ -67,9 +88,20 @@ def matlab_7(folder: Path) -> bytes:
 def saved(folder: Path, kind: str) -> bytes:
     path = folder / f"log.{kind}"
     if kind == "csv":
-        np.savetxt(path, np.column_stack(list(columns().values())), delimiter=",", header="time,q,tau", comments="", fmt="%.6g")
+        np.savetxt(
+            path,
+            np.column_stack(list(columns().values())),
+            delimiter=",",
+            header="time,q,tau",
+            comments="",
+            fmt="%.6g",
+        )
     elif kind == "json":
-        path.write_text(json.dumps([{name: values[row] for name, values in columns().items()} for row in range(ROWS)]))
+        path.write_text(
+            json.dumps(
+                [{name: values[row] for name, values in columns().items()} for row in range(ROWS)]
+            )
+        )
     elif kind == "npz":
         np.savez(path, **columns())
     else:
@@ -90,7 +122,9 @@ VALID = {
 
 
 @pytest.fixture(scope="module", params=VALID)
-def valid(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
+def valid(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, bytes]:
     """Where to put a file, and what it has when it is whole."""
     suffix, make = VALID[request.param]
     return tmp_path_factory.mktemp("fuzz") / f"log{suffix}", make(tmp_path_factory.mktemp("valid"))
@@ -108,17 +142,29 @@ def test_the_whole_file_is_read(valid: tuple[Path, bytes]):
     np.testing.assert_array_equal(np.diff(log["joint/position"][:, 0]), 1)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(data=st.data())
 def test_damaged_files_never_show_a_traceback(valid: tuple[Path, bytes], data: st.DataObject):
     path, content = valid
     damaged = bytearray(content)
-    for place, value in data.draw(st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=12)):
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=12)
+    ):
         damaged[place] = value
     if data.draw(st.booleans()):
         del damaged[data.draw(st.integers(0, len(content) - 1)) :]
-    start, size = data.draw(st.integers(0, len(content))), data.draw(st.sampled_from([0, 0, 1, 7, 100]))
-    damaged[start : start + size] = data.draw(st.sampled_from([b"", b"", b"\0" * size, b"\xff" * size]))
+    start, size = (
+        data.draw(st.integers(0, len(content))),
+        data.draw(st.sampled_from([0, 0, 1, 7, 100])),
+    )
+    damaged[start : start + size] = data.draw(
+        st.sampled_from([b"", b"", b"\0" * size, b"\xff" * size])
+    )
     path.write_bytes(damaged)
     message, log = outcome(path)
     if log is None:

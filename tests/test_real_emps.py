@@ -15,7 +15,9 @@ from fbse_drake.effects.effect import library
 from fbse_drake.interop.convert import read_log
 
 DATA = Path(os.environ.get("FBSE_DATA_DIR", "")) / "emps"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="FBSE_DATA_DIR does not hold the records of EMPS")
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason="FBSE_DATA_DIR does not hold the records of EMPS"
+)
 MAP = Path(__file__).parent.parent / "scenarios" / "real" / "emps.map.yaml"
 # Published; also that of the model's file [kg].
 MASS = 95.1089
@@ -53,7 +55,13 @@ def identified(record: Log, pulses: Log) -> Identification:
 @pytest.fixture(scope="module")
 def found(record: Log, pulses: Log) -> Study:
     scenario = load_scenario("real/emps")
-    return study(scenario, record, [library()[name] for name in EFFECTS], rollouts=False, tests={"pulses": pulses})
+    return study(
+        scenario,
+        record,
+        [library()[name] for name in EFFECTS],
+        rollouts=False,
+        tests={"pulses": pulses},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,11 @@ def published() -> Scenario:
 
 
 def test_the_publishers_parameters_are_found(identified: Identification) -> None:
-    values = {name: estimate.value for finding in identified.findings[:2] for name, estimate in finding.parameters.items()}
+    values = {
+        name: estimate.value
+        for finding in identified.findings[:2]
+        for name, estimate in finding.parameters.items()
+    }
     assert 0.5 * MASS + identified.inertia.change[0, 0] == pytest.approx(MASS, rel=0.01)
     assert values["viscous"] == pytest.approx(203.5034, rel=0.01)
     assert values["coulomb"] == pytest.approx(20.3935, rel=0.01)
@@ -70,10 +82,14 @@ def test_the_publishers_parameters_are_found(identified: Identification) -> None
     assert identified.findings[0].parameters["viscous"].unit == "N s/m"
 
 
-def test_their_model_leaves_what_they_say(identified: Identification, published: Scenario, record: Log, pulses: Log) -> None:
+def test_their_model_leaves_what_they_say(
+    identified: Identification, published: Scenario, record: Log, pulses: Log
+) -> None:
     """They say 4.08 % of the decimated force, and 5.98 % on the record with pulses."""
     assert identified.after["train"].relative < 0.0409
-    assert model_error(Predictor(published, record)).relative == pytest.approx(identified.after["train"].relative, rel=0.01)
+    assert model_error(Predictor(published, record)).relative == pytest.approx(
+        identified.after["train"].relative, rel=0.01
+    )
     assert model_error(Predictor(published, pulses)).relative == pytest.approx(0.0598, rel=0.06)
 
 
@@ -96,7 +112,9 @@ def test_the_model_keeps_what_the_search_promised(found: Study) -> None:
     assert step.train_rmse < 1.1 * step.held_out_rmse
 
 
-def test_simulated_in_closed_loop_it_stays_near_the_record(found: Study, published: Scenario, record: Log) -> None:
+def test_simulated_in_closed_loop_it_stays_near_the_record(
+    found: Study, published: Scenario, record: Log
+) -> None:
     """They say 0.0138 % of the position. Here over two of the four cycles."""
     cycles = record.part(slice(0, 12480))
     errors = [rollout(scenario, cycles) for scenario in (published, found.scenario)]

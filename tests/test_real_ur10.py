@@ -18,7 +18,9 @@ from fbse_drake.effects.inertia import pseudo_inertia
 from fbse_drake.interop.convert import read_log
 
 BAG = Path(os.environ.get("FBSE_DATA_DIR", "")) / "ur10" / "ur10_exciting_trajectory.db3"
-pytestmark = pytest.mark.skipif(not BAG.is_file(), reason="FBSE_DATA_DIR does not hold the UR10's bag")
+pytestmark = pytest.mark.skipif(
+    not BAG.is_file(), reason="FBSE_DATA_DIR does not hold the UR10's bag"
+)
 # Of the library, those that decide; `fbse study real/ur10` tries all of it.
 EFFECTS = ("CoulombViscousFriction", "LoadDependentFriction", "TorqueBias")
 FIRST = "shoulder_pan_joint"
@@ -37,7 +39,9 @@ def identified(recording: tuple[Scenario, Log, Log]) -> Identification:
     return identify(scenario, train, {"rest": rest})
 
 
-def test_all_base_parameters_of_six_links_are_excited(recording: tuple[Scenario, Log, Log], identified: Identification) -> None:
+def test_all_base_parameters_of_six_links_are_excited(
+    recording: tuple[Scenario, Log, Log], identified: Identification
+) -> None:
     """This arm, whose first joint is upright, has 36 (Gautier and Khalil 1990); what the fit leaves over hides some of them."""
     scenario, train, _ = recording
     inertia = untrusted_inertia(Predictor(scenario, train).motion, scenario.identify.inertia)
@@ -52,13 +56,20 @@ def test_plain_friction_and_inertia(identified: Identification) -> None:
     assert identified.before["train"].relative == pytest.approx(0.453, abs=0.005)
     assert identified.after["train"].relative < 0.038
     assert identified.after["rest"].relative_by_joint[FIRST] < 0.054
-    assert np.linalg.eigvalsh(pseudo_inertia(identified.inertia.model + identified.inertia.change)).min() > 0
+    assert (
+        np.linalg.eigvalsh(
+            pseudo_inertia(identified.inertia.model + identified.inertia.change)
+        ).min()
+        > 0
+    )
 
 
 def test_what_the_diagnosis_names_holds_on_the_rest(recording: tuple[Scenario, Log, Log]) -> None:
     scenario, train, rest = recording
     diagnosis = diagnose(Predictor(scenario, train), [library()[name] for name in EFFECTS])
-    assert {"CoulombViscousFriction", "LoadDependentFriction"} <= {f.effect for f in diagnosis.chosen}
+    assert {"CoulombViscousFriction", "LoadDependentFriction"} <= {
+        f.effect for f in diagnosis.chosen
+    }
     completed = add(scenario, diagnosis.chosen)
     fitted, tested = (model_error(Predictor(completed, log)) for log in (train, rest))
     assert fitted.relative < 0.038

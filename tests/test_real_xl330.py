@@ -21,15 +21,27 @@ from fbse_drake.interop.mapping import load_map
 
 DATA = Path(os.environ.get("FBSE_DATA_DIR", "")) / "bam_xl330" / "raw"
 pytestmark = pytest.mark.skipif(
-    "FBSE_DATA_DIR" not in os.environ or not DATA.is_dir(), reason="needs the recordings bam_xl330 in the folder that FBSE_DATA_DIR names"
+    "FBSE_DATA_DIR" not in os.environ or not DATA.is_dir(),
+    reason="needs the recordings bam_xl330 in the folder that FBSE_DATA_DIR names",
 )
 # Of the effects that are tried, those that concern a joint of a motor with a gear; the whole library takes minutes.
-FEW = [LoadDependentFriction, TorqueRollOff, CoulombFriction, ViscousFriction, ReflectedInertia, EncoderOffset]
+FEW = [
+    LoadDependentFriction,
+    TorqueRollOff,
+    CoulombFriction,
+    ViscousFriction,
+    ReflectedInertia,
+    EncoderOffset,
+]
 
 
 def records(*gains: int) -> Log:
     """The records that were made with these gains of the firmware."""
-    files = [path for path in sorted(DATA.glob("*.json")) if any(f'"kp": {gain},' in path.read_text()[:200] for gain in gains)]
+    files = [
+        path
+        for path in sorted(DATA.glob("*.json"))
+        if any(f'"kp": {gain},' in path.read_text()[:200] for gain in gains)
+    ]
     return convert(files, load_map("real/xl330"))
 
 
@@ -62,9 +74,16 @@ def mean_error(error: RolloutError | None) -> float:
 def test_the_firmware_commands_what_the_model_of_it_says(train: Log, believed: Scenario):
     """Duty cycle over position error, in every record: the recorded command is the position loop's."""
     for segment in train.meta["segments"]:
-        rows = (train.time >= segment["start"]) & (train.time <= segment["end"]) & (train["joint/enabled"][:, 0] > 0)
+        rows = (
+            (train.time >= segment["start"])
+            & (train.time <= segment["end"])
+            & (train["joint/enabled"][:, 0] > 0)
+        )
         error = (train["reference/joint/position"] - train["joint/position"])[rows, 0]
-        command, limit = train["joint/torque_command"][rows, 0], believed.control.torque_limit["servo"]
+        command, limit = (
+            train["joint/torque_command"][rows, 0],
+            believed.control.torque_limit["servo"],
+        )
         expected = np.clip(segment["kp"] * believed.control.kp["servo"] * error, -limit, limit)
         assert np.linalg.norm(command - expected) < 0.05 * np.linalg.norm(expected)
 
@@ -78,7 +97,9 @@ def test_friction_that_grows_with_the_load_is_found(diagnosis: Diagnosis):
     assert 0.0012 < chosen["ReflectedInertia"].parameters["inertia"].value < 0.0025
 
 
-def test_the_torque_is_explained_on_records_that_were_not_fitted(train: Log, believed: Scenario, found: Scenario):
+def test_the_torque_is_explained_on_records_that_were_not_fitted(
+    train: Log, believed: Scenario, found: Scenario
+):
     test = records(200, 800)
     for log in (train, test):
         before, after = (model_error(Predictor(model, log)).relative for model in (believed, found))

@@ -12,7 +12,16 @@ from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
 from fbse_drake.report import figures
-from fbse_drake.report.html import Details, FigureBlock, Report, Section, number, numeric_table, render_report, write_report
+from fbse_drake.report.html import (
+    Details,
+    FigureBlock,
+    Report,
+    Section,
+    number,
+    numeric_table,
+    render_report,
+    write_report,
+)
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.report.run import write_run_report
 
@@ -54,8 +63,18 @@ def walking_log(samples: int = SAMPLES, *, fell: bool = False) -> Log:
             f"reference/foot/{side}/position": np.tile([0.5, y, 0.0], (samples, 1)),
             f"reference/foot/{side}/support": stands.astype(float),
         }
-    outcome = {"fell": fell, "reason": "t = 3.990 s: fell: <tilted>" if fell else "finished", "time": float(time[-1])}
-    meta = {"joints": joints, "sides": ["left", "right"], "period": 0.01, "scenario": "walk: {seed: 0}", "outcome": outcome}
+    outcome = {
+        "fell": fell,
+        "reason": "t = 3.990 s: fell: <tilted>" if fell else "finished",
+        "time": float(time[-1]),
+    }
+    meta = {
+        "joints": joints,
+        "sides": ["left", "right"],
+        "period": 0.01,
+        "scenario": "walk: {seed: 0}",
+        "outcome": outcome,
+    }
     return Log(channels, meta)
 
 
@@ -72,17 +91,26 @@ def estimated_log(scenario: str = "walk: {estimator: !Fbse {}}") -> Log:
     truth = log["truth/joint/friction_torque"]
     tilt = math.radians(0.5) / 2
     level = np.tile([1.0, 0.0, 0.0, 0.0], (SAMPLES, 1))
-    variances = {"attitude": (9, 3), "base_state": (6, 2), "joint_acceleration": (12, 12), "friction": (4, 4)}
+    variances = {
+        "attitude": (9, 3),
+        "base_state": (6, 2),
+        "joint_acceleration": (12, 12),
+        "friction": (4, 4),
+    }
     channels = {
         "estimate/joint/friction_torque": 1.1 * np.concatenate([truth[:1], truth[:-1]]),
         "estimate/friction/parameters": np.tile([2.0, 0.5], (SAMPLES, 4, 1)),
         "estimate/friction/parameter_variance": np.full((SAMPLES, 4, 2), 0.01),
-        "estimate/base/orientation": np.tile([math.cos(tilt), math.sin(tilt), 0.0, 0.0], (SAMPLES, 1)),
+        "estimate/base/orientation": np.tile(
+            [math.cos(tilt), math.sin(tilt), 0.0, 0.0], (SAMPLES, 1)
+        ),
         "truth/base/orientation": level,
         "estimate/base/velocity": np.tile([0.001, 0.0, 0.0], (SAMPLES, 1)),
         "truth/base/velocity": np.zeros((SAMPLES, 3)),
         "estimate/com/position": log["truth/com/position"] + [0.004, 0.0, 0.0],
-        "estimate/support": np.stack([log[f"reference/foot/{side}/support"] for side in log.sides], axis=1),
+        "estimate/support": np.stack(
+            [log[f"reference/foot/{side}/support"] for side in log.sides], axis=1
+        ),
         "estimate/sensors/status": np.zeros((SAMPLES, 4)),
     }
     for name, (components, variance) in variances.items():
@@ -93,7 +121,9 @@ def estimated_log(scenario: str = "walk: {estimator: !Fbse {}}") -> Log:
 
 
 def without(log: Log, *beginnings: str) -> Log:
-    return Log({name: values for name, values in log.items() if not name.startswith(beginnings)}, log.meta)
+    return Log(
+        {name: values for name, values in log.items() if not name.startswith(beginnings)}, log.meta
+    )
 
 
 def line(figure: Figure, panel: int, label: str) -> np.ndarray:
@@ -129,7 +159,9 @@ def titles(log: Log) -> list[str]:
 def walk_report(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"
     log = walking_log()
-    log = dataclasses.replace(log, meta=log.meta | {"pads": dict.fromkeys(log.sides, PADS.tolist())})
+    log = dataclasses.replace(
+        log, meta=log.meta | {"pads": dict.fromkeys(log.sides, PADS.tolist())}
+    )
     write_run_report(path, log, run_metrics(log, 2.0), name="a_walk")
     return path.read_text(encoding="utf-8")
 
@@ -139,7 +171,9 @@ def test_report_refers_to_nothing_outside_itself(walk_report):
     assert page.titles == titles(walking_log())
     assert len(page.titles) == 10
     for source in page.sources:
-        assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True).startswith(b"\x89PNG")
+        assert base64.b64decode(
+            source.removeprefix("data:image/png;base64,"), validate=True
+        ).startswith(b"\x89PNG")
     assert page.links
     assert all(link.startswith("#") for link in page.links)
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
@@ -204,7 +238,9 @@ def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
 
 
 def test_fall_and_scenario_are_escaped_text(tmp_path, monkeypatch):
-    monkeypatch.setattr("fbse_drake.report.run.run_figures", lambda *_, **__: {topic: [] for topic in TOPICS})
+    monkeypatch.setattr(
+        "fbse_drake.report.run.run_figures", lambda *_, **__: {topic: [] for topic in TOPICS}
+    )
     log = walking_log(fell=True)
     log = dataclasses.replace(log, meta=log.meta | {"scenario": "title: <script>alert(1)</script>"})
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="<b>")
@@ -250,7 +286,9 @@ def test_phases_are_named_as_in_the_paper():
 def test_measured_zmp_is_the_centre_of_the_pad_forces():
     log = walking_log()
     figure = figures.footprints(log, pads=dict.fromkeys(log.sides, PADS))
-    expected = np.array([[0.6, 0.0], [0.6, 0.1], [0.6, 0.0], [0.6, -0.1]]).repeat(SAMPLES // 4, axis=0)
+    expected = np.array([[0.6, 0.0], [0.6, 0.1], [0.6, 0.0], [0.6, -0.1]]).repeat(
+        SAMPLES // 4, axis=0
+    )
     (line,) = (line for line in figure.axes[0].get_lines() if line.get_label() == "measured ZMP")
     np.testing.assert_allclose(line.get_xydata(), expected, atol=1e-12)
 
@@ -302,7 +340,9 @@ def test_numbers_are_rounded_for_reading(value, text):
 
 
 def test_tables_leave_out_rows_without_numbers():
-    (table,) = numeric_table(("Joint", "a", "b"), [("hip", math.nan, 2.0), ("knee", math.nan, math.nan)])
+    (table,) = numeric_table(
+        ("Joint", "a", "b"), [("hip", math.nan, 2.0), ("knee", math.nan, math.nan)]
+    )
     assert [row[0] for row in table.rows] == ["hip"]
     text = render_report(Report("r", True, "done", (Section("s", tables=(table,)),)))
     assert '<td>hip</td><td class="number">n/a</td><td class="number">2.00</td>' in text
@@ -312,7 +352,9 @@ def test_tables_leave_out_rows_without_numbers():
 def test_report_replaces_the_old_one_and_leaves_nothing_else(tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")
-    write_report(path, Report("new", True, "done", (Section("s", "text", details=(Details("d", "t"),)),)))
+    write_report(
+        path, Report("new", True, "done", (Section("s", "text", details=(Details("d", "t"),)),))
+    )
     assert "<title>new</title>" in path.read_text()
     assert list(tmp_path.iterdir()) == [path]
 
@@ -325,21 +367,34 @@ def test_failed_report_keeps_the_old_one(tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")
     with pytest.raises(RuntimeError, match="no picture"):
-        write_report(path, Report("new", True, "done", (Section("s", figures=(FigureBlock("f", "", Broken()),)),)))
+        write_report(
+            path,
+            Report("new", True, "done", (Section("s", figures=(FigureBlock("f", "", Broken()),)),)),
+        )
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_report_of_estimates_tells_their_errors(tmp_path):
     log = estimated_log()
-    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)), name="a_walk")
+    write_run_report(
+        tmp_path / "report.html",
+        log,
+        run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)),
+        name="a_walk",
+    )
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert len(_Page(text).titles) == 17
     # Friction of 1 Nm, estimated as 1.1 Nm, in stance and in swing.
-    numbers = "".join(f'<td class="number">{value}</td>' for value in ("0.100", "0.100", "0.100", "0.100"))
+    numbers = "".join(
+        f'<td class="number">{value}</td>' for value in ("0.100", "0.100", "0.100", "0.100")
+    )
     assert f"<tr><td>left knee</td>{numbers}</tr>" in text
     assert '<td>Estimated roll, RMS error</td><td class="number">0.500</td><td>deg</td>' in text
-    assert '<td>Estimated base velocity in x, RMS error</td><td class="number">1.00</td><td>mm/s</td>' in text
+    assert (
+        '<td>Estimated base velocity in x, RMS error</td><td class="number">1.00</td><td>mm/s</td>'
+        in text
+    )
     assert '<td>Estimator tick, median</td><td class="number">600</td><td>µs</td>' in text
     assert "<tr><td>base state</td><td>velocity</td>" in text
     assert ">n/a<" not in text
@@ -347,8 +402,17 @@ def test_report_of_estimates_tells_their_errors(tmp_path):
 
 def test_report_of_a_recording_tells_what_is_known(tmp_path):
     log = without(estimated_log(), "truth/", "reference/")
-    log = dataclasses.replace(log, meta={key: log.meta[key] for key in ("joints", "sides", "period")} | {"estimator_scenario": "mine: {}"})
-    write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)), name="a_robot")
+    log = dataclasses.replace(
+        log,
+        meta={key: log.meta[key] for key in ("joints", "sides", "period")}
+        | {"estimator_scenario": "mine: {}"},
+    )
+    write_run_report(
+        tmp_path / "report.html",
+        log,
+        run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)),
+        name="a_robot",
+    )
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "A recording of 3.99 s." in text
     assert "YAML of the estimator that ran over the log" in text
@@ -360,14 +424,19 @@ def test_report_of_a_recording_tells_what_is_known(tmp_path):
 @pytest.mark.parametrize("samples", [1, 15])
 def test_a_log_that_ends_before_the_filters_have_settled_has_all_figures(samples):
     log = estimated_log()
-    assert "Error of the friction estimate" in titles(Log({name: values[:samples] for name, values in log.items()}, log.meta))
+    assert "Error of the friction estimate" in titles(
+        Log({name: values[:samples] for name, values in log.items()}, log.meta)
+    )
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """All figures are empty, which saves the time to draw them."""
     for name, function in vars(figures).items():
-        if not name.startswith("_") and getattr(function, "__annotations__", {}).get("return") is Figure:
+        if (
+            not name.startswith("_")
+            and getattr(function, "__annotations__", {}).get("return") is Figure
+        ):
             monkeypatch.setattr(figures, name, lambda *_, **__: Figure())
 
 
@@ -387,12 +456,18 @@ def test_figures_of_estimates_follow_the_channels():
     assert [title for title in titles(log) if title not in titles(walking_log())] == added
     assert "Joint friction" not in titles(log)
     recorded = without(log, "truth/", "reference/")
-    assert [title for title in added if title not in titles(recorded)] == ["Error of the friction estimate"]
+    assert [title for title in added if title not in titles(recorded)] == [
+        "Error of the friction estimate"
+    ]
     assert "Friction over velocity" not in titles(recorded)
     assert "Centre of mass" in titles(recorded)
     # An estimator of friction alone.
-    friction_only = Log(walking_log().channels | {"estimate/joint/friction_torque": np.ones((SAMPLES, 4))}, log.meta)
-    assert [title for title in titles(friction_only) if title not in titles(walking_log())] == added[:2]
+    friction_only = Log(
+        walking_log().channels | {"estimate/joint/friction_torque": np.ones((SAMPLES, 4))}, log.meta
+    )
+    assert [
+        title for title in titles(friction_only) if title not in titles(walking_log())
+    ] == added[:2]
 
 
 def test_estimate_and_truth_are_drawn_at_the_end_of_the_same_step():
@@ -403,13 +478,20 @@ def test_estimate_and_truth_are_drawn_at_the_end_of_the_same_step():
     error = figures.friction_errors(log)
     assert error.axes[0].get_title(loc="right") == "RMS 0.10 Nm"
     known = without(log, "truth/")
-    assert [label for label in figures.estimated_friction(known).axes[0].get_legend_handles_labels()[1] if "true" in label] == []
+    assert [
+        label
+        for label in figures.estimated_friction(known).axes[0].get_legend_handles_labels()[1]
+        if "true" in label
+    ] == []
 
 
 def test_swings_of_the_joints_own_leg_are_shaded():
     for log in (estimated_log(), without(estimated_log(), "reference/")):
         panels = figures.estimated_friction(log).axes
-        spans = {axes.get_title(loc="left"): [patch.get_extents() for patch in axes.patches] for axes in panels}
+        spans = {
+            axes.get_title(loc="left"): [patch.get_extents() for patch in axes.patches]
+            for axes in panels
+        }
         places = {
             name: [axes.transData.inverted().transform(box)[:, 0] for box in spans[name]]
             for axes in panels
@@ -423,21 +505,34 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     log = estimated_log()
     spiky = log["estimate/joint/friction_torque"].copy()
     spiky[200, 0] = 500.0
-    axes = figures.estimated_friction(Log(log.channels | {"estimate/joint/friction_torque": spiky}, log.meta)).axes[0]
+    axes = figures.estimated_friction(
+        Log(log.channels | {"estimate/joint/friction_torque": spiky}, log.meta)
+    ).axes[0]
     low, high = axes.get_ylim()
     assert -1.6 < low < -1.1
     assert 1.1 < high < 1.6
     # What really acted is shown whole.
     true_spike = log["truth/joint/friction_torque"].copy()
     true_spike[200, 0] = 50.0
-    assert figures.estimated_friction(Log(log.channels | {"truth/joint/friction_torque": true_spike}, log.meta)).axes[0].get_ylim()[1] > 50
+    assert (
+        figures.estimated_friction(
+            Log(log.channels | {"truth/joint/friction_torque": true_spike}, log.meta)
+        )
+        .axes[0]
+        .get_ylim()[1]
+        > 50
+    )
 
 
 @pytest.mark.parametrize(
     ("scenario", "titles", "bands"),
     [
         ("walk: {estimator: !Fbse {}}", ["coulomb [Nm]", "viscous [Nm s/rad]"], True),
-        ("walk: {estimator: !Fbse {friction: !RecursiveLeastSquares {}}}", ["coulomb [Nm]", "viscous [Nm s/rad]"], False),
+        (
+            "walk: {estimator: !Fbse {friction: !RecursiveLeastSquares {}}}",
+            ["coulomb [Nm]", "viscous [Nm s/rad]"],
+            False,
+        ),
         ("walk: {sed: 0}", ["parameter 1", "parameter 2"], False),
         ("not yaml: [", ["parameter 1", "parameter 2"], False),
     ],
@@ -445,7 +540,11 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
 def test_parameters_are_named_by_the_scenarios_friction_model(scenario, titles, bands):
     figure = figures.friction_parameters(estimated_log(scenario))
     assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == titles
-    found = [collection.get_paths()[0].vertices[:, 1] for axes in figure.axes for collection in axes.collections]
+    found = [
+        collection.get_paths()[0].vertices[:, 1]
+        for axes in figure.axes
+        for collection in axes.collections
+    ]
     assert bool(found) == bands
     if bands:
         assert (found[0].min(), found[0].max()) == pytest.approx((1.8, 2.2))
@@ -455,7 +554,9 @@ def test_nis_is_averaged_over_half_a_second():
     log = estimated_log()
     innovation = np.ones((SAMPLES, 4)) * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
     innovation[200:, 0] *= 2.0
-    figure = figures.friction_consistency(Log(log.channels | {"estimate/friction/innovation": innovation}, log.meta))
+    figure = figures.friction_consistency(
+        Log(log.channels | {"estimate/friction/innovation": innovation}, log.meta)
+    )
     time, nis = line(figure, 0, "NIS, left").T
     assert np.isnan(nis[time < 0.2]).all()
     assert nis[(time >= 0.2) & (time < 1.7)] == pytest.approx(1.0)
@@ -480,7 +581,11 @@ def test_status_is_drawn_by_sensor_and_estimator():
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert names[:5] == ["joints", "IMU", "left foot", "right foot", "attitude"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ok", "stuck"]
-    boxes = [collection.get_paths()[0].get_extents() for collection in figure.axes[0].collections if len(collection.get_paths()) == 1]
+    boxes = [
+        collection.get_paths()[0].get_extents()
+        for collection in figure.axes[0].collections
+        if len(collection.get_paths()) == 1
+    ]
     stuck = next(box for box in boxes if box.width < 1)
     assert (stuck.x0, stuck.x1) == pytest.approx((1.0, 1.5))
     assert stuck.y0 < names.index("IMU") < stuck.y1

@@ -26,7 +26,9 @@ from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.report.run import write_run_report
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install playwright)")
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
+)
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Containers run as root and without a graphics card.
@@ -85,14 +87,24 @@ def visit() -> Iterator[Callable[..., Visit]]:
             context = browser.new_context(viewport={"width": width, "height": 800}, offline=True)
             page, own = context.new_page(), path.as_uri()
             inside = (own, "data:", "blob:")
-            page.on("request", lambda request: result.requests.extend([request.url] * (not request.url.startswith(inside))))
+            page.on(
+                "request",
+                lambda request: result.requests.extend(
+                    [request.url] * (not request.url.startswith(inside))
+                ),
+            )
             page.on("websocket", lambda socket: result.requests.append(socket.url))
-            page.on("console", lambda message: result.errors.extend([message.text] * (message.type == "error")))
+            page.on(
+                "console",
+                lambda message: result.errors.extend([message.text] * (message.type == "error")),
+            )
             page.on("pageerror", lambda error: result.errors.append(str(error)))
             page.goto(own, wait_until="networkidle")
             for name, value in page.evaluate(_LOOK).items():
                 setattr(result, name, value)
-            result.screenshot = matplotlib.image.imread(io.BytesIO(page.screenshot()), format="png")[..., :3]
+            result.screenshot = matplotlib.image.imread(
+                io.BytesIO(page.screenshot()), format="png"
+            )[..., :3]
             context.close()
             return result
 
@@ -117,31 +129,57 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reports")
 
 
-def test_study_of_a_walk_is_a_lab_report(visit: Callable[..., Visit], run: Callable[..., Log], folder: Path):
+def test_study_of_a_walk_is_a_lab_report(
+    visit: Callable[..., Visit], run: Callable[..., Log], folder: Path
+):
     predictor = Predictor(load_scenario("paper_walk"), run("paper_walk", "duration=3"))
     whole = (predictor, compare(predictor))
     rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
     errors = {"train": model_error(predictor)}
-    steps = (StudyStep((), 4.2, 4.2, rolled, errors), StudyStep((FRICTION,), 1.01, 1.0, rolled, errors))
-    found = Study(steps, (made_diagnosis(), NOTHING), "the noise floor is reached", predictor.scenario)
+    steps = (
+        StudyStep((), 4.2, 4.2, rolled, errors),
+        StudyStep((FRICTION,), 1.01, 1.0, rolled, errors),
+    )
+    found = Study(
+        steps, (made_diagnosis(), NOTHING), "the noise floor is reached", predictor.scenario
+    )
     reports.write_study_report(folder / "study.html", found, whole, whole, INPUTS)
     check(visit, folder / "study.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 10)
 
 
-def test_reports_of_a_machine_without_legs_are_lab_reports(visit: Callable[..., Visit], folder: Path):
+def test_reports_of_a_machine_without_legs_are_lab_reports(
+    visit: Callable[..., Visit], folder: Path
+):
     """A revolute and a prismatic joint: no feet, no phases."""
     (folder / "crane.urdf").write_text(CRANE)
-    scenario = crane(folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5}))
+    scenario = crane(
+        folder, rail=CoulombFriction({"slide": 7.0}), bearing=ViscousFriction({"swing": 1.5})
+    )
     log = simulate(scenario).log
-    found = study(scenario, log, [CoulombFriction, ViscousFriction, TorqueBias], rollouts=False, tests={"another log": log})
+    found = study(
+        scenario,
+        log,
+        [CoulombFriction, ViscousFriction, TorqueBias],
+        rollouts=False,
+        tests={"another log": log},
+    )
     before, after = Predictor(scenario, log), Predictor(found.scenario, log)
     comparison = compare(before)
     reports.write_compare_report(folder / "compare.html", comparison, before, INPUTS)
     check(visit, folder / "compare.html", [SUMMARY, WHERE, HYGIENE, AGAIN], 3)
     assert "In 2 of 2 joints." in (folder / "compare.html").read_text(encoding="utf-8")
-    reports.write_diagnosis_report(folder / "diagnosis.html", found.diagnoses[0], comparison, before, INPUTS)
+    reports.write_diagnosis_report(
+        folder / "diagnosis.html", found.diagnoses[0], comparison, before, INPUTS
+    )
     check(visit, folder / "diagnosis.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 7)
-    reports.write_study_report(folder / "study.html", found, (before, comparison), (after, compare(after)), INPUTS, {"another log": log})
+    reports.write_study_report(
+        folder / "study.html",
+        found,
+        (before, comparison),
+        (after, compare(after)),
+        INPUTS,
+        {"another log": log},
+    )
     check(visit, folder / "study.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 9)
     text = (folder / "study.html").read_text(encoding="utf-8")
     assert "Another log (not fitted): as given [%]" in text
@@ -152,7 +190,12 @@ def test_reports_of_a_machine_without_legs_are_lab_reports(visit: Callable[..., 
 def test_report_of_a_run(visit: Callable[..., Visit], run: Callable[..., Log], folder: Path):
     log = run("paper_walk", "duration=3")
     write_run_report(folder / "run.html", log, run_metrics(log, 1.0), name="a_walk")
-    check(visit, folder / "run.html", [SUMMARY, "Motion", "Joints", "Foot forces", "Friction", "Sensors", "Scenario"], 10)
+    check(
+        visit,
+        folder / "run.html",
+        [SUMMARY, "Motion", "Joints", "Foot forces", "Friction", "Sensors", "Scenario"],
+        10,
+    )
 
 
 def test_recording_of_a_run_shows_the_robot(visit: Callable[..., Visit], folder: Path):
@@ -186,5 +229,7 @@ def test_what_is_wrong_with_a_page_is_seen(visit: Callable[..., Visit], tmp_path
 def test_a_wide_table_scrolls_by_itself(visit: Callable[..., Visit], tmp_path: Path):
     header = tuple(f"a long name of column {k}" for k in range(30))
     table = Table(header, (tuple(float(k) for k in range(30)),), "Wide.")
-    write_report(tmp_path / "report.html", Report("wide", True, "done", (Section("s", tables=(table,)),)))
+    write_report(
+        tmp_path / "report.html", Report("wide", True, "done", (Section("s", tables=(table,)),))
+    )
     assert visit(tmp_path / "report.html", 800).overflow <= 0

@@ -27,7 +27,11 @@ def walk() -> tuple[Scenario, Log]:
 
 
 def changed(log: Log, **channels: np.ndarray) -> Log:
-    return replace(log, channels=log.channels | {name.replace("__", "/"): values for name, values in channels.items()})
+    return replace(
+        log,
+        channels=log.channels
+        | {name.replace("__", "/"): values for name, values in channels.items()},
+    )
 
 
 def kinds(residual: Residual, kind: str) -> list[int]:
@@ -37,7 +41,9 @@ def kinds(residual: Residual, kind: str) -> list[int]:
 def test_nothing_but_noise_is_left_where_nothing_is_missing(walk: tuple[Scenario, Log]) -> None:
     white = WhitenedResidual(Predictor(*walk).residual)
     ratio = np.sqrt(white.sse / white.count)
-    assert np.all((0.85 < ratio) & (ratio < 1.2)), dict(zip((r.name for r in white.residual.rows), ratio.round(2), strict=True))
+    assert np.all((0.85 < ratio) & (ratio < 1.2)), dict(
+        zip((r.name for r in white.residual.rows), ratio.round(2), strict=True)
+    )
     # White: no block knows anything of the next.
     y = white.y[:, kinds(white.residual, "joint") + kinds(white.residual, "base")]
     correlation = (y[1:] * y[:-1]).sum(axis=0) / (y**2).sum(axis=0)
@@ -48,7 +54,9 @@ def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None
     scenario, log = walk
     floor = Predictor(scenario, log).residual.noise_floor
     sensors = scenario.sensors
-    forces = replace(scenario, sensors=replace(sensors, foot_force=replace(sensors.foot_force, noise=50.0)))
+    forces = replace(
+        scenario, sensors=replace(sensors, foot_force=replace(sensors.foot_force, noise=50.0))
+    )
     by_forces = Predictor(forces, log).residual.noise_floor / floor
     rows = Predictor(scenario, log).residual.row_index
     # Vertical force on the base: the accelerometer's noise is nothing beside that of eight pads.
@@ -57,7 +65,9 @@ def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None
     assert by_forces[rows["left_sole/angular_velocity_x"]] > 5
     assert by_forces[rows["left_sole/angular_velocity_z"]] == pytest.approx(1.0, abs=1e-9)
     # Eight pads of 50 N each, averaged over ten samples.
-    assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(50 * np.sqrt(8 / 10), rel=0.02)
+    assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(
+        50 * np.sqrt(8 / 10), rel=0.02
+    )
 
 
 def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:
@@ -83,7 +93,9 @@ def test_soles_give_way_as_the_contact_says(walk: tuple[Scenario, Log]) -> None:
     for foot in predictor.robot.description.sides:
         for name, share in largest.items():
             row = after.row_index[f"{foot}_sole/{name}"]
-            assert rms(after.value, after.known)[row] < share * rms(before.value, before.known)[row], name
+            assert (
+                rms(after.value, after.known)[row] < share * rms(before.value, before.known)[row]
+            ), name
 
 
 def test_a_force_at_the_end_of_the_range_is_not_known(walk: tuple[Scenario, Log]) -> None:
@@ -101,14 +113,19 @@ def test_gaps_are_left_out_and_touch_nothing_else(walk: tuple[Scenario, Log]) ->
     whole = Predictor(scenario, log).residual
     keep = np.ones(len(log.time), dtype=bool)
     keep[1234:1240] = False
-    torn = Predictor(scenario, replace(log, channels={name: values[keep] for name, values in log.channels.items()})).residual
+    torn = Predictor(
+        scenario,
+        replace(log, channels={name: values[keep] for name, values in log.channels.items()}),
+    ).residual
     lost = np.flatnonzero(~torn.known[:, 0])
     assert lost.tolist() == [123]
     others = np.delete(np.arange(len(whole.time)), [122, 123, 124])
     np.testing.assert_allclose(torn.value[others, :18], whole.value[others, :18], atol=1e-9)
 
 
-def test_a_sole_rests_only_while_its_foot_stands_before_and_after(walk: tuple[Scenario, Log]) -> None:
+def test_a_sole_rests_only_while_its_foot_stands_before_and_after(
+    walk: tuple[Scenario, Log],
+) -> None:
     """Right after touch-down and right before lift-off a foot may roll over an edge."""
     motion = Predictor(*walk).motion
     rows = [row.name for row in motion.residual.rows]
@@ -120,7 +137,9 @@ def test_a_sole_rests_only_while_its_foot_stands_before_and_after(walk: tuple[Sc
             assert motion.standing[around, foot].all()
 
 
-def test_a_long_log_is_computed_piece_by_piece(walk: tuple[Scenario, Log], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_log_is_computed_piece_by_piece(
+    walk: tuple[Scenario, Log], monkeypatch: pytest.MonkeyPatch
+) -> None:
     motion = Predictor(*walk).motion
     whole = motion.equation.residual(motion.steps)
     monkeypatch.setattr("fbse_drake.discrepancy.residual._MOST_INSTANTS", 700)
@@ -158,7 +177,16 @@ def test_intervals_cover_the_truth_also_where_errors_are_correlated() -> None:
         # Beside the white noise, an error that lasts for a fifth of a second.
         lasting = np.repeat(rng.normal(size=blocks // 20), 20)
         y = 0.7 * column + rng.normal(size=blocks) + lasting
-        residual = Residual([Row("joint", "joint", "Nm")], time, y[:, None], one > 0, one, 0 * one, one > 0, signals=None)
+        residual = Residual(
+            [Row("joint", "joint", "Nm")],
+            time,
+            y[:, None],
+            one > 0,
+            one,
+            0 * one,
+            one > 0,
+            signals=None,
+        )
         white = WhitenedResidual(residual)
         fit = white.fit([white.whiten_signature(Signature(np.array([0]), column[:, None, None]))])
         low, high = fit.interval()[0]
@@ -173,7 +201,14 @@ def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
     blocks = 1000
     one = np.ones((blocks, 1))
     residual = Residual(
-        [Row("joint", "joint", "Nm")], 0.01 * np.arange(blocks), rng.normal(size=(blocks, 1)), one > 0, one, 0 * one, one > 0, signals=None
+        [Row("joint", "joint", "Nm")],
+        0.01 * np.arange(blocks),
+        rng.normal(size=(blocks, 1)),
+        one > 0,
+        one,
+        0 * one,
+        one > 0,
+        signals=None,
     )
     white = WhitenedResidual(residual)
     fit = white.fit([Signature(np.array([0]), rng.normal(size=(blocks, 1, 20)))])
@@ -187,7 +222,11 @@ def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
         ("imu__linear_acceleration", lambda x: -x, "sign is reversed"),
         ("imu__linear_acceleration", lambda x: x[:, [2, 1, 0]], "frame is wrong"),
         ("imu__linear_acceleration", lambda x: x / 9.81, "gravity is missing"),
-        ("foot__left__pad_force", lambda x: -x, "foot/left: this foot pulls at the ground.*sign is reversed"),
+        (
+            "foot__left__pad_force",
+            lambda x: -x,
+            "foot/left: this foot pulls at the ground.*sign is reversed",
+        ),
         ("joint__torque_command", lambda x: -x, "sign is reversed"),
         ("joint__torque_command", lambda x: 1000 * x, "unit is wrong"),
         ("joint__position", np.rad2deg, "degrees"),
@@ -195,7 +234,9 @@ def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
         ("joint__velocity", np.rad2deg, "degrees per second"),
     ],
 )
-def test_a_log_that_does_not_fit_is_said_in_one_line(walk: tuple[Scenario, Log], channel: str, change: object, words: str) -> None:
+def test_a_log_that_does_not_fit_is_said_in_one_line(
+    walk: tuple[Scenario, Log], channel: str, change: object, words: str
+) -> None:
     scenario, log = walk
     wrong = changed(log, **{channel: change(log[channel.replace("__", "/")])})
     with pytest.raises(InputError, match=words) as error:
@@ -207,8 +248,15 @@ def test_a_log_that_does_not_fit_is_said_in_one_line(walk: tuple[Scenario, Log],
 def test_a_log_that_tells_nothing_is_said_in_one_line() -> None:
     scenario = load_scenario("leg_swing_gantry", overrides=["duration=1"])
     log = simulate(scenario).log
-    silent = replace(log, channels={name: values for name, values in log.channels.items() if name != "joint/torque_command"})
-    with pytest.raises(InputError, match=r"nothing to compare a model with, joint/torque_command is missing"):
+    silent = replace(
+        log,
+        channels={
+            name: values for name, values in log.channels.items() if name != "joint/torque_command"
+        },
+    )
+    with pytest.raises(
+        InputError, match=r"nothing to compare a model with, joint/torque_command is missing"
+    ):
         _ = Predictor(scenario, silent).residual
     recording = replace(scenario.recording, unused_rows=["*"])
     with pytest.raises(InputError, match="nothing to compare a model with"):
@@ -218,7 +266,10 @@ def test_a_log_that_tells_nothing_is_said_in_one_line() -> None:
 def test_feet_read_upside_down_or_sideways(walk: tuple[Scenario, Log]) -> None:
     scenario, log = walk
     feet = [f"foot__{side}__pad_force" for side in log.sides]
-    for change, words in ((lambda x: -x, "sign is reversed"), (lambda x: x[:, :, [2, 1, 0]], "frame is wrong")):
+    for change, words in (
+        (lambda x: -x, "sign is reversed"),
+        (lambda x: x[:, :, [2, 1, 0]], "frame is wrong"),
+    ):
         wrong = changed(log, **{name: change(log[name.replace("__", "/")]) for name in feet})
         with pytest.raises(InputError, match=words):
             check_sensors(Predictor(scenario, wrong).motion)
@@ -229,4 +280,7 @@ def test_a_good_log_passes_and_a_missing_channel_is_named(walk: tuple[Scenario, 
     check_sensors(Predictor(scenario, log).motion)
     for name in ("imu/angular_velocity", "foot/right/pad_force"):
         with pytest.raises(InputError, match=name):
-            Predictor(scenario, replace(log, channels={k: v for k, v in log.channels.items() if k != name}))
+            Predictor(
+                scenario,
+                replace(log, channels={k: v for k, v in log.channels.items() if k != name}),
+            )

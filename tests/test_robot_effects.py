@@ -40,7 +40,9 @@ from fbse_drake.scenario import RobotConfig, build_robot
 WEIGHT = 87.0 * 9.81
 TICK = 1e-3
 POSTURE = np.tile([0.1, 0.05, -0.4, 0.8, -0.3, -0.05], 2)
-POSE = RigidTransform(Quaternion(Rotation.from_rotvec([0.2, -0.3, 0.5]).as_quat(scalar_first=True)), [1.0, 2.0, 0.7])
+POSE = RigidTransform(
+    Quaternion(Rotation.from_rotvec([0.2, -0.3, 0.5]).as_quat(scalar_first=True)), [1.0, 2.0, 0.7]
+)
 # More than one of each kind, where a kind has more than one value.
 SENSOR_EFFECTS = [
     FootForceGain(gain={"left": 0.1, "right": -0.05}),
@@ -53,7 +55,9 @@ SENSOR_EFFECTS = [
     AccelerometerBias(0.1, 0.2, -0.3),
     GyroscopeBias(0.01, -0.02, 0.03),
     EncoderOffset({"left_knee_pitch": 0.003}),
-    TransmissionElasticity({"all": 2e-5, "right_hip_roll": 5e-5}, {"all": 0.005, "right_hip_roll": 0.008}),
+    TransmissionElasticity(
+        {"all": 2e-5, "right_hip_roll": 5e-5}, {"all": 0.005, "right_hip_roll": 0.008}
+    ),
 ]
 
 
@@ -68,7 +72,9 @@ def simulated(name: str, *overrides: str, effects: Sequence[Effect] = ()) -> Log
 
 
 def robot_with(*effects: Effect) -> Robot:
-    return build_robot(RobotConfig(effects={f"added_{k}": effect for k, effect in enumerate(effects)}))
+    return build_robot(
+        RobotConfig(effects={f"added_{k}": effect for k, effect in enumerate(effects)})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -82,44 +88,71 @@ def mass_matrix(robot: Robot) -> np.ndarray:
     return robot.plant.CalcMassMatrix(context)
 
 
-@pytest.mark.parametrize(("body", "mass"), [("trunk", 10.0), ("trunk", -8.0), ("left_foot", 1.5), ("right_shank", -0.2)])
+@pytest.mark.parametrize(
+    ("body", "mass"), [("trunk", 10.0), ("trunk", -8.0), ("left_foot", 1.5), ("right_shank", -0.2)]
+)
 def test_mass_on_a_body_moves_with_its_centre_of_mass(plain: Robot, body: str, mass: float):
     changed = robot_with(BodyMass({body: mass}))
     plant, context = plain.plant, plain.plant.CreateDefaultContext()
     plain.set_state(context, POSTURE, np.zeros(12), POSE)
     frame, com = plain.body(body).body_frame(), plain.body(body).default_com()
     world = plant.world_frame()
-    J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, frame, com, world, world)
-    np.testing.assert_allclose(mass_matrix(changed) - mass_matrix(plain), mass * J.T @ J, atol=1e-10)
-    assert changed.plant.CalcTotalMass(changed.plant.CreateDefaultContext()) == pytest.approx(87.0 + mass)
+    J = plant.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, frame, com, world, world
+    )
+    np.testing.assert_allclose(
+        mass_matrix(changed) - mass_matrix(plain), mass * J.T @ J, atol=1e-10
+    )
+    assert changed.plant.CalcTotalMass(changed.plant.CreateDefaultContext()) == pytest.approx(
+        87.0 + mass
+    )
 
 
 def test_reflected_inertia_adds_to_what_is_configured():
     effect = ReflectedInertia({"all": 0.1, "left_hip_yaw": 0.4})
     changed = build_robot(
-        RobotConfig(rotor_inertia={"knee_pitch": 0.3}, effects={"rotors": effect, "more": ReflectedInertia({"knee_pitch": 1.0})})
+        RobotConfig(
+            rotor_inertia={"knee_pitch": 0.3},
+            effects={"rotors": effect, "more": ReflectedInertia({"knee_pitch": 1.0})},
+        )
     )
     diagonal = np.zeros(18)
     diagonal[changed.velocity_index] = [0.4, 0.1, 0.1, 1.4, 0.1, 0.1, 0.1, 0.1, 0.1, 1.4, 0.1, 0.1]
-    np.testing.assert_allclose(mass_matrix(changed) - mass_matrix(robot_with()), np.diag(diagonal), atol=1e-12)
+    np.testing.assert_allclose(
+        mass_matrix(changed) - mass_matrix(robot_with()), np.diag(diagonal), atol=1e-12
+    )
 
 
 def central_inertia(robot: Robot, body: str) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass of a body with its point masses, centre of mass, and rotational inertia about it."""
     plant, frame = robot.plant, robot.body(body).body_frame()
-    bodies = [index for index in plant.GetBodyIndices(robot.base.model_instance()) if plant.get_body(index).name().startswith(body)]
+    bodies = [
+        index
+        for index in plant.GetBodyIndices(robot.base.model_instance())
+        if plant.get_body(index).name().startswith(body)
+    ]
     inertia = plant.CalcSpatialInertia(plant.CreateDefaultContext(), frame, bodies)
-    return inertia.get_mass(), inertia.get_com(), inertia.Shift(inertia.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    return (
+        inertia.get_mass(),
+        inertia.get_com(),
+        inertia.Shift(inertia.get_com()).CalcRotationalInertia().CopyToFullMatrix3(),
+    )
 
 
 def test_moved_centre_of_mass_leaves_mass_and_central_inertia(plain: Robot):
     moved = np.array([0.03, -0.01, 0.02])
     changed = robot_with(BodyCentreOfMass(*({"trunk": value} for value in moved)))
-    (mass, com, inertia), (old_mass, old_com, old_inertia) = central_inertia(changed, "trunk"), central_inertia(plain, "trunk")
+    (mass, com, inertia), (old_mass, old_com, old_inertia) = (
+        central_inertia(changed, "trunk"),
+        central_inertia(plain, "trunk"),
+    )
     assert mass == pytest.approx(old_mass)
     np.testing.assert_allclose(com, old_com + moved, atol=1e-12)
     np.testing.assert_allclose(inertia, old_inertia, atol=1e-12)
-    whole = [robot.plant.CalcCenterOfMassPositionInWorld(robot.plant.CreateDefaultContext()) for robot in (plain, changed)]
+    whole = [
+        robot.plant.CalcCenterOfMassPositionInWorld(robot.plant.CreateDefaultContext())
+        for robot in (plain, changed)
+    ]
     np.testing.assert_allclose(whole[1] - whole[0], 50 / 87 * moved, atol=1e-12)
 
 
@@ -128,14 +161,22 @@ def test_payload_is_a_mass_and_a_moved_centre_of_mass(plain: Robot):
     place, mass = np.array([0.1, 0.05, 0.3]), 1e-3
     payload, _ = make_robot("biped", point_masses=[PointMass("trunk", mass, place)])
     shift = mass / 50.0 * (place - plain.body("trunk").default_com())
-    both = robot_with(BodyMass({"trunk": mass}), BodyCentreOfMass(*({"trunk": value} for value in shift)))
-    (_, com, _), (_, payload_com, _) = central_inertia(both, "trunk"), central_inertia(payload, "trunk")
+    both = robot_with(
+        BodyMass({"trunk": mass}), BodyCentreOfMass(*({"trunk": value} for value in shift))
+    )
+    (_, com, _), (_, payload_com, _) = (
+        central_inertia(both, "trunk"),
+        central_inertia(payload, "trunk"),
+    )
     np.testing.assert_allclose(com, payload_com, atol=1e-9)
     assert np.abs(payload_com - central_inertia(plain, "trunk")[1]).max() > 1e-6
 
 
 def test_point_masses_are_no_bodies_of_their_own(plain: Robot):
-    assert robot_with(BodyMass({"trunk": 1.0}), BodyCentreOfMass(x={"left_foot": 0.01})).body_names == plain.body_names
+    assert (
+        robot_with(BodyMass({"trunk": 1.0}), BodyCentreOfMass(x={"left_foot": 0.01})).body_names
+        == plain.body_names
+    )
     assert "left_thigh" in plain.body_names
     assert "imu" not in plain.body_names
 
@@ -143,10 +184,16 @@ def test_point_masses_are_no_bodies_of_their_own(plain: Robot):
 @pytest.mark.parametrize(
     ("effect", "message"),
     [
-        (BodyMass({"torso": 1.0}), r"effects\.added_0: torso: the model has no body of this name with a mass \(there are: trunk, left_hip"),
+        (
+            BodyMass({"torso": 1.0}),
+            r"effects\.added_0: torso: the model has no body of this name with a mass \(there are: trunk, left_hip",
+        ),
         (BodyMass({"trunk": -50.0}), r"trunk: expected a mass > 0, found 0 kg"),
         (ReflectedInertia({"elbow": 1.0}), r"effects\.added_0\.inertia\.elbow: unknown joint"),
-        (ReflectedInertia({"all": -1.0}), r"effects\.added_0\.inertia: expected values in \[0, inf\] kg m\^2"),
+        (
+            ReflectedInertia({"all": -1.0}),
+            r"effects\.added_0\.inertia: expected values in \[0, inf\] kg m\^2",
+        ),
     ],
 )
 def test_impossible_inertia_is_refused(effect: Effect, message: str):
@@ -155,7 +202,10 @@ def test_impossible_inertia_is_refused(effect: Effect, message: str):
 
 
 def test_inertia_that_no_body_has_is_refused():
-    with pytest.raises(InputError, match="trunk: expected the inertia of a body, found one that no distribution of mass has"):
+    with pytest.raises(
+        InputError,
+        match="trunk: expected the inertia of a body, found one that no distribution of mass has",
+    ):
         make_robot("biped", point_masses=[PointMass("trunk", -10.0, np.array([1.0, 0.0, 0.0]))])
 
 
@@ -163,27 +213,40 @@ def lift(robot: Robot, body: str, q: np.ndarray) -> np.ndarray:
     """How fast the centre of mass of a body rises per rate of each joint, with the base level and at rest, (n,) [m]."""
     plant, context = robot.plant, robot.plant.CreateDefaultContext()
     robot.set_state(context, q, np.zeros(12), RigidTransform())
-    frame, com, world = robot.body(body).body_frame(), robot.body(body).default_com(), plant.world_frame()
-    J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, frame, com, world, world)
+    frame, com, world = (
+        robot.body(body).body_frame(),
+        robot.body(body).default_com(),
+        plant.world_frame(),
+    )
+    J = plant.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, frame, com, world, world
+    )
     return J[2, robot.velocity_index]
 
 
 def test_feedforward_of_a_model_bears_its_masses(plain: Robot):
     base = scenario("leg_swing_gantry", "duration=0.1", noise=False)
-    loaded = dataclasses.replace(base, model=dataclasses.replace(base.robot, effects={"mass": BodyMass({"left_shank": 0.4})}))
+    loaded = dataclasses.replace(
+        base, model=dataclasses.replace(base.robot, effects={"mass": BodyMass({"left_shank": 0.4})})
+    )
     first, second = (build_station(each).reference for each in (base, loaded))
     # At rest: the torque that holds the weight of the mass.
     weight = 0.4 * 9.81 * lift(plain, "left_shank", first.joint_position[0])
-    np.testing.assert_allclose(second.feedforward_torque[0] - first.feedforward_torque[0], weight, atol=1e-9)
+    np.testing.assert_allclose(
+        second.feedforward_torque[0] - first.feedforward_torque[0], weight, atol=1e-9
+    )
     assert np.abs(weight).max() > 0.1
 
 
 def test_estimators_of_a_model_bear_its_masses(plain: Robot):
     base = scenario("paper_walk_fbse", "duration=0.1", noise=False)
-    loaded = dataclasses.replace(base, model=dataclasses.replace(base.robot, effects={"mass": BodyMass({"left_thigh": 2.0})}))
+    loaded = dataclasses.replace(
+        base, model=dataclasses.replace(base.robot, effects={"mass": BodyMass({"left_thigh": 2.0})})
+    )
     log = simulate(loaded).log
     in_station, replayed, unloaded = (
-        each["estimate/joint/link_torque"] for each in (log, estimate(loaded, log).log, estimate(base, log).log)
+        each["estimate/joint/link_torque"]
+        for each in (log, estimate(loaded, log).log, estimate(base, log).log)
     )
     np.testing.assert_allclose(replayed, in_station, atol=1e-9)
     weight = 2.0 * 9.81 * lift(plain, "left_thigh", log["truth/joint/position"][-1])
@@ -193,11 +256,16 @@ def test_estimators_of_a_model_bear_its_masses(plain: Robot):
 
 def test_simulated_robot_has_its_extra_mass():
     log = simulated(
-        "squat", "duration=0.3", "reference.amplitude=0", effects=[BodyMass({"trunk": 8.7}), BodyCentreOfMass(x={"trunk": 0.02})]
+        "squat",
+        "duration=0.3",
+        "reference.amplitude=0",
+        effects=[BodyMass({"trunk": 8.7}), BodyCentreOfMass(x={"trunk": 0.02})],
     )
     force = sum(log[f"foot/{side}/pad_force"][101:, :, 2].sum(axis=1) for side in log.sides)
     gained = log["truth/com/velocity"][-1, 2] - log["truth/com/velocity"][100, 2]
-    assert force.sum() * TICK == pytest.approx((87.0 + 8.7) * (gained + 9.81 * (log.time[-1] - log.time[100])), rel=1e-4)
+    assert force.sum() * TICK == pytest.approx(
+        (87.0 + 8.7) * (gained + 9.81 * (log.time[-1] - log.time[100])), rel=1e-4
+    )
 
 
 def true_signals(log: Log) -> SensorSignals:
@@ -228,15 +296,21 @@ def test_simulated_readings_are_those_of_the_whole_log(plain: Robot, name: str):
 def test_simulated_imu_reads_bias_and_turned_axes():
     angle, acceleration, rate = [0.02, -0.03, 0.1], [0.1, 0.2, -0.3], [0.01, -0.02, 0.03]
     effects = [ImuMisalignment(*angle), AccelerometerBias(*acceleration), GyroscopeBias(*rate)]
-    station = build_station(with_effects(scenario("paper_walk", "duration=0.2", noise=False), *effects))
+    station = build_station(
+        with_effects(scenario("paper_walk", "duration=0.2", noise=False), *effects)
+    )
     simulator = Simulator(station)
     context, imu = simulator.get_context(), station.GetSubsystemByName("imu")
     turn = Rotation.from_rotvec(angle).inv()
     for time in (0.05, 0.1, 0.2):
         simulator.AdvanceTo(time)
         true = imu.get_output_port().Eval(imu.GetMyContextFromRoot(context))
-        expected = np.concatenate([turn.apply(true[:3]) + acceleration, turn.apply(true[3:]) + rate])
-        np.testing.assert_allclose(station.GetOutputPort("measured_imu").Eval(context), expected, atol=1e-12)
+        expected = np.concatenate(
+            [turn.apply(true[:3]) + acceleration, turn.apply(true[3:]) + rate]
+        )
+        np.testing.assert_allclose(
+            station.GetOutputPort("measured_imu").Eval(context), expected, atol=1e-12
+        )
         assert np.linalg.norm(true[3:]) > 1e-4
 
 
@@ -244,9 +318,15 @@ def test_misalignment_is_that_of_the_imu_configuration():
     angle = [0.02, -0.03, 0.1]
     base = scenario("paper_walk", "duration=0.05", noise=False)
     base = dataclasses.replace(
-        base, sensors=dataclasses.replace(base.sensors, imu=dataclasses.replace(base.sensors.imu, misalignment=angle))
+        base,
+        sensors=dataclasses.replace(
+            base.sensors, imu=dataclasses.replace(base.sensors.imu, misalignment=angle)
+        ),
     )
-    configured, effect = simulate(base).log, simulated("paper_walk", "duration=0.05", effects=[ImuMisalignment(*angle)])
+    configured, effect = (
+        simulate(base).log,
+        simulated("paper_walk", "duration=0.05", effects=[ImuMisalignment(*angle)]),
+    )
     for channel in ("imu/linear_acceleration", "imu/angular_velocity"):
         np.testing.assert_allclose(effect[channel], configured[channel], atol=1e-12)
 
@@ -257,13 +337,20 @@ def test_foot_force_errors(plain: Robot):
     signals = SensorSignals(none, none, np.zeros((5, 3)), np.zeros((5, 3)), force, none)
 
     def read(effect: SensorEffect) -> np.ndarray:
-        return effect.distorted(signals, effect.resolve(plain.description), plain, TICK).pad_force - force
+        return (
+            effect.distorted(signals, effect.resolve(plain.description), plain, TICK).pad_force
+            - force
+        )
 
     gained = read(FootForceGain({"left": 0.1}))
     np.testing.assert_allclose(gained[:, :4], 0.1 * force[:, :4])
     assert np.all(gained[:, 4:] == 0)
     biased = read(FootForceBias(y={"right": 2.0}, z={"all": -1.0}))
-    np.testing.assert_allclose(biased, np.broadcast_to(np.repeat([[0, 0, -1], [0, 2, -1]], 4, axis=0), force.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        biased,
+        np.broadcast_to(np.repeat([[0, 0, -1], [0, 2, -1]], 4, axis=0), force.shape),
+        atol=1e-12,
+    )
 
 
 def wrenches(robot: Robot, force: np.ndarray) -> np.ndarray:
@@ -271,7 +358,11 @@ def wrenches(robot: Robot, force: np.ndarray) -> np.ndarray:
     places = [robot.pad_positions(side) for side in robot.description.sides]
     parts = np.split(force, np.cumsum([len(p) for p in places])[:-1], axis=-2)
     return np.stack(
-        [np.concatenate([np.cross(p, f).sum(axis=-2), f.sum(axis=-2)], axis=-1) for p, f in zip(places, parts, strict=True)], axis=-2
+        [
+            np.concatenate([np.cross(p, f).sum(axis=-2), f.sum(axis=-2)], axis=-1)
+            for p, f in zip(places, parts, strict=True)
+        ],
+        axis=-2,
     )
 
 
@@ -287,16 +378,25 @@ def test_foot_wrench_errors(description: str):
     true = wrenches(robot, force)
 
     def read(effect: SensorEffect) -> np.ndarray:
-        return wrenches(robot, effect.distorted(signals, effect.resolve(robot.description), robot, TICK).pad_force)
+        return wrenches(
+            robot,
+            effect.distorted(signals, effect.resolve(robot.description), robot, TICK).pad_force,
+        )
 
     moment = read(FootMomentBias(x={first: 2.0}, z={"all": -1.0})) - true
-    np.testing.assert_allclose(moment, np.broadcast_to([[2, 0, -1, 0, 0, 0], [0, 0, -1, 0, 0, 0]], moment.shape), atol=1e-10)
+    np.testing.assert_allclose(
+        moment,
+        np.broadcast_to([[2, 0, -1, 0, 0, 0], [0, 0, -1, 0, 0, 0]], moment.shape),
+        atol=1e-10,
+    )
     angle = np.array([0.1, -0.2, 0.3])
     turned = read(FootForceMisalignment(*({second: value} for value in angle)))
     R_FS = Rotation.from_rotvec(angle)
     np.testing.assert_allclose(turned[:, 0], true[:, 0], atol=1e-9)
     for part in (slice(0, 3), slice(3, 6)):
-        np.testing.assert_allclose(turned[:, 1, part], R_FS.inv().apply(true[:, 1, part]), atol=1e-9)
+        np.testing.assert_allclose(
+            turned[:, 1, part], R_FS.inv().apply(true[:, 1, part]), atol=1e-9
+        )
     # A low-pass of first order that starts with the first reading.
     lag = FootForceLag({first: 0.03})
     late, stays = read(lag), 0.03 / (0.03 + TICK)
@@ -308,33 +408,52 @@ def test_foot_wrench_errors(description: str):
     # And what was lost in it is had back.
     resolved = lag.resolve(robot.description)
     lagged = lag.distorted(signals, resolved, robot, TICK)
-    undone = lag.undone(lagged, lag.memory_over_time(lagged, resolved, robot, TICK), resolved, robot, TICK)
+    undone = lag.undone(
+        lagged, lag.memory_over_time(lagged, resolved, robot, TICK), resolved, robot, TICK
+    )
     np.testing.assert_allclose(wrenches(robot, undone.pad_force), true, atol=1e-8)
     if description == "strider":
         offset = read(FootForceBias(x={first: 5.0}, z={second: -7.0})) - true
-        np.testing.assert_allclose(offset, np.broadcast_to([[0, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, -7]], offset.shape), atol=1e-10)
+        np.testing.assert_allclose(
+            offset,
+            np.broadcast_to([[0, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, -7]], offset.shape),
+            atol=1e-10,
+        )
 
 
 def test_elastic_transmission_follows_the_command_as_a_low_pass():
     compliance, time_constant = 5e-5, 0.008
     log = simulated(
-        "leg_swing_gantry", "duration=0.5", effects=[TransmissionElasticity({"knee_pitch": compliance}, {"all": time_constant})]
+        "leg_swing_gantry",
+        "duration=0.5",
+        effects=[TransmissionElasticity({"knee_pitch": compliance}, {"all": time_constant})],
     )
     knee, other = 3, 2
     command = log["joint/torque_command"][:, knee]
     keep = np.exp(-TICK / time_constant)
     twist = lfilter([0.0, 1.0 - keep], [1.0, -keep], compliance * command)
-    np.testing.assert_allclose(log["joint/position"][:, knee] - log["truth/joint/position"][:, knee], twist, atol=1e-13)
+    np.testing.assert_allclose(
+        log["joint/position"][:, knee] - log["truth/joint/position"][:, knee], twist, atol=1e-13
+    )
     assert np.abs(twist).max() > 1e-4
     # The exact velocity at the end of each step is the limit of the twist's slope.
     rate = (log["joint/velocity"] - log["truth/joint/velocity"])[1:, knee]
-    np.testing.assert_allclose(rate, (compliance * command[:-1] - twist[1:]) / time_constant, atol=1e-12)
-    np.testing.assert_array_equal(log["joint/position"][:, other], log["truth/joint/position"][:, other])
+    np.testing.assert_allclose(
+        rate, (compliance * command[:-1] - twist[1:]) / time_constant, atol=1e-12
+    )
+    np.testing.assert_array_equal(
+        log["joint/position"][:, other], log["truth/joint/position"][:, other]
+    )
 
 
 def test_unknown_foot_is_refused():
-    with pytest.raises(InputError, match=r"robot\.effects\.added_0\.gain\.middle: unknown foot \(allowed: all, left, right\)"):
-        build_station(with_effects(scenario("squat", "duration=0.1"), FootForceGain({"middle": 0.1})))
+    with pytest.raises(
+        InputError,
+        match=r"robot\.effects\.added_0\.gain\.middle: unknown foot \(allowed: all, left, right\)",
+    ):
+        build_station(
+            with_effects(scenario("squat", "duration=0.1"), FootForceGain({"middle": 0.1}))
+        )
 
 
 def test_forces_and_imu_on_a_slope_know_the_tilted_gravity():
@@ -346,7 +465,9 @@ def test_forces_and_imu_on_a_slope_know_the_tilted_gravity():
     force = sum(log[f"foot/{side}/pad_force"][steps].sum(axis=1) for side in log.sides)
     gained = np.diff(log["truth/com/velocity"][[100, -1]], axis=0)[0]
     # Forces are in sole frames, which are parallel to the ground to a milliradian.
-    np.testing.assert_allclose(force.sum(axis=0) * TICK / 87.0, gained + upward * time, atol=1e-3 * 9.81 * time)
+    np.testing.assert_allclose(
+        force.sum(axis=0) * TICK / 87.0, gained + upward * time, atol=1e-3 * 9.81 * time
+    )
     orientation = Rotation.from_quat(log["truth/base/orientation"], scalar_first=True)
     lever = np.cross(log["truth/base/angular_velocity"], orientation.apply([0.01, -0.01, 0.02]))
     gained = np.diff((log["truth/base/velocity"] + lever)[[100, -1]], axis=0)[0]
@@ -356,7 +477,9 @@ def test_forces_and_imu_on_a_slope_know_the_tilted_gravity():
 
 def test_a_sole_on_a_slope_is_predicted_to_be_turned(plain: Robot):
     time = TICK * np.arange(3)
-    rotation, displacement = GroundSlope.sole_motion(np.zeros((3, 4, 3)), plain.pad_positions("left"), time)
+    rotation, displacement = GroundSlope.sole_motion(
+        np.zeros((3, 4, 3)), plain.pad_positions("left"), time
+    )
     turn = Rotation.from_rotvec(np.einsum("pni,p->ni", rotation, [0.04, -0.03]))
     np.testing.assert_allclose(turn.as_rotvec(), np.tile([0.04, -0.03, 0.0], (3, 1)))
     assert np.all(displacement == 0)
@@ -366,13 +489,19 @@ def sole_motion(robot: Robot, log: Log, side: str) -> tuple[np.ndarray, np.ndarr
     """True rotation vector and displacement of a sole, against the world."""
     context, rotation = robot.plant.CreateDefaultContext(), np.empty((len(log.time), 3))
     for k in range(len(log.time)):
-        X_WB = RigidTransform(Quaternion(log["truth/base/orientation"][k]), log["truth/base/position"][k])
+        X_WB = RigidTransform(
+            Quaternion(log["truth/base/orientation"][k]), log["truth/base/position"][k]
+        )
         robot.set_state(context, log["truth/joint/position"][k], np.zeros(12), X_WB)
-        rotation[k] = Rotation.from_matrix(robot.sole(side).CalcPoseInWorld(context).rotation().matrix()).as_rotvec()
+        rotation[k] = Rotation.from_matrix(
+            robot.sole(side).CalcPoseInWorld(context).rotation().matrix()
+        ).as_rotvec()
     return rotation, log[f"truth/foot/{side}/position"]
 
 
-def recovered(effect: type[ContactEffect], robot: Robot, log: Log, side: str, rows: slice, axes: Sequence[int]) -> tuple[float, float]:
+def recovered(
+    effect: type[ContactEffect], robot: Robot, log: Log, side: str, rows: slice, axes: Sequence[int]
+) -> tuple[float, float]:
     """Parameter with which the predicted motion of a standing sole fits the true one best, and the share of that motion which it explains.
 
     Args:
@@ -381,7 +510,9 @@ def recovered(effect: type[ContactEffect], robot: Robot, log: Log, side: str, ro
     predicted, true = [
         np.concatenate(motion, axis=-1)[..., rows, :][..., axes]
         for motion in (
-            effect.sole_motion(log[f"truth/foot/{side}/pad_force"], robot.pad_positions(side), log.time),
+            effect.sole_motion(
+                log[f"truth/foot/{side}/pad_force"], robot.pad_positions(side), log.time
+            ),
             sole_motion(robot, log, side),
         )
     ]
@@ -396,7 +527,10 @@ SWAY = ("sway", "duration=2", "reference.ramp=1", "reference.frequency=0.4")
 
 
 def test_contact_with_effects():
-    ground, plant = Ground(stiffness=5e5, dissipation=80.0), MultibodyPlantConfig(stiction_tolerance=2e-4)
+    ground, plant = (
+        Ground(stiffness=5e5, dissipation=80.0),
+        MultibodyPlantConfig(stiction_tolerance=2e-4),
+    )
     soft, same = GroundCompliance(3e-6).contact(ground, plant, 0.9)
     assert 1.0 / soft.stiffness == pytest.approx(1.0 / 5e5 + 3e-6)
     # Depth times dissipation stays.
@@ -419,8 +553,14 @@ def test_compliant_ground_gives_way_as_predicted(plain: Robot):
 
 
 def test_standing_robot_sinks_into_compliant_ground_by_its_weight():
-    logs = [simulated("squat", "duration=0.5", "reference.amplitude=0", effects=effects) for effects in ([], [GroundCompliance(5e-6)])]
-    firm, soft = (sum(log[f"truth/foot/{side}/position"][-100:, 2].mean() for side in log.sides) / 2 for log in logs)
+    logs = [
+        simulated("squat", "duration=0.5", "reference.amplitude=0", effects=effects)
+        for effects in ([], [GroundCompliance(5e-6)])
+    ]
+    firm, soft = (
+        sum(log[f"truth/foot/{side}/position"][-100:, 2].mean() for side in log.sides) / 2
+        for log in logs
+    )
     assert firm - soft == pytest.approx(5e-6 * WEIGHT / 8, rel=0.02)
 
 
@@ -435,14 +575,24 @@ def test_soles_creep_as_predicted(plain: Robot):
 
 def test_a_foot_in_the_air_does_not_creep_out_of_all_numbers(plain: Robot):
     force = 0.5 * np.random.default_rng(0).normal(size=(100, 4, 3))
-    rotation, displacement = FootCreep.sole_motion(force, plain.pad_positions("left"), TICK * np.arange(100))
+    rotation, displacement = FootCreep.sole_motion(
+        force, plain.pad_positions("left"), TICK * np.arange(100)
+    )
     assert np.all(np.isfinite(rotation))
     assert np.abs(displacement).max() < 0.1
 
 
 def test_creep_needs_a_solver_that_creeps():
-    with pytest.raises(InputError, match=r"robot: plant\.discrete_contact_approximation: FootCreep needs lagged or similar, found sap"):
-        build_station(with_effects(scenario("squat", "duration=0.1", "plant.discrete_contact_approximation=sap"), FootCreep(0.01)))
+    with pytest.raises(
+        InputError,
+        match=r"robot: plant\.discrete_contact_approximation: FootCreep needs lagged or similar, found sap",
+    ):
+        build_station(
+            with_effects(
+                scenario("squat", "duration=0.1", "plant.discrete_contact_approximation=sap"),
+                FootCreep(0.01),
+            )
+        )
 
 
 def test_effects_of_size_zero_change_no_bit():
@@ -471,7 +621,10 @@ def test_gravity_stays_upright_in_a_gantry():
     config = RobotConfig(gantry_height=1.0)
     slope = scenario("squat").ground
     tilted = dataclasses.replace(slope, slope=[0.1, 0.0])
-    robots = [build_robot(each, plant=MultibodyPlantConfig(time_step=TICK), ground=tilted) for each in (config, RobotConfig())]
+    robots = [
+        build_robot(each, plant=MultibodyPlantConfig(time_step=TICK), ground=tilted)
+        for each in (config, RobotConfig())
+    ]
     gravity = [robot.plant.gravity_field().gravity_vector() for robot in robots]
     np.testing.assert_array_equal(gravity[0], [0.0, 0.0, -9.81])
     np.testing.assert_allclose(gravity[1], [0.0, -9.81 * np.sin(0.1), -9.81 * np.cos(0.1)])

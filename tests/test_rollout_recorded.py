@@ -24,14 +24,18 @@ MASS, LENGTH, INERTIA, G = 0.49, 0.1, 1.5e-4, 9.81
 KP, KD = 8.0, 0.1
 
 
-def pendulum(model: dict[str, Effect], robot: dict[str, Effect] | None = None, kp: float = KP, gain: str = "") -> Scenario:
+def pendulum(
+    model: dict[str, Effect], robot: dict[str, Effect] | None = None, kp: float = KP, gain: str = ""
+) -> Scenario:
     """A pendulum with a position loop and a recorded reference, or (with effects of a robot) one that swings slowly."""
     return Scenario(
         duration=4.0,
         robot=RobotConfig("pendulum", effects=robot or {}),
         model=RobotConfig("pendulum", effects=model),
         control=PositionLoopConfig(kp={"servo": kp}, kd={"servo": kp / KP * KD}, feedforward=False),
-        reference=Recorded(gain) if robot is None else JointSines(amplitude={"servo": 0.5}, frequency={"servo": 0.5}, ramp=0.5),
+        reference=Recorded(gain)
+        if robot is None
+        else JointSines(amplitude={"servo": 0.5}, frequency={"servo": 0.5}, ramp=0.5),
     )
 
 
@@ -41,8 +45,15 @@ def recording(robot: dict[str, Effect], kp: float = KP) -> Log:
 
 def by_hand(time: np.ndarray, position: np.ndarray, reference: float, **more: np.ndarray) -> Log:
     """A recording of one joint that was made up: (N,) each."""
-    channels = {"joint/position": position, "reference/joint/position": np.full(len(time), reference), **more}
-    return Log({"time": time} | {name: values[:, None] for name, values in channels.items()}, {"joints": ["servo"], "period": 0.01})
+    channels = {
+        "joint/position": position,
+        "reference/joint/position": np.full(len(time), reference),
+        **more,
+    }
+    return Log(
+        {"time": time} | {name: values[:, None] for name, values in channels.items()},
+        {"joints": ["servo"], "period": 0.01},
+    )
 
 
 def worst(error: RolloutError | None) -> float:
@@ -51,7 +62,10 @@ def worst(error: RolloutError | None) -> float:
     return float(np.abs(error.position_error).max())
 
 
-TRUE = {"friction": CoulombFriction(coulomb={"servo": 0.08}), "motor": DcMotor(kt={"servo": 0.35}, resistance={"servo": 3.4})}
+TRUE = {
+    "friction": CoulombFriction(coulomb={"servo": 0.08}),
+    "motor": DcMotor(kt={"servo": 0.35}, resistance={"servo": 3.4}),
+}
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +87,13 @@ def test_a_missing_friction_costs_its_torque_over_the_stiffness(log: Log):
     moving = np.abs(log["joint/velocity"][:, 0]) > 0.2
     late = np.abs(error.position_error[moving, 0])
     q = log["joint/position"][moving, 0]
-    np.testing.assert_allclose(np.median(late), np.median(0.08 / (KP + MASS * G * LENGTH * np.cos(q))), rtol=0.05)
+    np.testing.assert_allclose(
+        np.median(late), np.median(0.08 / (KP + MASS * G * LENGTH * np.cos(q))), rtol=0.05
+    )
     # In the direction of the motion: the model goes ahead.
-    assert np.all(np.sign(error.position_error[moving, 0]) == np.sign(log["joint/velocity"][moving, 0]))
+    assert np.all(
+        np.sign(error.position_error[moving, 0]) == np.sign(log["joint/velocity"][moving, 0])
+    )
 
 
 def test_summaries_are_of_the_error_over_time(log: Log):
@@ -83,23 +101,32 @@ def test_summaries_are_of_the_error_over_time(log: Log):
     e = error.position_error[:, 0]
     assert error.position["servo"] == pytest.approx(np.sqrt(np.mean(e**2)))
     assert error.mean_absolute_position["servo"] == pytest.approx(np.abs(e).mean())
-    assert error.relative_position["servo"] == pytest.approx(np.linalg.norm(e) / np.linalg.norm(log["joint/position"]))
+    assert error.relative_position["servo"] == pytest.approx(
+        np.linalg.norm(e) / np.linalg.norm(log["joint/position"])
+    )
 
 
 def test_every_stretch_has_its_own_gain_and_starts_where_it_started():
     """Two records in one log, of a servo that was twice as stiff in the second."""
     parts = [recording(TRUE, factor * KP) for factor in (1.0, 2.0)]
-    second = dataclasses.replace(parts[1], channels={**parts[1].channels, "time": parts[1].time + 5.0})
+    second = dataclasses.replace(
+        parts[1], channels={**parts[1].channels, "time": parts[1].time + 5.0}
+    )
     # The second one begins in the middle of the motion.
     second = second.part(slice(700, None))
     segments = [
         {"start": float(part.time[0]), "end": float(part.time[-1]), "source": "a", "kp": kp}
         for part, kp in ((parts[0], 1.0), (second, 2.0))
     ]
-    both = Log({name: np.concatenate([parts[0][name], second[name]]) for name in second}, {**second.meta, "segments": segments})
+    both = Log(
+        {name: np.concatenate([parts[0][name], second[name]]) for name in second},
+        {**second.meta, "segments": segments},
+    )
     assert worst(rollout(pendulum(TRUE, gain="kp"), both)) < 1e-3
     assert worst(rollout(pendulum(TRUE), both)) > 0.01
-    with pytest.raises(InputError, match=r"gain stiffness: expected a number .* \(there are: start, end, kp\)"):
+    with pytest.raises(
+        InputError, match=r"gain stiffness: expected a number .* \(there are: start, end, kp\)"
+    ):
         rollout(pendulum(TRUE, gain="stiffness"), both)
 
 
@@ -119,14 +146,19 @@ def test_the_model_reads_its_angle_as_the_robot_does(log: Log):
     """An encoder whose zero is off: the loop acts on what is read, and so is compared."""
     shifted = TRUE | {"zero": EncoderOffset(offset={"servo": 0.03})}
     # Then it is asked for an angle that is as much off.
-    log = Log({name: values + 0.03 * name.endswith("joint/position") for name, values in log.items()}, log.meta)
+    log = Log(
+        {name: values + 0.03 * name.endswith("joint/position") for name, values in log.items()},
+        log.meta,
+    )
     assert worst(rollout(pendulum(shifted), log)) < 1e-9
     assert worst(rollout(pendulum(TRUE), log)) > 5e-4
 
 
 def test_nobody_knows_what_was_asked_for():
     log = by_hand(np.arange(0, 1.0, 0.01), np.zeros(100), 0.0)
-    unknown = Log({name: values for name, values in log.items() if not name.startswith("reference")}, log.meta)
+    unknown = Log(
+        {name: values for name, values in log.items() if not name.startswith("reference")}, log.meta
+    )
     assert rollout(pendulum({}), unknown) is None
     with pytest.raises(InputError, match="a recorded motion is not simulated without its log"):
         simulate(pendulum({}))
@@ -144,7 +176,11 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
   </joint>
 </robot>
 """)
-    (tmp_path / "wheel.yaml").write_text(yaml.safe_dump({"urdf": "wheel.urdf", "base": "stand", "fixed_base": True, "joints": ["servo"]}))
+    (tmp_path / "wheel.yaml").write_text(
+        yaml.safe_dump(
+            {"urdf": "wheel.urdf", "base": "stand", "fixed_base": True, "joints": ["servo"]}
+        )
+    )
     stall, no_load, tau = kt * voltage / resistance, voltage / kt, inertia * resistance / kt**2
     time = np.arange(0, 5 * tau, 0.01)
     angle = no_load * (time - tau * (1 - np.exp(-time / tau)))
@@ -152,11 +188,19 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
     scenario = Scenario(
         model=RobotConfig(str(tmp_path / "wheel.yaml"), effects=effects),
         robot=RobotConfig(str(tmp_path / "wheel.yaml")),
-        control=PositionLoopConfig(kp={"servo": 1e6}, kd={"servo": 0.0}, torque_limit={"servo": stall}),
+        control=PositionLoopConfig(
+            kp={"servo": 1e6}, kd={"servo": 0.0}, torque_limit={"servo": stall}
+        ),
         reference=Recorded(),
     )
     log = by_hand(
-        time, angle, 1e6, **{"joint/velocity": no_load * (1 - np.exp(-time / tau)), "joint/torque_command": np.full(len(time), stall)}
+        time,
+        angle,
+        1e6,
+        **{
+            "joint/velocity": no_load * (1 - np.exp(-time / tau)),
+            "joint/torque_command": np.full(len(time), stall),
+        },
     )
     error = rollout(scenario, log)
     assert worst(error) < 2e-3 * angle[-1]
@@ -166,21 +210,31 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
 
 def test_what_compensates_friction_moves_the_model_too():
     """The robot's friction was fed forward: the true model does the same, one that is not compensated does not."""
-    law = CoulombViscousFriction(coulomb={"all": 0.08}, viscous={"all": 0.0}, transition={"all": 0.02})
+    law = CoulombViscousFriction(
+        coulomb={"all": 0.08}, viscous={"all": 0.0}, transition={"all": 0.02}
+    )
     friction = {"friction": law}
     compensated = dataclasses.replace(
-        pendulum({}, friction), estimator=FixedFriction(law), compensation=FeedforwardCompensation(cutoff=50.0)
+        pendulum({}, friction),
+        estimator=FixedFriction(law),
+        compensation=FeedforwardCompensation(cutoff=50.0),
     )
     log = simulate(compensated).log
-    model = dataclasses.replace(compensated, model=RobotConfig("pendulum", effects=friction), reference=Recorded())
+    model = dataclasses.replace(
+        compensated, model=RobotConfig("pendulum", effects=friction), reference=Recorded()
+    )
     assert worst(rollout(model, log)) < 1e-9
     only_watched = dataclasses.replace(model, compensation=NoCompensation())
     assert worst(rollout(only_watched, log)) > 1e-3
 
 
-def test_an_estimate_that_is_only_watched_is_left_out_of_a_rollout(log: Log, monkeypatch: pytest.MonkeyPatch):
+def test_an_estimate_that_is_only_watched_is_left_out_of_a_rollout(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("fbse_drake.estimators.estimator.EstimatorDiagram", None)
-    watched = dataclasses.replace(pendulum(TRUE), estimator=FixedFriction(CoulombViscousFriction(transition={"all": 0.02})))
+    watched = dataclasses.replace(
+        pendulum(TRUE), estimator=FixedFriction(CoulombViscousFriction(transition={"all": 0.02}))
+    )
     assert worst(rollout(watched, log)) < 1e-9
 
 

@@ -42,7 +42,10 @@ def test_a_named_child_is_chosen(tmp_path: Path):
 
 
 def test_overrides_go_on_top():
-    result = load_scenario("paper_walk", overrides=["reference.step_length=0.05", "control.kp.hip_roll=2500", "log.period=2e-3"])
+    result = load_scenario(
+        "paper_walk",
+        overrides=["reference.step_length=0.05", "control.kp.hip_roll=2500", "log.period=2e-3"],
+    )
     assert result.reference.step_length == 0.05
     assert result.reference.single_supports == 7
     assert result.control.kp["hip_roll"] == 2500.0
@@ -57,7 +60,10 @@ def test_an_override_can_choose_another_reference():
 
 def test_an_override_can_take_an_effect_away():
     assert isinstance(load_scenario("paper_walk").robot.effects["joint_friction"], StribeckFriction)
-    assert load_scenario("paper_walk", overrides=["robot.effects.joint_friction=null"]).robot.effects == {}
+    assert (
+        load_scenario("paper_walk", overrides=["robot.effects.joint_friction=null"]).robot.effects
+        == {}
+    )
 
 
 def test_the_model_is_the_robot_without_its_effects():
@@ -70,18 +76,33 @@ def test_the_model_is_the_robot_without_its_effects():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mine: {sed: 1}", r"mine\.yaml: mine: sed: unknown key, did you mean seed\? \(allowed: title, seed,"),
-        ("mine: {reference: !Walk {step_lenght: 1}}", r"reference\.step_lenght: unknown key, did you mean step_length\?"),
-        ("mine: {reference: !Hop {}}", r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop"),
+        (
+            "mine: {sed: 1}",
+            r"mine\.yaml: mine: sed: unknown key, did you mean seed\? \(allowed: title, seed,",
+        ),
+        (
+            "mine: {reference: !Walk {step_lenght: 1}}",
+            r"reference\.step_lenght: unknown key, did you mean step_length\?",
+        ),
+        (
+            "mine: {reference: !Hop {}}",
+            r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop",
+        ),
         ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
         ("mine: {duration: .nan}", r"duration: expected a finite number, found nan"),
         ("mine: {duration: -1}", r"duration: expected a number > 0, found -1"),
         ("mine: {seed: 1.5}", r"seed: expected a whole number, found 1\.5"),
         ("mine: {seed: true}", r"seed: expected a whole number, found True"),
         ("mine: {control: 3}", r"control: expected a mapping, found 3"),
-        ("mine: {control: {kp: {hip_yw: 1}}}", r"control\.kp\.hip_yw: unknown joint \(allowed: all, hip_yaw"),
+        (
+            "mine: {control: {kp: {hip_yw: 1}}}",
+            r"control\.kp\.hip_yw: unknown joint \(allowed: all, hip_yaw",
+        ),
         ("mine: {control: {kd: {all: -1}}}", r"control\.kd\.all: expected a number >= 0, found -1"),
-        ("mine: {control: {period: 0.0015}}", r"control\.period: expected a whole multiple of plant\.time_step"),
+        (
+            "mine: {control: {period: 0.0015}}",
+            r"control\.period: expected a whole multiple of plant\.time_step",
+        ),
         (
             "mine: {plant: {time_step: 0.002}, control: {period: 0.001}}",
             r"control\.period: expected a whole multiple of plant\.time_step = 0\.002 s, found 0\.001",
@@ -91,19 +112,43 @@ def test_the_model_is_the_robot_without_its_effects():
             r"sensors\.encoders\.period: expected a whole multiple of plant\.time_step = 0\.002 s",
         ),
         ("mine: {log: {period: 0}}", r"log\.period: expected a whole multiple"),
-        ("mine: {sensors: {imu: {period: 0}}}", r"sensors\.imu\.period: expected a number > 0, found 0"),
+        (
+            "mine: {sensors: {imu: {period: 0}}}",
+            r"sensors\.imu\.period: expected a number > 0, found 0",
+        ),
         ("mine: {plant: {time_step: 0}}", r"plant\.time_step: expected a number > 0"),
-        ("mine: {ground: {stiffness: .inf}}", r"ground\.stiffness: expected a finite number, found inf"),
+        (
+            "mine: {ground: {stiffness: .inf}}",
+            r"ground\.stiffness: expected a finite number, found inf",
+        ),
         ("mine: {ground: {stiffness: 0}}", r"ground\.stiffness: expected a number > 0, found 0"),
-        ("mine: {duration: 0.0005}", r"duration: expected at least control\.period = 0\.001 s, found 0\.0005"),
+        (
+            "mine: {duration: 0.0005}",
+            r"duration: expected at least control\.period = 0\.001 s, found 0\.0005",
+        ),
         ("mine: {plant: {contact_model: soft}}", r"plant: Unknown contact_model: 'soft'"),
-        ("mine: {plant: {stiction_tolerance: -1}}", r"plant\.stiction_tolerance: expected a number > 0, found -1"),
+        (
+            "mine: {plant: {stiction_tolerance: -1}}",
+            r"plant\.stiction_tolerance: expected a number > 0, found -1",
+        ),
         ("mine: {plant: {time_stp: 0}}", r"plant\.time_stp: unknown key, did you mean time_step\?"),
-        ("mine: {robot: {description: nobody}}", r"nobody: no such file, and no such name in models/ \(there are: biped"),
+        (
+            "mine: {robot: {description: nobody}}",
+            r"nobody: no such file, and no such name in models/ \(there are: biped",
+        ),
         ("mine: {robot: {rotor_inertia: {knee: 1}}}", r"robot\.rotor_inertia\.knee: unknown joint"),
-        ("mine: {robot: {effects: {f: {gamma1: {all: 1}}}}}", r"robot\.effects\.f: expected one of .*!StribeckFriction"),
-        ("mine: {robot: {effects: {f: !StribeckFriction {gamma4: {all: -1}}}}}", r"robot\.effects\.f\.gamma4: expected values in"),
-        ("mine: {sensors: {imu: {acceleration_bias: 1}}}", r"sensors\.imu\.acceleration_bias: expected a list, found 1"),
+        (
+            "mine: {robot: {effects: {f: {gamma1: {all: 1}}}}}",
+            r"robot\.effects\.f: expected one of .*!StribeckFriction",
+        ),
+        (
+            "mine: {robot: {effects: {f: !StribeckFriction {gamma4: {all: -1}}}}}",
+            r"robot\.effects\.f\.gamma4: expected values in",
+        ),
+        (
+            "mine: {sensors: {imu: {acceleration_bias: 1}}}",
+            r"sensors\.imu\.acceleration_bias: expected a list, found 1",
+        ),
         ("mine: [1, 2]", r"expected a mapping, found a list"),
         ("- 1", r"mine\.yaml: expected a mapping of keys to values, found a list"),
         ("mine: {a: [}", r"mine\.yaml:1: not valid YAML"),
@@ -130,7 +175,10 @@ def test_bad_override_gets_one_line(override: str, message: str):
 
 
 def test_missing_file_lists_what_there_is():
-    with pytest.raises(InputError, match=r"paper_wolk: no such file, and no such name in scenarios/ \(there are: .*paper_walk"):
+    with pytest.raises(
+        InputError,
+        match=r"paper_wolk: no such file, and no such name in scenarios/ \(there are: .*paper_walk",
+    ):
         load_scenario("paper_wolk")
 
 

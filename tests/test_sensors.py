@@ -30,7 +30,9 @@ def test_held_signal_has_each_value_from_its_tick_on(step: float):
     context = source.CreateDefaultContext()
     for tick in range(0, 8000, 7):
         context.SetTime(tick * step)
-        assert source.get_output_port().Eval(context)[0] == min(int(tick * step / 1e-3 + 1e-6), 1999)
+        assert source.get_output_port().Eval(context)[0] == min(
+            int(tick * step / 1e-3 + 1e-6), 1999
+        )
 
 
 def test_imu_bias_and_walk():
@@ -95,15 +97,25 @@ def test_zmp_is_kept_while_nothing_stands():
 def test_force_sensors_read_late_and_with_a_gain():
     quiet = ("duration=0.3", "sensors.foot_force.noise=0")
     exact = simulate(scenario("paper_walk", *quiet)).log["foot/left/pad_force"]
-    late = simulate(scenario("paper_walk", *quiet, "sensors.foot_force.delay=0.005", "sensors.foot_force.gain=1.02")).log
+    late = simulate(
+        scenario(
+            "paper_walk", *quiet, "sensors.foot_force.delay=0.005", "sensors.foot_force.gain=1.02"
+        )
+    ).log
     np.testing.assert_allclose(late["foot/left/pad_force"][5:], 1.02 * exact[:-5], atol=1e-9)
     assert not late["foot/left/pad_force"][:5].any()
 
 
 def test_misaligned_imu_reads_the_same_vectors_in_turned_axes():
-    quiet = ("duration=0.3", "sensors.imu.acceleration_noise=0", "sensors.imu.angular_velocity_noise=0")
+    quiet = (
+        "duration=0.3",
+        "sensors.imu.acceleration_noise=0",
+        "sensors.imu.angular_velocity_noise=0",
+    )
     exact = simulate(scenario("paper_walk", *quiet)).log
-    turned = simulate(scenario("paper_walk", *quiet, "sensors.imu.misalignment=[0.02, -0.01, 0.03]")).log
+    turned = simulate(
+        scenario("paper_walk", *quiet, "sensors.imu.misalignment=[0.02, -0.01, 0.03]")
+    ).log
     R_IS = Rotation.from_rotvec([0.02, -0.01, 0.03])
     for channel in ("imu/linear_acceleration", "imu/angular_velocity"):
         np.testing.assert_allclose(R_IS.apply(turned[channel]), exact[channel], atol=1e-12)

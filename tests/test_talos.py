@@ -42,8 +42,12 @@ def talos() -> dict:
     try:
         files = metadata.files("example-robot-data") or []
     except metadata.PackageNotFoundError:
-        pytest.skip("the package example-robot-data, which has the model of TALOS, is not installed")
-    urdf = Path(next(file for file in files if file.name == "talos_reduced.urdf").locate()).resolve()
+        pytest.skip(
+            "the package example-robot-data, which has the model of TALOS, is not installed"
+        )
+    urdf = Path(
+        next(file for file in files if file.name == "talos_reduced.urdf").locate()
+    ).resolve()
 
     def leg(side: str) -> dict:
         return {
@@ -92,8 +96,13 @@ def test_it_weighs_what_its_urdf_says(talos: dict, tmp_path: Path):
     driven, _ = make_robot(described(tmp_path / "driven", with_driven_elbows(talos)))
     other = driven.plant.CreateDefaultContext()
     driven.set_joint_positions(other, np.concatenate([np.zeros(12), [-0.5, -0.5]]))
-    hands = [plant.GetFrameByName("gripper_left_base_link") for plant in (robot.plant, driven.plant)]
-    poses = [hand.CalcPoseInWorld(at).GetAsMatrix34() for hand, at in zip(hands, (context, other), strict=True)]
+    hands = [
+        plant.GetFrameByName("gripper_left_base_link") for plant in (robot.plant, driven.plant)
+    ]
+    poses = [
+        hand.CalcPoseInWorld(at).GetAsMatrix34()
+        for hand, at in zip(hands, (context, other), strict=True)
+    ]
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)
 
 
@@ -115,8 +124,14 @@ def test_it_walks_and_its_friction_is_estimated(talos: dict, tmp_path: Path):
 def test_driven_elbows_are_estimated_too(talos: dict, tmp_path: Path):
     """Before the walk begins the elbows are moved by nothing but the body's sway; their friction is small, and so is the error."""
     posture = "{arm_left_4_joint: -0.5, arm_right_4_joint: -0.5}"
-    log = simulate(walking(tmp_path, with_driven_elbows(talos), "estimator=!Fbse {}", "duration=1", posture=posture)).log
-    error = (log["estimate/joint/friction_torque"] - log["truth/joint/friction_torque"])[log.time > 0.5]
+    log = simulate(
+        walking(
+            tmp_path, with_driven_elbows(talos), "estimator=!Fbse {}", "duration=1", posture=posture
+        )
+    ).log
+    error = (log["estimate/joint/friction_torque"] - log["truth/joint/friction_torque"])[
+        log.time > 0.5
+    ]
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.5
     assert joint_sides(log)[6:] == ["right"] * 6 + [None] * 2
 
@@ -129,7 +144,9 @@ def test_with_driven_arms_a_hidden_mass_is_found(talos: dict, tmp_path: Path):
     case = dataclasses.replace(case, model=dataclasses.replace(case.robot, effects=friction))
     log = simulate(case).log
     assert log.joints[12:] == ELBOWS
-    np.testing.assert_allclose(log["truth/joint/position"][:, 12:], np.tile([-0.5, -0.7], (len(log.time), 1)), atol=5e-3)
+    np.testing.assert_allclose(
+        log["truth/joint/position"][:, 12:], np.tile([-0.5, -0.7], (len(log.time), 1)), atol=5e-3
+    )
     diagnosis = diagnose(Predictor(case, log))
     assert diagnosis.verdict == "effect_found"
     (found,) = diagnosis.chosen

@@ -46,19 +46,27 @@ def test_leg_kinematics_agree_with_drake(robot: Robot, side: str):
     leg, plant = LegKinematics.from_robot(robot, side), robot.plant
     q, v = random_angles(1, seed=3), np.random.default_rng(4).normal(size=(1, 6))
     motion = leg.forward(q, v)
-    columns = slice(6 * robot.description.sides.index(side), 6 * robot.description.sides.index(side) + 6)
+    columns = slice(
+        6 * robot.description.sides.index(side), 6 * robot.description.sides.index(side) + 6
+    )
     context = plant.CreateDefaultContext()
     joint_q, joint_v = np.zeros(12), np.zeros(12)
     joint_q[columns], joint_v[columns] = q, v
     robot.set_state(context, joint_q, joint_v, RigidTransform())
     world, sole = plant.world_frame(), robot.sole(side)
     X = sole.CalcPoseInWorld(context)
-    J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, sole, [0, 0, 0], world, world)
-    bias = plant.CalcBiasSpatialAcceleration(context, JacobianWrtVariable.kV, sole, [0, 0, 0], world, world)
+    J = plant.CalcJacobianSpatialVelocity(
+        context, JacobianWrtVariable.kV, sole, [0, 0, 0], world, world
+    )
+    bias = plant.CalcBiasSpatialAcceleration(
+        context, JacobianWrtVariable.kV, sole, [0, 0, 0], world, world
+    )
     np.testing.assert_allclose(motion.p_BF[0], X.translation(), atol=1e-12)
     np.testing.assert_allclose(motion.R_BF[0], X.rotation().matrix(), atol=1e-12)
     np.testing.assert_allclose(motion.J[0], J[:, robot.velocity_index[columns]], atol=1e-12)
-    np.testing.assert_allclose(motion.Jdot_v[0], np.concatenate([bias.rotational(), bias.translational()]), atol=1e-10)
+    np.testing.assert_allclose(
+        motion.Jdot_v[0], np.concatenate([bias.rotational(), bias.translational()]), atol=1e-10
+    )
 
 
 def test_leg_out_of_reach_is_refused(robot: Robot):
@@ -68,7 +76,9 @@ def test_leg_out_of_reach_is_refused(robot: Robot):
 
 
 def test_timeline_is_the_papers(walk: Reference):
-    singles = [(phase.start, phase.end, phase.support[0]) for phase in walk.plan.phases if phase.is_single]
+    singles = [
+        (phase.start, phase.end, phase.support[0]) for phase in walk.plan.phases if phase.is_single
+    ]
     assert singles == [
         (0.5, 1.1, "left"),
         (2.0, 2.6, "right"),
@@ -84,9 +94,23 @@ def test_com_of_the_reference_posture_is_the_planned_com(robot: Robot, walk: Ref
     context = robot.plant.CreateDefaultContext()
     for k in range(0, len(TIME), 173):
         V_WB = np.concatenate([np.zeros(3), walk.base.velocity[k]])
-        robot.set_state(context, walk.joint_position[k], walk.joint_velocity[k], RigidTransform(walk.base.position[k]), V_WB)
-        np.testing.assert_allclose(robot.plant.CalcCenterOfMassPositionInWorld(context), walk.plan.com.position[k], atol=1e-10)
-        np.testing.assert_allclose(robot.plant.CalcCenterOfMassTranslationalVelocityInWorld(context), walk.plan.com.velocity[k], atol=1e-10)
+        robot.set_state(
+            context,
+            walk.joint_position[k],
+            walk.joint_velocity[k],
+            RigidTransform(walk.base.position[k]),
+            V_WB,
+        )
+        np.testing.assert_allclose(
+            robot.plant.CalcCenterOfMassPositionInWorld(context),
+            walk.plan.com.position[k],
+            atol=1e-10,
+        )
+        np.testing.assert_allclose(
+            robot.plant.CalcCenterOfMassTranslationalVelocityInWorld(context),
+            walk.plan.com.velocity[k],
+            atol=1e-10,
+        )
         for side, foot in walk.plan.feet.items():
             pose = robot.sole(side).CalcPoseInWorld(context)
             np.testing.assert_allclose(pose.translation(), foot.position[k], atol=1e-10)
@@ -99,8 +123,12 @@ def test_joint_velocity_and_acceleration_are_the_derivatives(robot: Robot):
     reference = make_reference(Walk(), robot, t)
     k = np.searchsorted(t, middle)
     q = reference.joint_position
-    np.testing.assert_allclose((q[k + 1] - q[k - 1]) / (2 * h), reference.joint_velocity[k], atol=2e-5)
-    np.testing.assert_allclose((q[k + 1] - 2 * q[k] + q[k - 1]) / h**2, reference.joint_acceleration[k], atol=2e-3)
+    np.testing.assert_allclose(
+        (q[k + 1] - q[k - 1]) / (2 * h), reference.joint_velocity[k], atol=2e-5
+    )
+    np.testing.assert_allclose(
+        (q[k + 1] - 2 * q[k] + q[k - 1]) / h**2, reference.joint_acceleration[k], atol=2e-3
+    )
 
 
 def test_walk_starts_and_ends_at_rest(walk: Reference):
@@ -113,19 +141,29 @@ def test_walk_starts_and_ends_at_rest(walk: Reference):
 def test_planned_zmp_keeps_its_margin(robot: Robot, walk: Reference):
     for phase in walk.plan.phases:
         inside = (phase.start < TIME) & (phase.end > TIME)
-        corners = [walk.plan.feet[s].position[inside][0, :2] + robot.pad_positions(s)[:, :2] for s in phase.support]
-        assert support_margin(walk.plan.zmp[inside], np.concatenate(corners)).min() >= Walk().zmp_margin
+        corners = [
+            walk.plan.feet[s].position[inside][0, :2] + robot.pad_positions(s)[:, :2]
+            for s in phase.support
+        ]
+        assert (
+            support_margin(walk.plan.zmp[inside], np.concatenate(corners)).min()
+            >= Walk().zmp_margin
+        )
 
 
 def test_support_margin_of_a_square():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    np.testing.assert_allclose(support_margin(np.array([[0.5, 0.5], [0.9, 0.5], [1.2, 0.5]]), square), [0.5, 0.1, -0.2])
+    np.testing.assert_allclose(
+        support_margin(np.array([[0.5, 0.5], [0.9, 0.5], [1.2, 0.5]]), square), [0.5, 0.1, -0.2]
+    )
 
 
 def test_shared_load_gives_the_zmp_and_sums_to_one(walk: Reference):
     shares, cops = share_load(walk.plan, walk.plan.zmp)
     np.testing.assert_allclose(sum(shares.values()), 1.0)
-    np.testing.assert_allclose(sum(shares[s][:, None] * cops[s] for s in shares), walk.plan.zmp, atol=1e-12)
+    np.testing.assert_allclose(
+        sum(shares[s][:, None] * cops[s] for s in shares), walk.plan.zmp, atol=1e-12
+    )
     assert all(np.all((share >= 0) & (share <= 1)) for share in shares.values())
     # No jumps: a foot takes over the load gradually.
     assert max(np.abs(np.diff(share)).max() for share in shares.values()) < 0.03
@@ -134,7 +172,9 @@ def test_shared_load_gives_the_zmp_and_sums_to_one(walk: Reference):
 def test_feedforward_at_rest_carries_the_weight(robot: Robot, walk: Reference):
     """Virtual work: lifting the base by dz with the feet on the ground costs m g dz."""
     context = robot.plant.CreateDefaultContext()
-    robot.set_state(context, walk.joint_position[0], np.zeros(12), RigidTransform(walk.base.position[0]))
+    robot.set_state(
+        context, walk.joint_position[0], np.zeros(12), RigidTransform(walk.base.position[0])
+    )
     weight = robot.plant.CalcTotalMass(context) * 9.81
     step = 1e-5
     higher = make_reference(Squat(com_height=Walk().com_height), robot, np.array([0.0, 1.0]))
@@ -144,7 +184,9 @@ def test_feedforward_at_rest_carries_the_weight(robot: Robot, walk: Reference):
 
 
 def test_step_out_of_reach_names_the_step_and_the_limit(robot: Robot):
-    with pytest.raises(InputError, match=r"step \d .* out of reach: hip to ankle 0\.\d+ m, the leg allows 0\.550 m"):
+    with pytest.raises(
+        InputError, match=r"step \d .* out of reach: hip to ankle 0\.\d+ m, the leg allows 0\.550 m"
+    ):
         make_reference(Walk(step_length=0.40), robot, TIME)
 
 
@@ -154,11 +196,15 @@ def test_joint_limit_names_the_joint(robot: Robot):
 
 
 def test_zmp_outside_its_margin_names_the_phase(robot: Robot):
-    with pytest.raises(InputError, match=r"phase 1 \(left support\), t = .* zmp_margin asks for 0\.020 m"):
+    with pytest.raises(
+        InputError, match=r"phase 1 \(left support\), t = .* zmp_margin asks for 0\.020 m"
+    ):
         make_reference(Walk(zmp_inward=0.045), robot, TIME)
 
 
-@pytest.mark.parametrize(("field", "value"), [("single_support", 0.0), ("single_supports", 0), ("step_height", -0.1)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("single_support", 0.0), ("single_supports", 0), ("step_height", -0.1)]
+)
 def test_impossible_values_are_refused(field: str, value: float):
     with pytest.raises(InputError, match=field):
         dataclasses.replace(Walk(), **{field: value})
@@ -168,7 +214,10 @@ def test_sway_zmp_of_a_point_mass(robot: Robot):
     """A point mass that sways has its ZMP where gravity and inertia balance."""
     reference = make_reference(Sway(amplitude=0.04, frequency=0.3), robot, np.arange(0, 8, 0.01))
     com = reference.plan.com
-    moment = com.position[:, 2] * com.acceleration[:, 1] - (com.position[:, 1] - reference.plan.zmp[:, 1]) * 9.81
+    moment = (
+        com.position[:, 2] * com.acceleration[:, 1]
+        - (com.position[:, 1] - reference.plan.zmp[:, 1]) * 9.81
+    )
     np.testing.assert_allclose(moment, 0, atol=1e-9)
     assert np.abs(reference.plan.zmp[:, 1]).max() > 0.04
 

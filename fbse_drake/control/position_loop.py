@@ -36,7 +36,9 @@ class PositionLoopConfig:
                     raise InputError(f"{name}.{joint}: expected a number >= 0, found {value:g}")
 
 
-def position_loop(error: np.ndarray, error_rate: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> np.ndarray:
+def position_loop(
+    error: np.ndarray, error_rate: np.ndarray, kp: np.ndarray, kd: np.ndarray
+) -> np.ndarray:
     """Torque of the position loop, tau_pos = kp (theta_ref - theta) + kd (theta_ref_dot - theta_dot), paper eq. (68) [Nm]."""
     return kp * error + kd * error_rate
 
@@ -59,7 +61,11 @@ def _command(
     """Fills the command of a `PositionLoop` from its inputs."""
     n = len(command)
     for i in range(n):
-        torque = _law(desired[i] - estimated[i], desired[n + i] - estimated[n + i], kp[i], kd[i]) + feedforward[i] + friction[i]
+        torque = (
+            _law(desired[i] - estimated[i], desired[n + i] - estimated[n + i], kp[i], kd[i])
+            + feedforward[i]
+            + friction[i]
+        )
         command[i] = np.minimum(np.maximum(torque, -limit[i]), limit[i]) * enabled[i]
 
 

@@ -29,7 +29,10 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
                 tuple(entry["joints"]),
                 entry["held_out_before"],
                 entry["held_out_after"],
-                {name: Estimate(float(p["value"]), tuple(p["interval"]), p["unit"]) for name, p in entry["parameters"].items()},
+                {
+                    name: Estimate(float(p["value"]), tuple(p["interval"]), p["unit"])
+                    for name, p in entry["parameters"].items()
+                },
                 tuple(entry["confusable_with"]),
                 entry["chosen"],
             )
@@ -65,7 +68,11 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
     for name, values in by_effect.items():
         effect = _make(name, values)
         if isinstance(effect, InertialParameters):
-            earlier = {key: other for key, other in effects.items() if isinstance(other, InertialParameters)}
+            earlier = {
+                key: other
+                for key, other in effects.items()
+                if isinstance(other, InertialParameters)
+            }
             effect = sum(earlier.values(), effect)
             effects = {key: other for key, other in effects.items() if key not in earlier}
         effects[_free_key(name, effects)] = effect
@@ -89,7 +96,13 @@ def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:
     if kind is None:
         raise InputError(f"the library has no effect {name} (there are: {', '.join(library())})")
     targets = list(next(iter(values.values())))
-    return kind.from_values(targets, {parameter: [numbers[target] for target in targets] for parameter, numbers in values.items()})
+    return kind.from_values(
+        targets,
+        {
+            parameter: [numbers[target] for target in targets]
+            for parameter, numbers in values.items()
+        },
+    )
 
 
 def _free_key(name: str, taken: Mapping[str, Effect]) -> str:

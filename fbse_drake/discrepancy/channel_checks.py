@@ -54,7 +54,14 @@ def check_sampling(evidence: Evidence) -> Iterable[HygieneFinding]:
             f"the period of {1e3 * evidence.period:.4g} ms scatters by {100 * jitter:.2g} %; channels are interpolated on an even grid, "
             "which smoothes their noise"
         )
-        yield remark("jitter", "warning" if jitter > _STRONG_JITTER else "note", "time", jitter * evidence.period, "s", text)
+        yield remark(
+            "jitter",
+            "warning" if jitter > _STRONG_JITTER else "note",
+            "time",
+            jitter * evidence.period,
+            "s",
+            text,
+        )
 
 
 def _runs(equal: np.ndarray) -> np.ndarray:
@@ -72,14 +79,20 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
     far_by_angles = np.maximum(10 * STILL, 10 * evidence.quantum["joint/position"])
     velocity = evidence.log.get("joint/velocity", np.zeros_like(position))
     # One count of a velocity may be its offset.
-    velocity = np.where(np.abs(velocity) > 1.5 * evidence.quantum.get("joint/velocity", 0.0), velocity, 0.0)
+    velocity = np.where(
+        np.abs(velocity) > 1.5 * evidence.quantum.get("joint/velocity", 0.0), velocity, 0.0
+    )
     enabled = evidence.log.get("joint/enabled", np.ones_like(position))
     settling = round(_SETTLING / evidence.period)
     for name, (values, parts) in evidence.channels.items():
         found = {}
         for k, part in enumerate(parts):
             # An angle that is stuck does not show that the joint moves.
-            travelled = np.cumsum(velocity, axis=0) * evidence.period if name == "joint/position" else position
+            travelled = (
+                np.cumsum(velocity, axis=0) * evidence.period
+                if name == "joint/position"
+                else position
+            )
             moves = travelled / far.get(name, far_by_angles)
             moves = moves[:, [k]] if name.startswith("joint/") else moves
             # A velocity that was filtered still runs on for a while after its joint has come to rest.
@@ -89,7 +102,11 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
             if name == "joint/torque_command":
                 # A drive may be off, or at its limit, which is another finding.
                 column = values[:, k]
-                runs = [(a, b) for a, b in runs if enabled[a : b + 1, k].any() and column.min() < column[a] < column.max()]
+                runs = [
+                    (a, b)
+                    for a, b in runs
+                    if enabled[a : b + 1, k].any() and column.min() < column[a] < column.max()
+                ]
             if name.startswith("foot/"):
                 # In the air a foot may well read nothing at all.
                 runs = [(a, b) for a, b in runs if values[a, k] != 0]
@@ -109,7 +126,11 @@ def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:
             for extreme in (column.min(), column.max()):
                 runs = _runs(column == extreme)
                 long = [stop - start for start, stop in runs if stop - start >= _CLIPPED_RUN]
-                if abs(extreme) > 0.2 * np.abs(column).max() and np.ptp(column) > 20 * evidence.quantum[name][k] and len(long) > 1:
+                if (
+                    abs(extreme) > 0.2 * np.abs(column).max()
+                    and np.ptp(column) > 20 * evidence.quantum[name][k]
+                    and len(long) > 1
+                ):
                     share += sum(long) / len(column)
             if share > CLIPPED_SHARE:
                 found[part] = 100 * share
@@ -128,9 +149,7 @@ def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
         changing = np.abs(values[1:, moving]).max(axis=1) > 0
         if changing.any() and (share := float(held[changing].mean())) > _REPEATED:
             late = 500 * evidence.period / (1 - share)
-            text = (
-                f"{100 * share:.0f} % of its samples repeat the one before: it comes {late:.2g} ms late on average; its noise is not white"
-            )
+            text = f"{100 * share:.0f} % of its samples repeat the one before: it comes {late:.2g} ms late on average; its noise is not white"
             yield remark("held", "warning", name, 1.0 / (1.0 - share), "samples", text)
 
 
@@ -143,9 +162,19 @@ def check_steps(evidence: Evidence) -> Iterable[HygieneFinding]:
         (values, parts), step = evidence.channels[name], evidence.quantum[name]
         angles = name == "joint/position"
         coarse = step > (1.5 * believed if angles else 0.02 * values.std(axis=0))
-        found = {part: float(step[k]) for k, part in enumerate(parts) if step[k] > 0 and coarse[k] and np.ptp(values[:, k]) > STILL}
-        known = f"the scenario believes {believed:.2g} (sensors.encoders.resolution)" if angles else "what is smaller does not show"
-        yield from remarks("quantised", "note", name, found, units, "{where} comes in steps of {size}; " + known)
+        found = {
+            part: float(step[k])
+            for k, part in enumerate(parts)
+            if step[k] > 0 and coarse[k] and np.ptp(values[:, k]) > STILL
+        }
+        known = (
+            f"the scenario believes {believed:.2g} (sensors.encoders.resolution)"
+            if angles
+            else "what is smaller does not show"
+        )
+        yield from remarks(
+            "quantised", "note", name, found, units, "{where} comes in steps of {size}; " + known
+        )
 
 
 def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -161,10 +190,15 @@ def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
             frequency, power = welch(column, 1.0 / evidence.period, nperseg=SPECTRUM)
             # Relative to half the sampling rate.
             share = frequency / frequency[-1]
-            middle, top = power[(share > 0.5) & (share < 0.6)].mean(), power[(share > 0.85) & (share < 0.95)].mean()
+            middle, top = (
+                power[(share > 0.5) & (share < 0.6)].mean(),
+                power[(share > 0.85) & (share < 0.95)].mean(),
+            )
             beyond = np.cumsum(power[::-1])[::-1] / power.sum()
             if top < _EMPTY * middle:
-                found[part] = float(frequency[max(1, int(np.argmax(beyond < _EDGE)))] or frequency[-1])
+                found[part] = float(
+                    frequency[max(1, int(np.argmax(beyond < _EDGE)))] or frequency[-1]
+                )
         lowest = dict.fromkeys(found, min(found.values(), default=0.0))
         text = "{where} was filtered before it was recorded: it holds nothing above {size}; intervals take its noise to be white"
         yield from remarks("filtered", "note", name, lowest, "Hz", text)
@@ -179,7 +213,9 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
     evidence = Evidence(motion)
     believed = {
         "joint/position": max(sensors.encoders.noise, sensors.encoders.resolution / np.sqrt(12)),
-        "joint/velocity": sensors.encoders.velocity_noise if sensors.encoders.velocity == "exact" else np.nan,
+        "joint/velocity": sensors.encoders.velocity_noise
+        if sensors.encoders.velocity == "exact"
+        else np.nan,
         "joint/torque_command": max(torque_noise.values(), default=np.nan),
         "imu/linear_acceleration": sensors.imu.acceleration_noise,
         "imu/angular_velocity": sensors.imu.angular_velocity_noise,
@@ -192,15 +228,30 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
             result.append(_level(motion, name, forces, "N", sensors.foot_force.noise))
         else:
             units = evidence.units.get(name, {"": motion.log.unit(name)})
-            result.append(_level(motion, name, values, " or ".join(dict.fromkeys(units.values())), believed[name]))
+            result.append(
+                _level(
+                    motion, name, values, " or ".join(dict.fromkeys(units.values())), believed[name]
+                )
+            )
     return result
 
 
-def _level(motion: RecordedMotion, name: str, values: np.ndarray, unit: str, believed: float) -> NoiseLevel:
-    whole = np.convolve(np.diff(motion.log.time) < 1.5 * motion.period, np.ones(_DIFFERENCE), "valid") == _DIFFERENCE
-    differences = np.diff(values, _DIFFERENCE, axis=0)[whole] / np.sqrt(comb(2 * _DIFFERENCE, _DIFFERENCE))
+def _level(
+    motion: RecordedMotion, name: str, values: np.ndarray, unit: str, believed: float
+) -> NoiseLevel:
+    whole = (
+        np.convolve(np.diff(motion.log.time) < 1.5 * motion.period, np.ones(_DIFFERENCE), "valid")
+        == _DIFFERENCE
+    )
+    differences = np.diff(values, _DIFFERENCE, axis=0)[whole] / np.sqrt(
+        comb(2 * _DIFFERENCE, _DIFFERENCE)
+    )
     # The quiet parts of the log, and the typical component: impacts and trembling joints are no noise of sensors.
-    parts = [(part**2).mean(axis=0) for part in np.array_split(differences, max(1, len(differences) // _QUIET_SAMPLES)) if len(part)]
+    parts = [
+        (part**2).mean(axis=0)
+        for part in np.array_split(differences, max(1, len(differences) // _QUIET_SAMPLES))
+        if len(part)
+    ]
     level = float(np.median(np.sqrt(np.quantile(parts, _QUIET, axis=0)))) if parts else np.nan
     return NoiseLevel(name, level, unit, float(believed))
 
@@ -213,9 +264,23 @@ def check_noise(evidence: Evidence) -> Iterable[HygieneFinding]:
         factor = noise.level / noise.believed
         if not 1 / _NOISE_FACTOR < factor < _NOISE_FACTOR:
             noisy = factor > 1
-            effect = "intervals are too narrow and false effects may be found" if noisy else "small effects are missed"
+            effect = (
+                "intervals are too narrow and false effects may be found"
+                if noisy
+                else "small effects are missed"
+            )
             text = f"its white noise is {noise.level:.2g} {noise.unit} a sample, the scenario believes {noise.believed:.2g}; {effect}"
-            yield remark("noise_level", "warning" if noisy else "note", noise.channel, factor, "1", text)
+            yield remark(
+                "noise_level", "warning" if noisy else "note", noise.channel, factor, "1", text
+            )
 
 
-CHECKS = (check_sampling, check_stuck, check_clipped, check_slow_channels, check_steps, check_filtered, check_noise)
+CHECKS = (
+    check_sampling,
+    check_stuck,
+    check_clipped,
+    check_slow_channels,
+    check_steps,
+    check_filtered,
+    check_noise,
+)

@@ -62,7 +62,11 @@ class Bin:
     @property
     def ratio(self) -> float:
         """Size of the error in multiples of the noise."""
-        return float(np.inf) if self.noise_floor == 0 and self.error != 0 else abs(self.error) / max(self.noise_floor, 1e-300)
+        return (
+            float(np.inf)
+            if self.noise_floor == 0 and self.error != 0
+            else abs(self.error) / max(self.noise_floor, 1e-300)
+        )
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,9 @@ class Channel:
     @property
     def worst(self) -> Bin | None:
         """The bin that stands out most from the noise."""
-        return max((b for bins in self.bins.values() for b in bins), key=lambda b: b.ratio, default=None)
+        return max(
+            (b for bins in self.bins.values() for b in bins), key=lambda b: b.ratio, default=None
+        )
 
 
 @dataclass(frozen=True)
@@ -121,14 +127,26 @@ def compare(predictor: Predictor) -> Comparison:
     if robot.has_floating_base:
         # Without masses the base's rows are the wrench of the feet.
         unloaded = replace(blocks, pad_force=np.zeros_like(blocks.pad_force))
-        wrench = equation.residual(blocks, kinematic=False) - equation.residual(unloaded, kinematic=False)
+        wrench = equation.residual(blocks, kinematic=False) - equation.residual(
+            unloaded, kinematic=False
+        )
         zero[:, n : n + 6] = wrench[:, n:]
-        foot_load = {side: w[:, 5] for side, w in zip(robot.description.sides, equation.wrenches(blocks.pad_force), strict=True)}
-    return compare_residual(predictor.residual, robot.description, rms(zero, predictor.residual.known), foot_load)
+        foot_load = {
+            side: w[:, 5]
+            for side, w in zip(
+                robot.description.sides, equation.wrenches(blocks.pad_force), strict=True
+            )
+        }
+    return compare_residual(
+        predictor.residual, robot.description, rms(zero, predictor.residual.known), foot_load
+    )
 
 
 def compare_residual(
-    residual: Residual, description: RobotDescription, zero_rmse: np.ndarray, foot_load: Mapping[str, np.ndarray]
+    residual: Residual,
+    description: RobotDescription,
+    zero_rmse: np.ndarray,
+    foot_load: Mapping[str, np.ndarray],
 ) -> Comparison:
     """Compares a residual with its noise.
 
@@ -138,15 +156,30 @@ def compare_residual(
         foot_load: vertical force on each sole [N], shape (B,), by side.
     """
     white = WhitenedResidual(residual)
-    rows = [_RowErrors(residual, white, k, description, foot_load) for k in range(len(residual.rows))]
-    tests = sum(len(division.phases) * (len(division.variable.edges) - 1) for row in rows for division in row.divisions)
+    rows = [
+        _RowErrors(residual, white, k, description, foot_load) for k in range(len(residual.rows))
+    ]
+    tests = sum(
+        len(division.phases) * (len(division.variable.edges) - 1)
+        for row in rows
+        for division in row.divisions
+    )
     threshold = float(norm.isf(_FALSE_ALARM / 2 / max(1, tests)))
     smallest = np.fmax(_SMALLEST_NOISE_SHARE * residual.noise_floor, _SMALLEST_SHARE * zero_rmse)
-    failures = [failure for row, size in zip(rows, smallest, strict=True) for failure in row.failures(threshold, size)]
+    failures = [
+        failure
+        for row, size in zip(rows, smallest, strict=True)
+        for failure in row.failures(threshold, size)
+    ]
     total = max(1, white.count.sum())
     return Comparison(
         float(np.sqrt(white.sse.sum() / total)),
-        float(np.sqrt(sum(_held_out_sse(white.y[:, k], *_constant(white, k)) for k in range(len(rows))) / total)),
+        float(
+            np.sqrt(
+                sum(_held_out_sse(white.y[:, k], *_constant(white, k)) for k in range(len(rows)))
+                / total
+            )
+        ),
         tuple(row.channel(zero) for row, zero in zip(rows, zero_rmse, strict=True)),
         tuple(sorted(failures, key=lambda failure: failure.where.ratio, reverse=True)),
     )
@@ -176,28 +209,45 @@ class _RowErrors:
     """Errors of one row and where they occur."""
 
     def __init__(
-        self, residual: Residual, white: WhitenedResidual, place: int, description: RobotDescription, foot_load: Mapping[str, np.ndarray]
+        self,
+        residual: Residual,
+        white: WhitenedResidual,
+        place: int,
+        description: RobotDescription,
+        foot_load: Mapping[str, np.ndarray],
     ):
         self.row, self.time = residual.rows[place], residual.time
         self.known, self.error = residual.known[:, place], residual.value[:, place]
         self.variance, self.covariance = residual.variance[:, place], residual.covariance[:, place]
         self.stretch, self.fold = white.stretch, white.fold
-        self._rmse, self._noise_floor = float(rms(self.error, self.known)), float(residual.noise_floor[place])
+        self._rmse, self._noise_floor = (
+            float(rms(self.error, self.known)),
+            float(residual.noise_floor[place]),
+        )
         self.phases, self._exclusive = self._phases(residual.standing, description)
         self.variables = self._variables(residual, place, foot_load)
 
-    def _phases(self, standing: np.ndarray, description: RobotDescription) -> tuple[dict[str, np.ndarray], list[str]]:
+    def _phases(
+        self, standing: np.ndarray, description: RobotDescription
+    ) -> tuple[dict[str, np.ndarray], list[str]]:
         """When each phase is, and the names of those that exclude each other."""
         sides, single = description.sides, standing.sum(axis=1) == 1
-        own = next((k for k, leg in enumerate(description.legs.values()) if self.row.name in leg.joints), None)
+        own = next(
+            (k for k, leg in enumerate(description.legs.values()) if self.row.name in leg.joints),
+            None,
+        )
         both = {"double_support": standing.all(axis=1)} if len(sides) == 2 else {}
         if own is None:
-            phases = {f"{side}_support": standing[:, k] & single for k, side in enumerate(sides)} | both
+            phases = {
+                f"{side}_support": standing[:, k] & single for k, side in enumerate(sides)
+            } | both
             return phases, list(phases)
         phases = {"stance": standing[:, own], "swing": ~standing[:, own]}
         return phases | both, list(phases)
 
-    def _variables(self, residual: Residual, place: int, foot_load: Mapping[str, np.ndarray]) -> dict[str, _Variable]:
+    def _variables(
+        self, residual: Residual, place: int, foot_load: Mapping[str, np.ndarray]
+    ) -> dict[str, _Variable]:
         plus, signals = np.ones(len(self.time)), residual.signals
         found = [_Variable("none", 0 * plus, plus, np.array([-np.inf, np.inf]))]
         if self.row.kind == "joint":
@@ -205,18 +255,37 @@ class _RowErrors:
             speeds = self._edges(np.abs(velocity), _SPEED_QUANTILES)[1:-1]
             speeds = speeds[speeds > 0]
             found += [
-                _Variable("speed", np.abs(velocity), np.sign(velocity), np.array([0.0, *speeds, np.inf])),
-                _Variable("velocity", velocity, plus, np.array([-np.inf, *-speeds[::-1], 0.0, *speeds, np.inf])),
+                _Variable(
+                    "speed", np.abs(velocity), np.sign(velocity), np.array([0.0, *speeds, np.inf])
+                ),
+                _Variable(
+                    "velocity",
+                    velocity,
+                    plus,
+                    np.array([-np.inf, *-speeds[::-1], 0.0, *speeds, np.inf]),
+                ),
             ]
-            by_name = {"position": signals.joint_position[:, place], "load": signals.torque_command[:, place]}
+            by_name = {
+                "position": signals.joint_position[:, place],
+                "load": signals.torque_command[:, place],
+            }
         else:
             by_name = {f"{side} foot load": load for side, load in foot_load.items()}
             if self.row.kind == "kinematic":
-                by_name = {name: load for name, load in by_name.items() if self.row.name.startswith((f"{name.split()[0]}_", "soles/"))}
-        found += [_Variable(name, values, plus, self._edges(values, _QUANTILES)) for name, values in by_name.items()]
+                by_name = {
+                    name: load
+                    for name, load in by_name.items()
+                    if self.row.name.startswith((f"{name.split()[0]}_", "soles/"))
+                }
+        found += [
+            _Variable(name, values, plus, self._edges(values, _QUANTILES))
+            for name, values in by_name.items()
+        ]
         bins = int(np.clip((self.time[-1] - self.time[0]) / _TIME_BIN, 1, _MOST_TIME_BINS))
         inner = np.linspace(self.time[0], self.time[-1], bins + 1)[1:-1]
-        found.append(_Variable("time", self.time, plus, np.array([-np.inf, *np.round(inner, 1), np.inf])))
+        found.append(
+            _Variable("time", self.time, plus, np.array([-np.inf, *np.round(inner, 1), np.inf]))
+        )
         return {variable.name: variable for variable in found}
 
     def _edges(self, values: np.ndarray, quantiles: Sequence[float]) -> np.ndarray:
@@ -233,33 +302,64 @@ class _RowErrors:
         """Simple ones first."""
         everywhere = {"all": np.ones_like(self.known)}
         exclusive = {name: self.phases[name] for name in self._exclusive}
-        used = [name for name, phase in exclusive.items() if (phase & self.known).sum() >= _FEWEST_BLOCKS]
+        used = [
+            name
+            for name, phase in exclusive.items()
+            if (phase & self.known).sum() >= _FEWEST_BLOCKS
+        ]
         variables = self.variables.values()
         undivided = [_Division(variable, everywhere) for variable in variables]
         if len(used) < 2:
             return undivided
-        none, *others = [_Division(variable, {name: exclusive[name] for name in used}) for variable in variables]
+        none, *others = [
+            _Division(variable, {name: exclusive[name] for name in used}) for variable in variables
+        ]
         return [undivided[0], none, *undivided[1:], *others]
 
     def bins(self, division: _Division) -> list[Bin]:
         """Mean errors, phase by phase, in order of the variable."""
         variable = division.variable
         ranges = list(itertools.pairwise(variable.edges))
-        found = [self._bin(name, phase, variable, low, high) for name, phase in division.phases.items() for low, high in ranges]
+        found = [
+            self._bin(name, phase, variable, low, high)
+            for name, phase in division.phases.items()
+            for low, high in ranges
+        ]
         return [b for b in found if b is not None]
 
-    def _bin(self, phase: str, when: np.ndarray, variable: _Variable, low: float, high: float) -> Bin | None:
+    def _bin(
+        self, phase: str, when: np.ndarray, variable: _Variable, low: float, high: float
+    ) -> Bin | None:
         inside = self.known & when & (variable.values >= low) & (variable.values < high)
         places, count = np.flatnonzero(inside), int(inside.sum())
         if count < _FEWEST_BLOCKS or len(np.unique(self.stretch[places])) < _FEWEST_STRETCHES:
             return None
         # Neighbouring blocks have correlated noise.
         weight = np.where(inside, variable.sign, 0.0)
-        noise = np.sqrt(max(0.0, (weight**2 * self.variance).sum() + 2 * (weight[:-1] * weight[1:] * self.covariance[:-1]).sum())) / count
+        noise = (
+            np.sqrt(
+                max(
+                    0.0,
+                    (weight**2 * self.variance).sum()
+                    + 2 * (weight[:-1] * weight[1:] * self.covariance[:-1]).sum(),
+                )
+            )
+            / count
+        )
         mean, half = self._mean(self.error[places] * variable.sign[places], places)
         half = max(half, norm.ppf(0.975) * noise)
         centre = float(variable.values[places].mean())
-        return Bin(phase, variable.name, float(low), float(high), centre, count, mean, (mean - half, mean + half), float(noise))
+        return Bin(
+            phase,
+            variable.name,
+            float(low),
+            float(high),
+            centre,
+            count,
+            mean,
+            (mean - half, mean + half),
+            float(noise),
+        )
 
     def _mean(self, values: np.ndarray, places: np.ndarray) -> tuple[float, float]:
         """Mean of values at some blocks, (m,) each, and half of its 95 % interval by the scatter between stretches."""
@@ -274,9 +374,16 @@ class _RowErrors:
         """What is said of the row beside its failures."""
         noise, everywhere = np.sqrt(self.variance), {"all": np.ones_like(self.known)}
         by_phase = {
-            name: (float(rms(self.error, self.known & phase)), float(rms(noise, self.known & phase))) for name, phase in self.phases.items()
+            name: (
+                float(rms(self.error, self.known & phase)),
+                float(rms(noise, self.known & phase)),
+            )
+            for name, phase in self.phases.items()
         }
-        bins = {name: tuple(self.bins(_Division(variable, everywhere))) for name, variable in self.variables.items()}
+        bins = {
+            name: tuple(self.bins(_Division(variable, everywhere)))
+            for name, variable in self.variables.items()
+        }
         nrmse = self._rmse / float(zero) if zero > 0 else np.nan
         return Channel(self.row, self._rmse, self._noise_floor, nrmse, by_phase, bins)
 
@@ -290,32 +397,63 @@ class _RowErrors:
         if self.known.sum() < _FEWEST_BLOCKS:
             return []
         divisions = self.divisions
-        unexplained = np.array([_held_out_sse(self.error, self._cells(division), self.known, self.fold) for division in divisions])
+        unexplained = np.array(
+            [
+                _held_out_sse(self.error, self._cells(division), self.known, self.fold)
+                for division in divisions
+            ]
+        )
         best = divisions[int(np.argmax(unexplained <= _WORTHWHILE * unexplained.min()))]
-        found = [where for phase in best.phases for where in self._outstanding(best, phase, threshold, smallest)]
+        found = [
+            where
+            for phase in best.phases
+            for where in self._outstanding(best, phase, threshold, smallest)
+        ]
         if not found and self._rmse > max(_EXCESS * self._noise_floor, smallest):
             found = [self._scatter()]
-        return [Failure(self.row, where, _text(self.row, where, has_phases=bool(self.phases))) for where in found]
+        return [
+            Failure(self.row, where, _text(self.row, where, has_phases=bool(self.phases)))
+            for where in found
+        ]
 
     def _scatter(self) -> Bin:
         """The root mean square of the whole row."""
         places = np.flatnonzero(self.known)
         mean, half = self._mean(self.error[places] ** 2, places)
         low, high = np.sqrt([max(0.0, mean - half), mean + half]).tolist()
-        return Bin("all", "scatter", -np.inf, np.inf, 0.0, len(places), self._rmse, (low, high), self._noise_floor)
+        return Bin(
+            "all",
+            "scatter",
+            -np.inf,
+            np.inf,
+            0.0,
+            len(places),
+            self._rmse,
+            (low, high),
+            self._noise_floor,
+        )
 
     def _cells(self, division: _Division) -> np.ndarray:
         """Columns of the parts of a division, (B, cells): the sign of the error's variable inside, 0 outside."""
         place = np.digitize(division.variable.values, division.variable.edges[1:-1])
         inside = np.eye(len(division.variable.edges) - 1)[place] * division.variable.sign[:, None]
-        return np.concatenate([inside * phase[:, None] for phase in division.phases.values()], axis=1)
+        return np.concatenate(
+            [inside * phase[:, None] for phase in division.phases.values()], axis=1
+        )
 
-    def _outstanding(self, division: _Division, phase: str, threshold: float, smallest: float) -> list[Bin]:
+    def _outstanding(
+        self, division: _Division, phase: str, threshold: float, smallest: float
+    ) -> list[Bin]:
         """Runs of bins of one phase whose errors have one sign and stand out from the noise: at most one for each sign."""
         bins = self.bins(replace(division, phases={phase: division.phases[phase]}))
         found = []
         for sign in (1, -1):
-            size = [sign * b.error if b.ratio > threshold and b.interval[0] * b.interval[1] > 0 else -np.inf for b in bins]
+            size = [
+                sign * b.error
+                if b.ratio > threshold and b.interval[0] * b.interval[1] > 0
+                else -np.inf
+                for b in bins
+            ]
             if not bins or max(size) < smallest or max(size) <= 0:
                 continue
             first = last = int(np.argmax(size))
@@ -323,7 +461,15 @@ class _RowErrors:
                 first -= 1
             while last + 1 < len(bins) and size[last + 1] >= _SIMILAR * max(size):
                 last += 1
-            found.append(self._bin(phase, division.phases[phase], division.variable, bins[first].low, bins[last].high))
+            found.append(
+                self._bin(
+                    phase,
+                    division.phases[phase],
+                    division.variable,
+                    bins[first].low,
+                    bins[last].high,
+                )
+            )
         return found
 
 
@@ -333,7 +479,9 @@ def _constant(white: WhitenedResidual, row: int) -> tuple[np.ndarray, np.ndarray
     return ones, white.residual.known[:, row], white.fold
 
 
-def _held_out_sse(error: np.ndarray, columns: np.ndarray, known: np.ndarray, fold: np.ndarray) -> float:
+def _held_out_sse(
+    error: np.ndarray, columns: np.ndarray, known: np.ndarray, fold: np.ndarray
+) -> float:
     """Sum of squares of an error (B,) after orthogonal columns (B, p) that are fitted to the other folds."""
     inside = (fold == np.arange(FOLDS)[:, None]) & known
     power, product = inside @ columns**2, inside @ (columns * error[:, None])
@@ -374,7 +522,13 @@ def range_text(row: Row, where: Bin) -> str:
     if from_below and np.isinf(where.high):
         return ""
     if where.variable == "time":
-        return f"until {high} s" if from_below else f"from {low} s on" if np.isinf(where.high) else f"from {low} to {high} s"
+        return (
+            f"until {high} s"
+            if from_below
+            else f"from {low} s on"
+            if np.isinf(where.high)
+            else f"from {low} to {high} s"
+        )
     if from_below:
         return f"{name} < {high} {unit}"
     return f"{name} > {low} {unit}" if np.isinf(where.high) else f"{low} < {name} < {high} {unit}"
@@ -383,7 +537,15 @@ def range_text(row: Row, where: Bin) -> str:
 def _place(row: Row, where: Bin) -> str:
     """Channel, phase and range, as `left knee pitch, swing, |velocity| < 0.1 rad/s`."""
     channel = words(row.name if row.kind == "joint" else row.name.split("/")[0])
-    return ", ".join(part for part in (channel, words(where.phase) if where.phase != "all" else "", range_text(row, where)) if part)
+    return ", ".join(
+        part
+        for part in (
+            channel,
+            words(where.phase) if where.phase != "all" else "",
+            range_text(row, where),
+        )
+        if part
+    )
 
 
 def _digits(value: float) -> str:
@@ -398,7 +560,9 @@ def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
     more = where.error > 0
     if where.variable == "scatter":
         nothing = "neither phase nor any" if has_phases else "none"
-        what = f"an error of {size} {unit} (root mean square) that follows {nothing} of the variables"
+        what = (
+            f"an error of {size} {unit} (root mean square) that follows {nothing} of the variables"
+        )
     elif row.kind == "joint":
         along = " along the motion" if where.variable == "speed" else ""
         what = f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too {'low' if more else 'high'}{along}"
@@ -420,7 +584,11 @@ def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
     """Contents of compare.json. Ranges without a bound have null there."""
     return {
-        "total": {"rmse": comparison.rmse, "noise_floor": 1.0, "held_out_rmse": comparison.held_out_rmse},
+        "total": {
+            "rmse": comparison.rmse,
+            "noise_floor": 1.0,
+            "held_out_rmse": comparison.held_out_rmse,
+        },
         "unit": "multiples of the sensors' noise",
         "channels": {
             channel.row.name: {
@@ -428,12 +596,18 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
                 "rmse": channel.rmse,
                 "nrmse": channel.nrmse,
                 "noise_floor": channel.noise_floor,
-                "by_phase": {name: {"rmse": rmse, "noise_floor": floor} for name, (rmse, floor) in channel.by_phase.items()},
+                "by_phase": {
+                    name: {"rmse": rmse, "noise_floor": floor}
+                    for name, (rmse, floor) in channel.by_phase.items()
+                },
                 "worst": None if channel.worst is None else _bin_json(channel.worst),
             }
             for channel in comparison.channels
         },
-        "failures": [{"channel": f.row.name, **_bin_json(f.where), "unit": f.row.unit, "text": f.text} for f in comparison.failures],
+        "failures": [
+            {"channel": f.row.name, **_bin_json(f.where), "unit": f.row.unit, "text": f.text}
+            for f in comparison.failures
+        ],
     }
 
 

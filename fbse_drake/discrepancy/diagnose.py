@@ -102,18 +102,29 @@ def suspected_bodies(predictor: Predictor) -> list[str]:
     """Bodies whose masses the diagnosis tries: those that weigh something."""
     robot = predictor.robot
     total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-    return [name for name in robot.body_names if robot.body(name).default_mass() > _LIGHT_BODY * total]
+    return [
+        name for name in robot.body_names if robot.body(name).default_mass() > _LIGHT_BODY * total
+    ]
 
 
 def plausible_effects(predictor: Predictor) -> list[type[Effect]]:
     """The library but for what the scenario rules out, and for what acts in the joints of a log without torques."""
     torques = "joint/torque_command" in predictor.motion.log
-    known = {name: effect for name, effect in library().items() if name not in predictor.scenario.identify.ruled_out}
-    return [effect for effect in known.values() if torques or not issubclass(effect, JointTorqueEffect)]
+    known = {
+        name: effect
+        for name, effect in library().items()
+        if name not in predictor.scenario.identify.ruled_out
+    }
+    return [
+        effect for effect in known.values() if torques or not issubclass(effect, JointTorqueEffect)
+    ]
 
 
 def diagnose(
-    predictor: Predictor, effects: Iterable[type[Effect]] | None = None, *, progress: Callable[[str], None] | None = None
+    predictor: Predictor,
+    effects: Iterable[type[Effect]] | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
@@ -126,7 +137,11 @@ def diagnose(
     """
     say = progress or (lambda _: None)
     say("predicting what each effect would do")
-    search = Search(predictor, plausible_effects(predictor) if effects is None else effects, suspected_bodies(predictor))
+    search = Search(
+        predictor,
+        plausible_effects(predictor) if effects is None else effects,
+        suspected_bodies(predictor),
+    )
     before = search.white.sse
     path = select(search, say)
     final, inertia = search.consistent(path[-1])
@@ -140,7 +155,9 @@ def diagnose(
     statuses = {e.__name__: _status(search, final, e, rivals, experiments) for e in search.effects}
     if unexplained and not _well_explained(search.white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif final.candidates or (inertia is not None and final.deviance < search.white.deviance(search.white.sse) - MARGIN):
+    elif final.candidates or (
+        inertia is not None and final.deviance < search.white.deviance(search.white.sse) - MARGIN
+    ):
         verdict = "effect_found"
     else:
         hidden = sum(status.verdict == "not_visible" for status in statuses.values())
@@ -148,7 +165,10 @@ def diagnose(
     white = search.white
     return Diagnosis(
         verdict,
-        (*_ranking(search, path, rivals), *inertia_findings(search.white, before, path[0], inertia)),
+        (
+            *_ranking(search, path, rivals),
+            *inertia_findings(search.white, before, path[0], inertia),
+        ),
         statuses,
         tuple(unexplained),
         tuple(path),
@@ -170,7 +190,9 @@ def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[
             break
         chosen = _spread(search, additions)
         chosen = _revise(search, chosen)
-        say("found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates))
+        say(
+            "found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates)
+        )
         if chosen.deviance > base.deviance - MARGIN:
             break
         path.append(search.polished(search.doubting(chosen)))
@@ -207,14 +229,21 @@ def _spread(search: Search, additions: list[Explanation]) -> Explanation:
         return [e for e in by_joint.get(joint, []) if e.candidates[-1].effect is effect]
 
     if len(added.targets) > 1:
-        simple = [_simplest(by_joint[joint]).candidates[-1].effect for joint in added.targets if joint in by_joint]
+        simple = [
+            _simplest(by_joint[joint]).candidates[-1].effect
+            for joint in added.targets
+            if joint in by_joint
+        ]
         options = [best]
         for effect in dict.fromkeys([added.effect, *simple]):
             own = [e.candidates[-1] for joint in added.targets for e in alone(effect, joint)]
             options += [search.explain([*others, *own])] if own else []
         best = _simplest(sorted(options, key=lambda e: e.deviance))
     effect = best.candidates[-1].effect
-    chosen, taken = [*best.candidates], {target for c in best.candidates if c.effect is effect for target in c.targets}
+    chosen, taken = (
+        [*best.candidates],
+        {target for c in best.candidates if c.effect is effect for target in c.targets},
+    )
     for joint, there in by_joint.items():
         same = alone(effect, joint)
         if joint not in taken and same and same[0].deviance < there[0].deviance + MARGIN:
@@ -252,7 +281,11 @@ def _rivals(search: Search, final: Explanation) -> dict[int, list[Explanation]]:
     result = {}
     for k, member in enumerate(final.candidates):
         rest = search.explain([c for c in final.candidates if c is not member])
-        additions = [e for e in search.best_additions(rest, member.signature.rows) if len(e.candidates) == len(final.candidates)]
+        additions = [
+            e
+            for e in search.best_additions(rest, member.signature.rows)
+            if len(e.candidates) == len(final.candidates)
+        ]
         result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
     return result
 
@@ -261,16 +294,25 @@ def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = sl
     return float(np.sqrt(sse[rows].sum() / max(1, white.count[rows].sum())))
 
 
-def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Explanation]]) -> list[Finding]:
+def _ranking(
+    search: Search, path: list[Explanation], rivals: dict[int, list[Explanation]]
+) -> list[Finding]:
     final, white = path[-1], search.white
-    without = [search.explain([c for c in final.candidates if c is not member]) for member in final.candidates]
+    without = [
+        search.explain([c for c in final.candidates if c is not member])
+        for member in final.candidates
+    ]
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
-        equal = tuple(dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(search, e, final)))
+        equal = tuple(
+            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(search, e, final))
+        )
         findings.append(finding_of(white, rest, final, member, equal, chosen=True))
     seen = {(f.effect, f.targets) for f in findings}
-    others = sorted((e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance)
+    others = sorted(
+        (e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance
+    )
     for explanation in others:
         member = explanation.candidates[-1]
         if (member.name, member.targets) not in seen:
@@ -281,7 +323,13 @@ def _ranking(search: Search, path: list[Explanation], rivals: dict[int, list[Exp
 
 
 def finding_of(
-    white: WhitenedResidual, before: Explanation, after: Explanation, member: Candidate, equal: tuple[str, ...], *, chosen: bool
+    white: WhitenedResidual,
+    before: Explanation,
+    after: Explanation,
+    member: Candidate,
+    equal: tuple[str, ...],
+    *,
+    chosen: bool,
 ) -> Finding:
     """What a member of an explanation brings.
 
@@ -290,7 +338,10 @@ def finding_of(
         equal: effects that explain as much.
     """
     values, intervals = after.values(member)
-    parameters = {name: Estimate(values[name], intervals[name], member.parameters[name].unit) for name in values}
+    parameters = {
+        name: Estimate(values[name], intervals[name], member.parameters[name].unit)
+        for name in values
+    }
     rows = member.signature.rows
     return Finding(
         member.name,
@@ -303,7 +354,12 @@ def finding_of(
     )
 
 
-def inertia_findings(white: WhitenedResidual, before: np.ndarray, alone: Explanation, inertia: IdentifiedInertia | None) -> list[Finding]:
+def inertia_findings(
+    white: WhitenedResidual,
+    before: np.ndarray,
+    alone: Explanation,
+    inertia: IdentifiedInertia | None,
+) -> list[Finding]:
     """Changes of the inertial parameters of each body.
 
     Args:
@@ -313,30 +369,47 @@ def inertia_findings(white: WhitenedResidual, before: np.ndarray, alone: Explana
     if inertia is None:
         return []
     findings = []
-    for body, values, widths in zip(inertia.bodies, inertia.change, inertia.half_width, strict=True):
+    for body, values, widths in zip(
+        inertia.bodies, inertia.change, inertia.half_width, strict=True
+    ):
         parameters = {
-            name: Estimate(float(value), (float(value - width), float(value + width)), InertialParameters.parameters[name].unit)
+            name: Estimate(
+                float(value),
+                (float(value - width), float(value + width)),
+                InertialParameters.parameters[name].unit,
+            )
             for name, value, width in zip(PARAMETERS, values, widths, strict=True)
         }
         errors = (_rms(white, sse) for sse in (before, alone.held_out_sse))
-        findings.append(Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True))
+        findings.append(
+            Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True)
+        )
     return findings
 
 
-def _well_explained(white: WhitenedResidual, final: Explanation, unexplained: Sequence[Structure]) -> bool:
+def _well_explained(
+    white: WhitenedResidual, final: Explanation, unexplained: Sequence[Structure]
+) -> bool:
     """Is what is left small beside what the explanation takes away, in every row?"""
     if not final.candidates:
         return False
     for structure in unexplained:
         row = structure.index
-        before, after = white.sse[row] - white.count[row], final.held_out_sse[row] - white.count[row]
+        before, after = (
+            white.sse[row] - white.count[row],
+            final.held_out_sse[row] - white.count[row],
+        )
         if after > (1 - _EXPLAINED) * before or structure.ratio > _LARGEST_REST:
             return False
     return True
 
 
 def _status(
-    search: Search, final: Explanation, effect: type[Effect], rivals: dict[int, list[Explanation]], experiments: Experiments
+    search: Search,
+    final: Explanation,
+    effect: type[Effect],
+    rivals: dict[int, list[Explanation]],
+    experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
     smallest = search.smallest_detectable(final, effect)
@@ -344,27 +417,37 @@ def _status(
     mistaken_for = [
         final.candidates[k]
         for k, alternatives in rivals.items()
-        if any(e.candidates[-1].effect is effect and _equals(search, e, final) for e in alternatives)
+        if any(
+            e.candidates[-1].effect is effect and _equals(search, e, final) for e in alternatives
+        )
     ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"
     elif mistaken_for:
         verdict = "confusable"
         member = mistaken_for[0]
-        scenario = experiments.that_separates(member.effect, member.targets, final.values(member)[0], effect)
+        scenario = experiments.that_separates(
+            member.effect, member.targets, final.values(member)[0], effect
+        )
     elif all(size > search.largest_plausible(effect, target) for target, size in smallest.items()):
         verdict = "not_visible"
         scenario = experiments.that_shows(effect)
     else:
         verdict = "absent"
-    units = dict.fromkeys(search.parameters(effect, target)[parameter].unit for target in smallest) or [effect.parameters[parameter].unit]
-    return EffectStatus(verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario)
+    units = dict.fromkeys(
+        search.parameters(effect, target)[parameter].unit for target in smallest
+    ) or [effect.parameters[parameter].unit]
+    return EffectStatus(
+        verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
+    )
 
 
 def _equals(search: Search, rival: Explanation, final: Explanation) -> bool:
     """Does a rival explain as much? One with fewer parameters does also if chance may have brought what the final explanation has more."""
     more = len(final.fit.parameters) - len(rival.fit.parameters)
-    return rival.deviance < final.deviance + (search.threshold[min(12, more)] if more > 0 else MARGIN)
+    return rival.deviance < final.deviance + (
+        search.threshold[min(12, more)] if more > 0 else MARGIN
+    )
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -381,7 +464,10 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "joints": list(f.targets),
                 "held_out_before": f.held_out_before,
                 "held_out_after": f.held_out_after,
-                "parameters": {n: {"value": e.value, "interval": list(e.interval), "unit": e.unit} for n, e in f.parameters.items()},
+                "parameters": {
+                    n: {"value": e.value, "interval": list(e.interval), "unit": e.unit}
+                    for n, e in f.parameters.items()
+                },
                 "confusable_with": list(f.confusable_with),
                 "chosen": f.chosen,
             }
@@ -390,7 +476,10 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "effects": {
             name: {
                 "verdict": s.verdict,
-                "smallest_detectable": max((size for size in s.smallest_detectable.values() if np.isfinite(size)), default=np.inf),
+                "smallest_detectable": max(
+                    (size for size in s.smallest_detectable.values() if np.isfinite(size)),
+                    default=np.inf,
+                ),
                 "parameter": s.parameter,
                 "unit": s.unit,
                 "smallest_detectable_by_target": s.smallest_detectable,
@@ -400,5 +489,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for name, s in diagnosis.effects.items()
         },
-        "unexplained": [{"row": u.row, "ratio": u.ratio, "variable": u.variable, "share": u.share} for u in diagnosis.unexplained],
+        "unexplained": [
+            {"row": u.row, "ratio": u.ratio, "variable": u.variable, "share": u.share}
+            for u in diagnosis.unexplained
+        ],
     }

@@ -64,27 +64,47 @@ class Evidence:
             "imu/angular_velocity": axes,
         }
         for side in self.sides:
-            names[f"foot/{side}/wrench"] = [f"{kind}_{axis}" for kind in ("moment", "force") for axis in axes]
+            names[f"foot/{side}/wrench"] = [
+                f"{kind}_{axis}" for kind in ("moment", "force") for axis in axes
+            ]
             if (pads := f"foot/{side}/pad_force") in self.log:
-                names[pads] = [f"pad {pad + 1} {axis}" for pad in range(self.log[pads].shape[1]) for axis in axes]
-        return {name: (self.log[name].reshape(len(self.log.time), -1), parts) for name, parts in names.items() if name in self.log}
+                names[pads] = [
+                    f"pad {pad + 1} {axis}"
+                    for pad in range(self.log[pads].shape[1])
+                    for axis in axes
+                ]
+        return {
+            name: (self.log[name].reshape(len(self.log.time), -1), parts)
+            for name, parts in names.items()
+            if name in self.log
+        }
 
     @cached_property
     def quantum(self) -> dict[str, np.ndarray]:
         """Steps in which each channel's components come; 0 where there are none."""
-        return {name: np.array([step_of(column) for column in values.T]) for name, (values, _) in self.channels.items()}
+        return {
+            name: np.array([step_of(column) for column in values.T])
+            for name, (values, _) in self.channels.items()
+        }
 
     @cached_property
     def instants(self) -> Instants:
         """Steps at the log's own rate and not filtered for the diagnosis, at most some thousand from its middle."""
         motion = self._read(cutoff=0.0)
         start = max(0, (len(motion.steps.joint_position) - _SAMPLES) // 2)
-        return Instants(**{name: values[start : start + _SAMPLES] for name, values in vars(motion.steps).items()})
+        return Instants(
+            **{
+                name: values[start : start + _SAMPLES]
+                for name, values in vars(motion.steps).items()
+            }
+        )
 
     def _read(self, **changes: object) -> RecordedMotion:
         """The log read in another way."""
         motion = self.motion
-        return RecordedMotion(motion.robot, motion.sensors, replace(motion.recording, **changes), motion.log)
+        return RecordedMotion(
+            motion.robot, motion.sensors, replace(motion.recording, **changes), motion.log
+        )
 
     @cached_property
     def known(self) -> np.ndarray:
@@ -94,7 +114,10 @@ class Evidence:
     def needed_and_given(self, at: Instants) -> tuple[np.ndarray, np.ndarray]:
         """What the masses need of the feet and what the feet give, [moment, force] on the base in its axes, (M, 6) each."""
         unloaded = replace(at, pad_force=np.zeros_like(at.pad_force))
-        without, left = (self.motion.equation.residual(one, kinematic=False)[:, len(self.joints) :] for one in (unloaded, at))
+        without, left = (
+            self.motion.equation.residual(one, kinematic=False)[:, len(self.joints) :]
+            for one in (unloaded, at)
+        )
         return -without, left - without
 
     @cached_property
@@ -116,7 +139,10 @@ class Evidence:
         """The same for other wrenches on the feet: the others carry the robot."""
         weight = self.motion.equation.weight
         loads = np.stack([np.abs(wrench[:, 5]) for wrench in wrenches])
-        return [(load < _UNLOADED * weight) & (loads.sum(axis=0) - load > _LOADED * weight) for load in loads]
+        return [
+            (load < _UNLOADED * weight) & (loads.sum(axis=0) - load > _LOADED * weight)
+            for load in loads
+        ]
 
     @cached_property
     def link_torque(self) -> np.ndarray:
@@ -127,7 +153,10 @@ class Evidence:
     @cached_property
     def units(self) -> dict[str, dict[str, str]]:
         """Unit of each joint in the joint channels."""
-        of_angle = {joint: "m" if unit == "N" else "rad" for joint, unit in zip(self.joints, self.robot.torque_units, strict=True)}
+        of_angle = {
+            joint: "m" if unit == "N" else "rad"
+            for joint, unit in zip(self.joints, self.robot.torque_units, strict=True)
+        }
         return {
             "joint/position": of_angle,
             "joint/velocity": {joint: f"{unit}/s" for joint, unit in of_angle.items()},
@@ -135,13 +164,28 @@ class Evidence:
         }
 
 
-def remark(kind: str, severity: Severity, channel: str, size: float, unit: str, text: str, where: Iterable[str] = ()) -> HygieneFinding:
+def remark(
+    kind: str,
+    severity: Severity,
+    channel: str,
+    size: float,
+    unit: str,
+    text: str,
+    where: Iterable[str] = (),
+) -> HygieneFinding:
     """A finding whose line begins with its channel."""
-    return HygieneFinding(channel, tuple(where), kind, float(size), unit, severity, f"{channel}: {text}")
+    return HygieneFinding(
+        channel, tuple(where), kind, float(size), unit, severity, f"{channel}: {text}"
+    )
 
 
 def remarks(
-    kind: str, severity: Severity, channel: str, sizes: Mapping[str, float], unit: str | Mapping[str, str], text: str
+    kind: str,
+    severity: Severity,
+    channel: str,
+    sizes: Mapping[str, float],
+    unit: str | Mapping[str, str],
+    text: str,
 ) -> list[HygieneFinding]:
     """One finding for all components of a channel that show the same; the worst comes first, and its size is that of the finding.
 
@@ -156,7 +200,11 @@ def remarks(
     unit = unit if isinstance(unit, str) else unit[first]
     size = f"{sizes[first]:.3g}" if unit == "1" else f"{sizes[first]:.3g} {unit}"
     named = f"{first} and {len(others)} more" if others else first
-    return [remark(kind, severity, channel, sizes[first], unit, text.format(where=named, size=size), where)]
+    return [
+        remark(
+            kind, severity, channel, sizes[first], unit, text.format(where=named, size=size), where
+        )
+    ]
 
 
 def step_of(column: np.ndarray) -> float:

@@ -51,14 +51,18 @@ def planned_log(scenario: Scenario) -> Log:
         np.zeros((len(coarse), n)),
     )
     if robot.has_floating_base and reference.plan is not None:
-        support = np.stack([reference.plan.support(side) for side in robot.description.sides], axis=1)
+        support = np.stack(
+            [reference.plan.support(side) for side in robot.description.sides], axis=1
+        )
         at = replace(at, pad_force=_standing_forces(equation, at, support))
     at = replace(at, torque_command=-equation.residual(at, kinematic=False)[:, :n])
     fine = np.arange(int(scenario.duration / period) + 1) * period
 
     def sampled(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
-        return np.stack([np.interp(fine, coarse, column) for column in flat.T], axis=1).reshape(len(fine), *values.shape[1:])
+        return np.stack([np.interp(fine, coarse, column) for column in flat.T], axis=1).reshape(
+            len(fine), *values.shape[1:]
+        )
 
     channels = {
         "time": fine,
@@ -71,7 +75,12 @@ def planned_log(scenario: Scenario) -> Log:
     force = sampled(at.pad_force)
     for foot, side in enumerate(robot.description.sides):
         channels[f"foot/{side}/pad_force"] = force[:, equation.pads.foot == foot]
-    meta = {"joints": robot.joint_names, "sides": robot.description.sides, "period": period, "source": "planned motion"}
+    meta = {
+        "joints": robot.joint_names,
+        "sides": robot.description.sides,
+        "period": period,
+        "source": "planned motion",
+    }
     return Log(channels, meta)
 
 
@@ -90,7 +99,9 @@ def _standing_forces(equation: EquationOfMotion, at: Instants, support: np.ndarr
     for k in range(3 * pads):
         unit = np.zeros((len(needed), pads, 3))
         unit.reshape(len(needed), -1)[:, k] = 1.0
-        columns[:, :, k] = equation.residual(replace(at, pad_force=unit), kinematic=False)[:, n:] - needed
+        columns[:, :, k] = (
+            equation.residual(replace(at, pad_force=unit), kinematic=False)[:, n:] - needed
+        )
     columns *= np.repeat(support[:, equation.pads.foot], 3, axis=1)[:, None, :]
     forces = -np.einsum("mij,mj->mi", np.linalg.pinv(columns), needed)
     return forces.reshape(len(needed), pads, 3)
@@ -122,7 +133,10 @@ class Experiments:
         return found
 
     def _searches(self, effect: type[Effect]) -> dict[str, Search]:
-        return {name: Search(predictor, [effect], self._bodies) for name, predictor in self._predictors.items()}
+        return {
+            name: Search(predictor, [effect], self._bodies)
+            for name, predictor in self._predictors.items()
+        }
 
     def that_shows(self, effect: type[Effect]) -> str | None:
         """Name of the scenario that would show the smallest size of an effect, if that is a plausible one."""
@@ -133,9 +147,18 @@ class Experiments:
         best = min(sizes, key=lambda name: sizes[name], default=None)
         return best if best is not None and sizes[best] < effect.largest_plausible() else None
 
-    def that_separates(self, effect: type[Effect], targets: Sequence[str], values: Mapping[str, float], rival: type[Effect]) -> str | None:
+    def that_separates(
+        self,
+        effect: type[Effect],
+        targets: Sequence[str],
+        values: Mapping[str, float],
+        rival: type[Effect],
+    ) -> str | None:
         """Name of the scenario in which an effect, with its values, could least be taken for a rival, if it could not."""
-        differences = {name: search.separation(effect, targets, values, rival) for name, search in self._searches(rival).items()}
+        differences = {
+            name: search.separation(effect, targets, values, rival)
+            for name, search in self._searches(rival).items()
+        }
         best = max(differences, key=lambda name: differences[name], default=None)
         return best if best is not None and differences[best] > MARGIN else None
 
@@ -149,6 +172,8 @@ def _motions(scenario: Scenario) -> dict[str, Scenario]:
         except InputError:
             continue
         same_robot = other.believed.description == scenario.believed.description
-        if same_robot and all(other.reference != known.reference for known in (scenario, *found.values())):
+        if same_robot and all(
+            other.reference != known.reference for known in (scenario, *found.values())
+        ):
             found[path.stem] = other
     return found

@@ -59,7 +59,9 @@ class Draw:
     def vector(self, size: float, names: Sequence[str]) -> dict[str, float]:
         """A vector of this length in any direction."""
         direction = self.random.normal(size=len(names))
-        return dict(zip(names, (size * direction / np.linalg.norm(direction)).tolist(), strict=True))
+        return dict(
+            zip(names, (size * direction / np.linalg.norm(direction)).tolist(), strict=True)
+        )
 
 
 Values = Callable[[Draw, float], dict[str, float]]
@@ -101,8 +103,12 @@ _RECIPES = {
     "TorqueDelay": Recipe((5e-4, 3e-3), _one("delay")),
     "TorqueLag": Recipe((5e-4, 3e-3), _one("time_constant")),
     # Size: the share of the joint's largest torque that is cut off.
-    "TorqueSaturation": Recipe((0.03, 0.2), lambda draw, size: {"limit": (1 - size) * float(np.abs(draw.torque).max())}),
-    "CoulombFriction": Recipe((0.2, 8.0), lambda draw, size: {"coulomb": size, **_sharp(draw)}, everywhere=True),
+    "TorqueSaturation": Recipe(
+        (0.03, 0.2), lambda draw, size: {"limit": (1 - size) * float(np.abs(draw.torque).max())}
+    ),
+    "CoulombFriction": Recipe(
+        (0.2, 8.0), lambda draw, size: {"coulomb": size, **_sharp(draw)}, everywhere=True
+    ),
     "ViscousFriction": Recipe((0.2, 8.0), _one("viscous"), everywhere=True),
     "StribeckFriction": Recipe(
         (0.5, 5.0),
@@ -116,15 +122,35 @@ _RECIPES = {
         },
         everywhere=True,
     ),
-    "DirectionalFriction": Recipe((0.5, 5.0), lambda draw, size: {"asymmetry": draw.either(size), **_sharp(draw)}),
+    "DirectionalFriction": Recipe(
+        (0.5, 5.0), lambda draw, size: {"asymmetry": draw.either(size), **_sharp(draw)}
+    ),
     "DirectionalViscousFriction": Recipe((0.2, 8.0), _signed("asymmetry")),
-    "LoadDependentFriction": Recipe((0.01, 0.2), lambda draw, size: {"coefficient": size, **_sharp(draw)}, everywhere=True),
+    "LoadDependentFriction": Recipe(
+        (0.01, 0.2), lambda draw, size: {"coefficient": size, **_sharp(draw)}, everywhere=True
+    ),
     "QuadraticDrag": Recipe((0.5, 8.0), _one("drag")),
-    "ThermalDrift": Recipe((1.0, 10.0), lambda draw, size: {"change": size, "warm_up": draw.between(2, 15), **_sharp(draw)}),
-    "TorqueRipple": Recipe((0.3, 3.0), lambda draw, size: {**draw.vector(size, ("sine", "cosine")), "cycles": draw.between(10, 200)}),
-    "JointSpring": Recipe((5.0, 60.0), lambda draw, size: {"stiffness": size, "preload": size * draw.uniform(-0.3, 0.3)}),
-    "PreslidingHysteresis": Recipe((0.5, 8.0), lambda draw, size: {"coulomb": size, "displacement": draw.between(2e-3, 2e-2)}),
-    "Backlash": Recipe((5e-4, 5e-3), lambda draw, size: {"gap": size, "rotor_inertia": draw.between(0.1, 0.5)}),
+    "ThermalDrift": Recipe(
+        (1.0, 10.0),
+        lambda draw, size: {"change": size, "warm_up": draw.between(2, 15), **_sharp(draw)},
+    ),
+    "TorqueRipple": Recipe(
+        (0.3, 3.0),
+        lambda draw, size: {
+            **draw.vector(size, ("sine", "cosine")),
+            "cycles": draw.between(10, 200),
+        },
+    ),
+    "JointSpring": Recipe(
+        (5.0, 60.0),
+        lambda draw, size: {"stiffness": size, "preload": size * draw.uniform(-0.3, 0.3)},
+    ),
+    "PreslidingHysteresis": Recipe(
+        (0.5, 8.0), lambda draw, size: {"coulomb": size, "displacement": draw.between(2e-3, 2e-2)}
+    ),
+    "Backlash": Recipe(
+        (5e-4, 5e-3), lambda draw, size: {"gap": size, "rotor_inertia": draw.between(0.1, 0.5)}
+    ),
     "ReflectedInertia": Recipe((0.02, 0.4), _one("inertia"), everywhere=True),
     "BodyMass": Recipe((0.2, 4.0), _one("mass")),
     "BodyCentreOfMass": Recipe((4e-3, 3e-2), _vector("xyz")),
@@ -137,11 +163,18 @@ _RECIPES = {
     "GyroscopeBias": Recipe((2e-3, 4e-2), _vector("xyz")),
     "ImuMisalignment": Recipe((5e-3, 4e-2), _vector("xyz")),
     "EncoderOffset": Recipe((1e-3, 1e-2), _signed("offset")),
-    "TransmissionElasticity": Recipe((1e-5, 1e-4), lambda draw, size: {"compliance": size, "time_constant": draw.between(5e-3, 1.5e-2)}),
+    "TransmissionElasticity": Recipe(
+        (1e-5, 1e-4),
+        lambda draw, size: {"compliance": size, "time_constant": draw.between(5e-3, 1.5e-2)},
+    ),
     # Strangers.
-    "TorqueHum": Recipe((1.0, 5.0), lambda draw, size: {"amplitude": size, "frequency": draw.between(1, 8)}),
+    "TorqueHum": Recipe(
+        (1.0, 5.0), lambda draw, size: {"amplitude": size, "frequency": draw.between(1, 8)}
+    ),
     "NeighbourTorque": Recipe((0.03, 0.15), _signed("share")),
-    "UnevenFriction": Recipe((1.0, 8.0), lambda draw, size: {"coulomb": size, "unevenness": draw.uniform(0.6, 1.0)}),
+    "UnevenFriction": Recipe(
+        (1.0, 8.0), lambda draw, size: {"coulomb": size, "unevenness": draw.uniform(0.6, 1.0)}
+    ),
     "TorqueDropouts": Recipe((0.2, 0.8), _one("depth")),
     "RoughSpot": Recipe(
         (2.0, 12.0),
@@ -181,7 +214,9 @@ class HiddenEffect:
         return (library() | STRANGERS)[self.effect]
 
     def make(self) -> Effect:
-        return self.kind.from_values(self.targets, {name: list(values.values()) for name, values in self.parameters.items()})
+        return self.kind.from_values(
+            self.targets, {name: list(values.values()) for name, values in self.parameters.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -206,7 +241,15 @@ class Exercise:
     answer: Answer
 
 
-def draw(scenario: Scenario, seed: int, *, what: str = "any", size: Size | None = None, count: int = 1, shrunk: float = 1.0) -> Answer:
+def draw(
+    scenario: Scenario,
+    seed: int,
+    *,
+    what: str = "any",
+    size: Size | None = None,
+    count: int = 1,
+    shrunk: float = 1.0,
+) -> Answer:
     """Draws what is hidden.
 
     Args:
@@ -224,7 +267,9 @@ def draw(scenario: Scenario, seed: int, *, what: str = "any", size: Size | None 
     known = {name: effect for name, effect in library().items() if not effect.composite}
     kinds = ("any", "library", "decoy", "stranger")
     if what not in (*kinds, *known, *STRANGERS):
-        raise InputError(f"what: expected one of {', '.join((*kinds, *known, *STRANGERS))}, found {what}")
+        raise InputError(
+            f"what: expected one of {', '.join((*kinds, *known, *STRANGERS))}, found {what}"
+        )
     if size not in (None, *SIZES):
         raise InputError(f"size: expected one of {', '.join(SIZES)}, found {size}")
     random = np.random.default_rng(seed)
@@ -242,8 +287,13 @@ def draw(scenario: Scenario, seed: int, *, what: str = "any", size: Size | None 
         possible = [name for name, effect in pool.items() if _possible(effect, scenario, robot)]
         if not 0 < count <= len(possible):
             raise InputError(f"count: expected 1 to {len(possible)} effects, found {count}")
-        names = [str(name) for name in random.choice(possible, 1 if pool is STRANGERS else count, replace=False)]
-    reference = make_reference(scenario.reference, robot, np.arange(round(scenario.duration / _COARSE) + 1) * _COARSE)
+        names = [
+            str(name)
+            for name in random.choice(possible, 1 if pool is STRANGERS else count, replace=False)
+        ]
+    reference = make_reference(
+        scenario.reference, robot, np.arange(round(scenario.duration / _COARSE) + 1) * _COARSE
+    )
     hidden: list[HiddenEffect] = []
     for name in names:
         taken = [target for other in hidden for target in other.targets]
@@ -255,30 +305,52 @@ def draw(scenario: Scenario, seed: int, *, what: str = "any", size: Size | None 
 
 
 def _hidden_effect(
-    random: np.random.Generator, effect: type[Effect], targets: tuple[str, ...], size: float, robot: Robot, reference: Reference
+    random: np.random.Generator,
+    effect: type[Effect],
+    targets: tuple[str, ...],
+    size: float,
+    robot: Robot,
+    reference: Reference,
 ) -> HiddenEffect:
     """An effect of a size: the same on every target, but on all joints different."""
     draws = []
     for target in targets:
         joints = [robot.joint_names.index(target)] if effect.acts_on == "joint" else []
-        draws.append(Draw(random, reference.joint_position[:, joints], reference.feedforward_torque[:, joints]))
+        draws.append(
+            Draw(
+                random, reference.joint_position[:, joints], reference.feedforward_torque[:, joints]
+            )
+        )
     recipe = _recipe(effect)
     if len(targets) == len(robot.joint_names):
         values = [recipe.values(draw, size * draw.uniform(0.5, 1.0)) for draw in draws]
     else:
         values = [recipe.values(draws[0], size)] * len(targets)
-    parameters = {name: dict(zip(targets, (of_target[name] for of_target in values), strict=True)) for name in values[0]}
+    parameters = {
+        name: dict(zip(targets, (of_target[name] for of_target in values), strict=True))
+        for name in values[0]
+    }
     return HiddenEffect(effect.__name__, targets, size, parameters)
 
 
 def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
     """Can the robot have it? In a gantry, only in its joints; feet creep only if the contact solver lets them."""
-    if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in ("lagged", "similar"):
+    if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in (
+        "lagged",
+        "similar",
+    ):
         return False
     return effect.acts_on == "joint" or robot.has_floating_base
 
 
-def _targets(random: np.random.Generator, effect: type[Effect], robot: Robot, taken: Collection[str], *, alone: bool) -> tuple[str, ...]:
+def _targets(
+    random: np.random.Generator,
+    effect: type[Effect],
+    robot: Robot,
+    taken: Collection[str],
+    *,
+    alone: bool,
+) -> tuple[str, ...]:
     """One target, none of those taken; or, unless it is to be alone, a joint of every leg, or all joints."""
     names = robot.description
     if effect.acts_on == "robot":
@@ -287,8 +359,21 @@ def _targets(random: np.random.Generator, effect: type[Effect], robot: Robot, ta
         return (str(random.choice(names.sides)),)
     if effect.acts_on == "body":
         masses = {body: robot.plant.GetBodyByName(body).default_mass() for body in robot.body_names}
-        return (str(random.choice([body for body, mass in masses.items() if mass > _LIGHT_BODY * sum(masses.values())])),)
-    chance, joint = random.random(), str(random.choice([joint for joint in robot.joint_names if joint not in taken]))
+        return (
+            str(
+                random.choice(
+                    [
+                        body
+                        for body, mass in masses.items()
+                        if mass > _LIGHT_BODY * sum(masses.values())
+                    ]
+                )
+            ),
+        )
+    chance, joint = (
+        random.random(),
+        str(random.choice([joint for joint in robot.joint_names if joint not in taken])),
+    )
     if alone or chance < 0.5 or len(robot.joint_names) == 1:
         return (joint,)
     if _recipe(effect).everywhere and chance < 0.75:
@@ -328,7 +413,14 @@ def make_exercise(
     raise InputError(f"nothing can be hidden in this scenario: {outcome['reason']}")
 
 
-def record(scenario: Scenario, name: str, answer: Answer, seed: int, *, progress: Callable[[float], None] | None = None) -> Exercise:
+def record(
+    scenario: Scenario,
+    name: str,
+    answer: Answer,
+    seed: int,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> Exercise:
     """Simulates a scenario's robot with what is hidden in it.
 
     The model becomes the robot's twin: it lacks what is hidden, and nothing else.
@@ -344,13 +436,25 @@ def record(scenario: Scenario, name: str, answer: Answer, seed: int, *, progress
     """
     public = replace(scenario, model=scenario.robot)
     noise = int(np.random.default_rng([seed, 1]).integers(2**31))
-    effects = scenario.robot.effects | {f"hidden_{k}": hidden.make() for k, hidden in enumerate(answer.effects)}
-    result = simulate(replace(public, seed=noise, robot=replace(scenario.robot, effects=effects)), name=name, progress=progress)
+    effects = scenario.robot.effects | {
+        f"hidden_{k}": hidden.make() for k, hidden in enumerate(answer.effects)
+    }
+    result = simulate(
+        replace(public, seed=noise, robot=replace(scenario.robot, effects=effects)),
+        name=name,
+        progress=progress,
+    )
     outcome = result.log.meta["outcome"]
     if not outcome["finished"] and not outcome["fell"]:
         raise KeyboardInterrupt
-    channels = {key: values for key, values in result.log.items() if not key.startswith(("truth/", "estimate/"))}
-    return Exercise(public, Log(channels, result.log.meta | {"scenario": dump_scenario(public, name)}), answer)
+    channels = {
+        key: values
+        for key, values in result.log.items()
+        if not key.startswith(("truth/", "estimate/"))
+    }
+    return Exercise(
+        public, Log(channels, result.log.meta | {"scenario": dump_scenario(public, name)}), answer
+    )
 
 
 def hide(
@@ -365,7 +469,9 @@ def hide(
     progress: Callable[[float], None] | None = None,
 ) -> None:
     """Writes an exercise to a folder: `log.npz`, `scenario.yaml` and `answer.sealed`. Arguments: see `make_exercise`."""
-    exercise = make_exercise(scenario, name, seed, what=what, size=size, count=count, progress=progress)
+    exercise = make_exercise(
+        scenario, name, seed, what=what, size=size, count=count, progress=progress
+    )
     exercise.log.save(out / "log.npz")
     write_text(out / "scenario.yaml", dump_scenario(exercise.scenario, name))
     write_text(out / "answer.sealed", seal(exercise.answer))
@@ -391,7 +497,10 @@ def unseal(text: str) -> Answer:
         tree = json.loads(zlib.decompress(data))
     except (ValueError, binascii.Error, zlib.error):
         raise InputError("the sealed answer is damaged") from None
-    effects = tuple(HiddenEffect(**(effect | {"targets": tuple(effect["targets"])})) for effect in tree["effects"])
+    effects = tuple(
+        HiddenEffect(**(effect | {"targets": tuple(effect["targets"])}))
+        for effect in tree["effects"]
+    )
     return Answer(**(tree | {"effects": effects}))
 
 
@@ -418,7 +527,9 @@ def reveal(folder: Path) -> dict[str, Any]:
                 diagnoses = found["diagnoses"] if file.stem == "study" else [found]
                 return {"answer": asdict(answer), "score": asdict(score(answer, diagnoses))}
             except (ValueError, KeyError, TypeError) as error:
-                raise InputError(f"{file}: not the contents of a {file.name} (at {error})") from None
+                raise InputError(
+                    f"{file}: not the contents of a {file.name} (at {error})"
+                ) from None
     return {"answer": asdict(answer), "score": None}
 
 
@@ -448,22 +559,37 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
     Args:
         diagnoses: contents of diagnosis.json of each round.
     """
-    chosen = [finding for diagnosis in diagnoses for finding in diagnosis["ranking"] if finding["chosen"]]
-    hidden = {effect.effect: effect for effect in answer.effects} if answer.kind == "library" else {}
+    chosen = [
+        finding for diagnosis in diagnoses for finding in diagnosis["ranking"] if finding["chosen"]
+    ]
+    hidden = (
+        {effect.effect: effect for effect in answer.effects} if answer.kind == "library" else {}
+    )
 
     found, confusable, targets, covered = {}, {}, {}, {}
     for name, effect in hidden.items():
         named = [finding for finding in chosen if finding["effect"] == name]
         found[name] = bool(named)
-        confusable[name] = not named and any(name in finding["confusable_with"] for finding in chosen)
-        targets[name] = {target for finding in named for target in finding["joints"]} == set(effect.targets)
+        confusable[name] = not named and any(
+            name in finding["confusable_with"] for finding in chosen
+        )
+        targets[name] = {target for finding in named for target in finding["joints"]} == set(
+            effect.targets
+        )
         for finding in named:
             shared = [target for target in effect.targets if target in finding["joints"]]
             for parameter, estimate in finding["parameters"].items():
                 low, high = estimate["interval"]
                 # Targets that share a value share its interval, which counts once.
-                truth = {effect.parameters[parameter][target]: target for target in shared} if parameter in effect.parameters else {}
-                covered |= {f"{name}.{target}.{parameter}": low <= value <= high for value, target in truth.items()}
+                truth = (
+                    {effect.parameters[parameter][target]: target for target in shared}
+                    if parameter in effect.parameters
+                    else {}
+                )
+                covered |= {
+                    f"{name}.{target}.{parameter}": low <= value <= high
+                    for value, target in truth.items()
+                }
     wrong = [f["effect"] for f in chosen if not {f["effect"], *f["confusable_with"]} & set(hidden)]
     verdict = {
         "library": diagnoses[0]["verdict"] == "effect_found",

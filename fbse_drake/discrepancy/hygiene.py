@@ -28,7 +28,9 @@ class Hygiene:
 
     def before(self, outcome: str) -> str:
         """A result with what is not to be trusted of it said first."""
-        return " ".join([*(f"Not to be trusted: {finding.text}." for finding in self.untrustworthy), outcome])
+        return " ".join(
+            [*(f"Not to be trusted: {finding.text}." for finding in self.untrustworthy), outcome]
+        )
 
 
 def inspect(motion: RecordedMotion) -> Hygiene:
@@ -38,13 +40,18 @@ def inspect(motion: RecordedMotion) -> Hygiene:
         motion: the log, seen by the model. Works for fixed and floating bases, with and without torques.
     """
     evidence = Evidence(motion)
-    findings = sorted((finding for check in _CHECKS for finding in check(evidence)), key=lambda finding: _ORDER.index(finding.severity))
+    findings = sorted(
+        (finding for check in _CHECKS for finding in check(evidence)),
+        key=lambda finding: _ORDER.index(finding.severity),
+    )
     return Hygiene(tuple(findings), tuple(channel_checks.estimated_noise(motion)))
 
 
 def hygiene_json(hygiene: Hygiene) -> dict[str, Any]:
     """Contents of the key `hygiene` in compare.json, diagnosis.json and study.json."""
     return {
-        "findings": [vars(finding) | {"where": list(finding.where)} for finding in hygiene.findings],
+        "findings": [
+            vars(finding) | {"where": list(finding.where)} for finding in hygiene.findings
+        ],
         "noise": [vars(level) for level in hygiene.noise],
     }

@@ -33,7 +33,11 @@ class Identification:
 
 
 def identify(
-    scenario: Scenario, log: Log, tests: Mapping[str, Log] | None = None, *, progress: Callable[[str], None] | None = None
+    scenario: Scenario,
+    log: Log,
+    tests: Mapping[str, Log] | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
 ) -> Identification:
     """Identifies the inertial parameters that a scenario does not trust, with friction and bias of every joint.
 
@@ -45,7 +49,9 @@ def identify(
         InputError: a log that does not fit the scenario, or a scenario that trusts all inertia.
     """
     if not scenario.identify.inertia:
-        raise InputError("identify.inertia: names no body, so there is nothing to identify (as in identify: {inertia: [all]})")
+        raise InputError(
+            "identify.inertia: names no body, so there is nothing to identify (as in identify: {inertia: [all]})"
+        )
     say = progress or (lambda _: None)
     say("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
@@ -53,17 +59,26 @@ def identify(
     raw, alone = search.white.sse, search.explain([])
     say("fitting")
     fitted, inertia = search.consistent(search.plain_friction())
-    findings = [finding_of(search.white, alone, fitted, member, (), chosen=True) for member in fitted.candidates]
+    findings = [
+        finding_of(search.white, alone, fitted, member, (), chosen=True)
+        for member in fitted.candidates
+    ]
     findings += inertia_findings(search.white, raw, alone, inertia)
     completed = add(scenario, findings)
     logs = {"train": log} | dict(tests or {})
-    errors = [{name: model_error(Predictor(one, other)) for name, other in logs.items()} for one in (scenario, completed)]
+    errors = [
+        {name: model_error(Predictor(one, other)) for name, other in logs.items()}
+        for one in (scenario, completed)
+    ]
     return Identification(inertia, tuple(findings), *errors, completed)
 
 
 def identifiability_text(inertia: IdentifiedInertia) -> str:
     """What a log can say of inertial parameters at all, in two sentences."""
-    seen, known = len(inertia.base_parameters), sum(base.identified for base in inertia.base_parameters)
+    seen, known = (
+        len(inertia.base_parameters),
+        sum(base.identified for base in inertia.base_parameters),
+    )
     text = (
         f"Of {inertia.change.size} inertial parameters of {len(inertia.bodies)} bodies this log shows {seen} combinations "
         f"(condition number {inertia.condition:.3g}), {known} of them to within a tenth of what a body of this size has; "
@@ -81,11 +96,19 @@ def identification_json(result: Identification) -> dict[str, Any]:
     bodies = {}
     for k, body in enumerate(inertia.bodies):
         value = inertia.model[k] + inertia.change[k]
-        between = np.stack([value - inertia.half_width[k], value + inertia.half_width[k]], axis=1).tolist()
+        between = np.stack(
+            [value - inertia.half_width[k], value + inertia.half_width[k]], axis=1
+        ).tolist()
         bodies[body] = {
             name: {"model": m, "value": v, "interval": i, "uncertainty": u, "unit": unit}
             for name, m, v, i, u, unit in zip(
-                PARAMETERS, inertia.model[k].tolist(), value.tolist(), between, inertia.uncertainty[k].tolist(), units, strict=True
+                PARAMETERS,
+                inertia.model[k].tolist(),
+                value.tolist(),
+                between,
+                inertia.uncertainty[k].tolist(),
+                units,
+                strict=True,
             )
         }
     return {
@@ -101,7 +124,10 @@ def identification_json(result: Identification) -> dict[str, Any]:
                 "combination": base.text,
                 "factors": [
                     {"body": body, "parameter": name, "factor": factor}
-                    for (body, name), factor in {(base.body, base.parameter): 1.0, **base.others}.items()
+                    for (body, name), factor in {
+                        (base.body, base.parameter): 1.0,
+                        **base.others,
+                    }.items()
                 ],
                 "model": base.model,
                 "value": base.value,
@@ -116,7 +142,10 @@ def identification_json(result: Identification) -> dict[str, Any]:
             {
                 "effect": f.effect,
                 "joints": list(f.targets),
-                "parameters": {name: {"value": e.value, "interval": list(e.interval), "unit": e.unit} for name, e in f.parameters.items()},
+                "parameters": {
+                    name: {"value": e.value, "interval": list(e.interval), "unit": e.unit}
+                    for name, e in f.parameters.items()
+                },
             }
             for f in result.findings
             if f.effect != InertialParameters.__name__

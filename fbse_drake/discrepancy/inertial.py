@@ -20,9 +20,20 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from fbse_drake.discrepancy.regression import Fit, Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual import EquationOfMotion, Instants, RecordedMotion, residual_rows
+from fbse_drake.discrepancy.residual import (
+    EquationOfMotion,
+    Instants,
+    RecordedMotion,
+    residual_rows,
+)
 from fbse_drake.effects.effect import Effect
-from fbse_drake.effects.inertia import InertiaEffect, InertialParameters, inertia_changes, inertial_parameters, pseudo_inertia
+from fbse_drake.effects.inertia import (
+    InertiaEffect,
+    InertialParameters,
+    inertia_changes,
+    inertial_parameters,
+    pseudo_inertia,
+)
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 
@@ -57,24 +68,39 @@ def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> n
 
     From B's Jacobian J and its spatial velocity and acceleration about its origin Bo, all in B: J^T times the force and moment on the body.
     """
-    plant, context, frame = equation.robot.plant, equation.robot.plant.CreateDefaultContext(), equation.robot.body(body).body_frame()
+    plant, context, frame = (
+        equation.robot.plant,
+        equation.robot.plant.CreateDefaultContext(),
+        equation.robot.body(body).body_frame(),
+    )
     states, accelerations = equation.plant_motion(at)
     wrt, world, origin = JacobianWrtVariable.kV, plant.world_frame(), np.zeros(3)
     # The specific force of a floating base stands for gravity.
-    gravity = np.zeros(3) if equation.robot.has_floating_base else plant.gravity_field().gravity_vector()
+    gravity = (
+        np.zeros(3) if equation.robot.has_floating_base else plant.gravity_field().gravity_vector()
+    )
     J = np.empty((len(states), 6, plant.num_velocities()))
     bias, g = np.empty((len(states), 6)), np.empty((len(states), 3))
     for k, state in enumerate(states):
         plant.SetPositionsAndVelocities(context, state)
         J[k] = plant.CalcJacobianSpatialVelocity(context, wrt, frame, origin, world, frame)
-        bias[k] = plant.CalcBiasSpatialAcceleration(context, wrt, frame, origin, world, frame).get_coeffs()
+        bias[k] = plant.CalcBiasSpatialAcceleration(
+            context, wrt, frame, origin, world, frame
+        ).get_coeffs()
         g[k] = frame.CalcRotationMatrixInWorld(context).inverse().multiply(gravity)
     V = np.einsum("mij,mj->mi", J, states[:, plant.num_positions() :])
     A = np.einsum("mij,mj->mi", J, accelerations) + bias
-    return np.swapaxes(J, 1, 2)[:, equation.row_velocities] @ body_wrench(V[:, :3], A[:, :3], A[:, 3:] - g)
+    return np.swapaxes(J, 1, 2)[:, equation.row_velocities] @ body_wrench(
+        V[:, :3], A[:, :3], A[:, 3:] - g
+    )
 
 
-def inertia_addition(equation: EquationOfMotion, at: Instants, effect: InertiaEffect, regressor: Callable[[str], np.ndarray]) -> np.ndarray:
+def inertia_addition(
+    equation: EquationOfMotion,
+    at: Instants,
+    effect: InertiaEffect,
+    regressor: Callable[[str], np.ndarray],
+) -> np.ndarray:
     """What a robot whose inertia an effect changes has more than the model in the joint and base rows, shape (M, rows).
 
     Args:
@@ -185,18 +211,27 @@ def untrusted_inertia(motion: RecordedMotion, bodies: Sequence[str]) -> Untruste
     rows = sum(row.kind != "kinematic" for row in residual_rows(motion.robot))
     size = len(PARAMETERS)
     model = np.concatenate([_of_body(motion.robot, body) for body in bodies])
-    scale, columns = np.zeros((len(model), len(model))), np.empty((len(motion.time), rows, len(model)))
+    scale, columns = (
+        np.zeros((len(model), len(model))),
+        np.empty((len(motion.time), rows, len(model))),
+    )
     own = np.empty((len(bodies), 4, 4))
     for k, body in enumerate(bodies):
         part = slice(k * size, (k + 1) * size)
         scale[part, part], own[k] = body_coordinates(model[part])
-        columns[:, :, part] = motion.averages(inertial_regressor(motion.equation, motion.steps, body)) @ scale[part, part]
+        columns[:, :, part] = (
+            motion.averages(inertial_regressor(motion.equation, motion.steps, body))
+            @ scale[part, part]
+        )
     return UntrustedInertia(list(bodies), model, scale, own, columns)
 
 
 def _of_body(robot: Robot, name: str) -> np.ndarray:
     """Inertial parameters of a body of the plant with what inertia effects added to it, (10,)."""
-    return sum(inertial_parameters(body.default_spatial_inertia()) for body in [robot.body(name), *robot.added_to(name)])
+    return sum(
+        inertial_parameters(body.default_spatial_inertia())
+        for body in [robot.body(name), *robot.added_to(name)]
+    )
 
 
 @dataclass(frozen=True)
@@ -224,7 +259,9 @@ class BaseParameter:
         """As `upper_arm izz + 0.612 forearm mz`."""
         terms = [f"{self.body} {self.parameter}"]
         for (body, name), factor in self.others.items():
-            terms.append(f"{'-' if factor < 0 else '+'} {abs(factor):.3g} {body} {name}".replace(" 1 ", " "))
+            terms.append(
+                f"{'-' if factor < 0 else '+'} {abs(factor):.3g} {body} {name}".replace(" 1 ", " ")
+            )
         return " ".join(terms)
 
 
@@ -249,11 +286,17 @@ class IdentifiedInertia:
     @property
     def effect(self) -> Effect:
         """The changes as they stand in a scenario."""
-        return InertialParameters.from_values(self.bodies, dict(zip(PARAMETERS, self.change.T.tolist(), strict=True)))
+        return InertialParameters.from_values(
+            self.bodies, dict(zip(PARAMETERS, self.change.T.tolist(), strict=True))
+        )
 
 
 def identified_inertia(
-    inertia: UntrustedInertia, white: WhitenedResidual, fit: Fit, z: np.ndarray, directions: np.ndarray
+    inertia: UntrustedInertia,
+    white: WhitenedResidual,
+    fit: Fit,
+    z: np.ndarray,
+    directions: np.ndarray,
 ) -> IdentifiedInertia:
     """What a fit says of inertial parameters.
 
@@ -263,7 +306,9 @@ def identified_inertia(
     """
     T, P = inertia.scale, len(z)
     signature = white.whiten_signature(inertia.signature())
-    columns = (signature.values / np.sqrt(white.scale(fit.sse))[signature.rows, None]).reshape(-1, P)
+    columns = (signature.values / np.sqrt(white.scale(fit.sse))[signature.rows, None]).reshape(
+        -1, P
+    )
     # Of changes of the parameters: as believed beforehand, as the log leaves it if what it leaves over is white noise, and as it is.
     believed = T @ T.T
     informed = T @ np.linalg.inv(columns.T @ columns + np.eye(P)) @ T.T
@@ -281,14 +326,28 @@ def identified_inertia(
     for place, row in zip(kept, S, strict=True):
         body, name = inertia.names[place]
         terms = np.abs(row) * sizes
-        others = {inertia.names[p]: float(row[p]) for p in np.flatnonzero(terms > _SMALLEST_TERM * terms.max()) if p != place}
-        now, value, width = float(row @ inertia.model), float(row @ (inertia.model + change)), float(np.sqrt(row @ between @ row))
+        others = {
+            inertia.names[p]: float(row[p])
+            for p in np.flatnonzero(terms > _SMALLEST_TERM * terms.max())
+            if p != place
+        }
+        now, value, width = (
+            float(row @ inertia.model),
+            float(row @ (inertia.model + change)),
+            float(np.sqrt(row @ between @ row)),
+        )
         unit = InertialParameters.parameters[name].unit
         share = float(np.sqrt((row @ informed @ row) / (row @ believed @ row)))
-        base.append(BaseParameter(body, name, unit, others, now, value, (value - width, value + width), share))
+        base.append(
+            BaseParameter(
+                body, name, unit, others, now, value, (value - width, value + width), share
+            )
+        )
     lengths = np.linalg.norm(W[:, kept], axis=0)
     of_bodies = (len(inertia.bodies), -1)
-    edges = np.linalg.eigvalsh(inertia.own + np.einsum("bk,kij->bij", z.reshape(of_bodies), _BASIS)).min(axis=1)
+    edges = np.linalg.eigvalsh(
+        inertia.own + np.einsum("bk,kij->bij", z.reshape(of_bodies), _BASIS)
+    ).min(axis=1)
     return IdentifiedInertia(
         inertia.bodies,
         change.reshape(of_bodies),
@@ -297,7 +356,11 @@ def identified_inertia(
         inertia.model.reshape(of_bodies),
         tuple(base),
         float(np.linalg.cond(W[:, kept] / lengths)) if kept else 1.0,
-        tuple(body for body, edge in zip(inertia.bodies, edges, strict=True) if edge < 2 * _LEAST_SHARE),
+        tuple(
+            body
+            for body, edge in zip(inertia.bodies, edges, strict=True)
+            if edge < 2 * _LEAST_SHARE
+        ),
     )
 
 
@@ -359,6 +422,8 @@ def consistent_parameters(
         program.AddLinearMatrixInequalityConstraint([J - _LEAST_SHARE * np.eye(4), *_BASIS], z)
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
-        raise InputError(f"inertial parameters: no physically consistent values found ({result.get_solution_result().name})")
+        raise InputError(
+            f"inertial parameters: no physically consistent values found ({result.get_solution_result().name})"
+        )
     solution = result.GetSolution(variables) / norm
     return solution[:K], solution[K:]

@@ -54,7 +54,9 @@ def _offset(x: np.ndarray, y: np.ndarray, inside: np.ndarray | None = None) -> t
     return float(lags[best] + 0.5 * (before - after) / (before - 2 * here + after)), float(here)
 
 
-def _clock(evidence: Evidence, channel: str, offset: float, correlation: float, against: str) -> Iterable[HygieneFinding]:
+def _clock(
+    evidence: Evidence, channel: str, offset: float, correlation: float, against: str
+) -> Iterable[HygieneFinding]:
     """
     Args:
         offset: by how many samples the channel is late.
@@ -76,7 +78,12 @@ def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     differenced = np.gradient(evidence.log["joint/position"], evidence.log.time, axis=0)
     moving = np.sqrt((velocity**2).mean(axis=0)) > _MOVING
     if moving.any():
-        yield from _clock(evidence, "joint/velocity", *_offset(differenced[:, moving], velocity[:, moving]), "the rate of the angles")
+        yield from _clock(
+            evidence,
+            "joint/velocity",
+            *_offset(differenced[:, moving], velocity[:, moving]),
+            "the rate of the angles",
+        )
 
 
 def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -86,7 +93,9 @@ def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     motion, at = evidence.motion, evidence.instants
     by_legs, stands = rate_by_legs(motion, at)
     gyro = at.angular_velocity @ motion.equation.R_BI.T
-    yield from _clock(evidence, "imu/angular_velocity", *_offset(by_legs, gyro, stands), "the legs that stand")
+    yield from _clock(
+        evidence, "imu/angular_velocity", *_offset(by_legs, gyro, stands), "the legs that stand"
+    )
 
 
 def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -94,13 +103,23 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     if not evidence.robot.has_floating_base or len(evidence.instants.joint_position) < SPECTRUM:
         return
     # Impacts are vertical.
-    needed, given = (wrench[:, 5] - wrench[:, 5].mean() for wrench in evidence.needed_and_given(evidence.instants))
+    needed, given = (
+        wrench[:, 5] - wrench[:, 5].mean()
+        for wrench in evidence.needed_and_given(evidence.instants)
+    )
     pulsation = 2 * np.pi * np.fft.rfftfreq(len(needed), evidence.period)
     spectrum, inner = np.fft.rfft(needed), given[_LARGEST_OFFSET:-_LARGEST_OFFSET]
 
     def mismatch(response: np.ndarray) -> float:
         """Share of what the feet give that is not what the masses need behind a filter."""
-        return 1.0 - _correlation(np.fft.irfft(spectrum * response, len(needed))[_LARGEST_OFFSET:-_LARGEST_OFFSET], inner) ** 2
+        return (
+            1.0
+            - _correlation(
+                np.fft.irfft(spectrum * response, len(needed))[_LARGEST_OFFSET:-_LARGEST_OFFSET],
+                inner,
+            )
+            ** 2
+        )
 
     constants = evidence.period * np.geomspace(0.5, 50, 20)
     offsets = np.linspace(-0.5 * _LARGEST_OFFSET, 0.5 * _LARGEST_OFFSET, 2 * _LARGEST_OFFSET + 1)
@@ -108,7 +127,9 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     shifts = [np.exp(-1j * pulsation * offset * evidence.period) for offset in offsets]
     causal = np.array([[mismatch(filter_ * shift) for shift in shifts] for filter_ in filters])
     # As smooth, for what the masses need is noisy, but not late.
-    smooth = np.array([[mismatch(np.abs(filter_) * shift) for shift in shifts] for filter_ in filters])
+    smooth = np.array(
+        [[mismatch(np.abs(filter_) * shift) for shift in shifts] for filter_ in filters]
+    )
     if min(causal.min(), smooth.min()) > 1 - _CORRELATED**2:
         return
     if causal.min() < (1 - _WORTHWHILE) * smooth.min():
@@ -148,7 +169,13 @@ def _fit_torque(torque: np.ndarray, link: np.ndarray, velocity: np.ndarray) -> _
     left = torque - X @ theta
     # What is left lasts: counts as a twentieth as many samples.
     deviation = np.sqrt(20 * (left**2).mean() * np.linalg.pinv(X.T @ X)[0, 0])
-    return _TorqueFit(float(theta[0]), float(deviation), share, explained(link)[0], explained(velocity, direction)[0])
+    return _TorqueFit(
+        float(theta[0]),
+        float(deviation),
+        share,
+        explained(link)[0],
+        explained(velocity, direction)[0],
+    )
 
 
 def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -158,7 +185,11 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
         return
     motion = evidence.motion
     known = evidence.known[:, 0]
-    torque, link, velocity = motion.blocks.torque_command[known], evidence.link_torque[known], motion.blocks.joint_velocity[known]
+    torque, link, velocity = (
+        motion.blocks.torque_command[known],
+        evidence.link_torque[known],
+        motion.blocks.joint_velocity[known],
+    )
     floor = np.nan_to_num(motion.residual.noise_floor[: len(evidence.joints)])
     raw = evidence.log[channel]
     scales, duty, offsets = {}, {}, []
@@ -169,15 +200,25 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
         fit = _fit_torque(torque[:, k], link[:, k], velocity[:, k])
         limit = np.abs(raw[:, k]).max()
         saturates = float((np.abs(raw[:, k]) == limit).mean()) > CLIPPED_SHARE
-        if saturates and fit.by_velocity > max(fit.by_model, 0.3) and not 1 / _NO_TORQUE < fit.scale < _NO_TORQUE:
+        if (
+            saturates
+            and fit.by_velocity > max(fit.by_model, 0.3)
+            and not 1 / _NO_TORQUE < fit.scale < _NO_TORQUE
+        ):
             duty[joint] = limit
             continue
         off = max(fit.scale, 1 / fit.scale) if fit.scale > 0 else np.inf
-        if fit.explained > 0.5 and off > _DOUBTFUL_TORQUE and abs(fit.scale - 1) > 5 * fit.deviation:
+        if (
+            fit.explained > 0.5
+            and off > _DOUBTFUL_TORQUE
+            and abs(fit.scale - 1) > 5 * fit.deviation
+        ):
             scales[joint] = fit.scale
         if fit.explained > 0.8 and fit.by_model > 0.3:
             offsets.append(_torque_offset(torque[:, k], link[:, k], velocity[:, k]))
-    doubtful = {joint: scale for joint, scale in scales.items() if 1 / _NO_TORQUE < scale < _NO_TORQUE}
+    doubtful = {
+        joint: scale for joint, scale in scales.items() if 1 / _NO_TORQUE < scale < _NO_TORQUE
+    }
     hopeless = {joint: scale for joint, scale in scales.items() if joint not in doubtful}
     text = (
         "{where} reads {size} times what the model needs: unit, gear ratio or torque constant is wrong, or the model's masses; "
@@ -194,7 +235,9 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
         seconds = offset * motion.length * motion.period
         agree = np.mean(np.abs(np.array(offsets) - offset) < 0.5) > 0.7
         if agree and offset > 0:
-            yield from _clock(evidence, channel, seconds / evidence.period, 1.0, "the motion that it makes")
+            yield from _clock(
+                evidence, channel, seconds / evidence.period, 1.0, "the motion that it makes"
+            )
         elif agree:
             text = (
                 f"the motion follows {-1e3 * seconds:.3g} ms behind it; this can be the robot's own delay or lag (TorqueDelay, "
@@ -207,7 +250,12 @@ def _torque_offset(torque: np.ndarray, link: np.ndarray, velocity: np.ndarray) -
     """By how many blocks a torque comes later than the motion that it makes."""
     lags = np.arange(-5, 6)
     inner = slice(5, len(torque) - 5)
-    left = np.array([1 - _fit_torque(np.roll(torque, -lag)[inner], link[inner], velocity[inner]).explained for lag in lags])
+    left = np.array(
+        [
+            1 - _fit_torque(np.roll(torque, -lag)[inner], link[inner], velocity[inner]).explained
+            for lag in lags
+        ]
+    )
     best = int(left.argmin())
     if not 0 < best < len(lags) - 1 or left[best] > (1 - _WORTHWHILE) * left[5]:
         return float(lags[best]) if left[best] <= (1 - _WORTHWHILE) * left[5] else 0.0
@@ -218,10 +266,18 @@ def _torque_offset(torque: np.ndarray, link: np.ndarray, velocity: np.ndarray) -
 def check_dead_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
     """Joints that do not move, and torques that do not answer."""
     motion = evidence.motion
-    resting = np.ptp(evidence.log["joint/position"], axis=0) < np.maximum(STILL, 3 * evidence.quantum["joint/position"])
-    at_rest = {joint: float(np.ptp(evidence.log["joint/position"][:, k])) for k, joint in enumerate(evidence.joints) if resting[k]}
+    resting = np.ptp(evidence.log["joint/position"], axis=0) < np.maximum(
+        STILL, 3 * evidence.quantum["joint/position"]
+    )
+    at_rest = {
+        joint: float(np.ptp(evidence.log["joint/position"][:, k]))
+        for k, joint in enumerate(evidence.joints)
+        if resting[k]
+    }
     text = "{where} does not move ({size}); nothing can be said of its friction"
-    yield from remarks("no_motion", "note", "joint/position", at_rest, evidence.units["joint/position"], text)
+    yield from remarks(
+        "no_motion", "note", "joint/position", at_rest, evidence.units["joint/position"], text
+    )
     if "joint/torque_command" not in evidence.log:
         return
     torque = evidence.log["joint/torque_command"]
@@ -230,10 +286,19 @@ def check_dead_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
     dead = {
         joint: float(np.ptp(torque[:, k]))
         for k, joint in enumerate(evidence.joints)
-        if needed[k] > 10 * floor[k] and needed[k] > 0 and np.ptp(torque[:, k]) < 0.05 * np.ptp(evidence.link_torque[:, k])
+        if needed[k] > 10 * floor[k]
+        and needed[k] > 0
+        and np.ptp(torque[:, k]) < 0.05 * np.ptp(evidence.link_torque[:, k])
     }
     text = "{where} moves but its torque does not ({size}); the channel is dead, whatever is found in this joint"
-    yield from remarks("dead_torque", "untrustworthy", "joint/torque_command", dead, evidence.units["joint/torque_command"], text)
+    yield from remarks(
+        "dead_torque",
+        "untrustworthy",
+        "joint/torque_command",
+        dead,
+        evidence.units["joint/torque_command"],
+        text,
+    )
 
 
 def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -242,8 +307,13 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
     every = max(1, len(motion.time) // _SWAP_BLOCKS)
     at = Instants(**{name: values[::every] for name, values in vars(motion.blocks).items()})
     known = evidence.known[::every]
-    legs = [[evidence.joints.index(joint) for joint in leg.joints] for leg in evidence.robot.description.legs.values()]
-    pairs = [([a], [b]) for a, b in itertools.combinations(range(n), 2)] + list(itertools.combinations(legs, 2))
+    legs = [
+        [evidence.joints.index(joint) for joint in leg.joints]
+        for leg in evidence.robot.description.legs.values()
+    ]
+    pairs = [([a], [b]) for a, b in itertools.combinations(range(n), 2)] + list(
+        itertools.combinations(legs, 2)
+    )
     scale = np.maximum(rms(_zero_prediction(motion, at), known), 1e-9)
 
     def score(instants: Instants) -> float:
@@ -265,7 +335,9 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
         if "torque_command" in channels and "joint/torque_command" not in evidence.log:
             continue
         after, (first, second) = min(
-            ((score(swapped(channels, *pair)), pair) for pair in pairs), key=lambda one: one[0], default=(np.inf, ([], []))
+            ((score(swapped(channels, *pair)), pair) for pair in pairs),
+            key=lambda one: one[0],
+            default=(np.inf, ([], [])),
         )
         if after < _SWAPPED * before:
             names = [evidence.joints[k] for k in (*first, *second)]
@@ -302,7 +374,10 @@ def check_weight(evidence: Evidence) -> Iterable[HygieneFinding]:
     excess = float(np.linalg.norm(given) - np.linalg.norm(needed))
     share = excess / evidence.motion.equation.weight
     if abs(share) > _WEIGHT:
-        more, kilograms = "more" if share > 0 else "less", abs(excess) / evidence.motion.equation.gravity
+        more, kilograms = (
+            "more" if share > 0 else "less",
+            abs(excess) / evidence.motion.equation.gravity,
+        )
         text = (
             f"the feet carry {abs(excess):.3g} N ({100 * abs(share):.2g} %) {more} than the model's masses need; {kilograms:.2g} kg {more} "
             "and a gain that all force sensors share explain this alike, and no motion tells them apart"
@@ -322,8 +397,12 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
     motion, n = evidence.motion, len(evidence.joints)
     at, (required, _) = motion.blocks, evidence.over_blocks
     kinematic = motion.equation.residual(at)[:, n + 6 :]
-    for foot, (side, R_BF) in enumerate(zip(evidence.sides, motion.equation.sole_rotations(at), strict=True)):
-        alone = np.all([evidence.aloft[other] for other in range(len(evidence.sides)) if other != foot], axis=0)
+    for foot, (side, R_BF) in enumerate(
+        zip(evidence.sides, motion.equation.sole_rotations(at), strict=True)
+    ):
+        alone = np.all(
+            [evidence.aloft[other] for other in range(len(evidence.sides)) if other != foot], axis=0
+        )
         if len(evidence.sides) < 2 or alone.sum() < _FEWEST:
             continue
         needed = np.einsum("mij,mi->mj", R_BF[alone], required[alone, 3:])
@@ -331,10 +410,21 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
         # Does the sole stand level, by IMU and angles? Its specific force says so.
         tilt = kinematic[alone, 6 * foot + 3 : 6 * foot + 5].mean(axis=0)
         level = np.hypot(*tilt) / motion.equation.gravity < _TILT
-        lean = {axis: _tilt(measured.mean(axis=0), k) - _tilt(needed.mean(axis=0), k) for k, axis in enumerate("xy")}
+        lean = {
+            axis: _tilt(measured.mean(axis=0), k) - _tilt(needed.mean(axis=0), k)
+            for k, axis in enumerate("xy")
+        }
         lean = {f"force_{axis}": angle for axis, angle in lean.items() if abs(angle) > _TILT}
-        cause = "stands level by IMU and angles, so that it is the force sensor's frame or cross-talk" if level else "seems tilted too"
-        text = "{where} leans {size} from what gravity and motion need, with the load; the sole " + cause + ", and not the masses"
+        cause = (
+            "stands level by IMU and angles, so that it is the force sensor's frame or cross-talk"
+            if level
+            else "seems tilted too"
+        )
+        text = (
+            "{where} leans {size} from what gravity and motion need, with the load; the sole "
+            + cause
+            + ", and not the masses"
+        )
         yield from remarks("force_frame", "warning", f"foot/{side}", lean, "rad", text)
         against = {}
         for k, axis in enumerate("xyz"):
@@ -345,7 +435,9 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
             "{where} moves against what the motion needs while this foot alone carries the robot (correlation {size}); its sign or "
             "calibration is wrong, and so is what is found in the base's rows that it enters"
         )
-        yield from remarks("force_against_motion", "untrustworthy", f"foot/{side}", against, "1", text)
+        yield from remarks(
+            "force_against_motion", "untrustworthy", f"foot/{side}", against, "1", text
+        )
 
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> float:
@@ -360,12 +452,18 @@ def check_feet_in_the_air(evidence: Evidence) -> Iterable[HygieneFinding]:
     motion = evidence.motion
     weight, margin = motion.equation.weight, max(1, round(_SETTLED / evidence.period))
     wrenches = motion.equation.wrenches(motion.steps.pad_force)
-    for side, wrench, aloft in zip(evidence.sides, wrenches, evidence.aloft_among(wrenches), strict=True):
+    for side, wrench, aloft in zip(
+        evidence.sides, wrenches, evidence.aloft_among(wrenches), strict=True
+    ):
         inside = binary_erosion(aloft, iterations=margin)
         if inside.sum() < margin:
             continue
         reading = np.median(wrench[inside, 3:], axis=0)
-        found = {f"force_{axis}": float(reading[k]) for k, axis in enumerate("xyz") if abs(reading[k]) > _AIR * weight}
+        found = {
+            f"force_{axis}": float(reading[k])
+            for k, axis in enumerate("xyz")
+            if abs(reading[k]) > _AIR * weight
+        }
         text = "{where} reads {size} while the foot is in the air; the sensor has an offset (FootForceBias)"
         yield from remarks("air_reading", "warning", f"foot/{side}", found, "N", text)
 
@@ -378,7 +476,9 @@ def check_gravity(evidence: Evidence) -> Iterable[HygieneFinding]:
     mean = float(np.linalg.norm(evidence.motion.signals.specific_force.mean(axis=0)))
     if abs(mean / equation.gravity - 1) > _GRAVITY:
         text = f"its mean is {mean:.3f} m/s^2, gravity is {equation.gravity:.2f}; bias or scale of the accelerometer looks like mass"
-        yield remark("gravity", "warning", "imu/linear_acceleration", mean - equation.gravity, "m/s^2", text)
+        yield remark(
+            "gravity", "warning", "imu/linear_acceleration", mean - equation.gravity, "m/s^2", text
+        )
 
 
 CHECKS = (

@@ -20,10 +20,22 @@ from fbse_drake.discrepancy.residual import (
     rms,
 )
 from fbse_drake.discrepancy.servo import with_command
-from fbse_drake.effects.contact import ContactEffect, FootCreep, GroundCompliance, PadContact, pad_contact, spring_force
+from fbse_drake.effects.contact import (
+    ContactEffect,
+    FootCreep,
+    GroundCompliance,
+    PadContact,
+    pad_contact,
+    spring_force,
+)
 from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.inertia import InertiaEffect
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, ResolvedJointTorque, basis_over_time
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    ResolvedJointTorque,
+    basis_over_time,
+)
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log
@@ -53,12 +65,17 @@ class Predictor:
         with located("model: "):
             self.robot = build_robot(scenario.believed)
         names = self.robot.description
-        self._known = [effect.resolve(names, key=f"model.effects.{key}") for key, effect in scenario.believed.effects.items()]
+        self._known = [
+            effect.resolve(names, key=f"model.effects.{key}")
+            for key, effect in scenario.believed.effects.items()
+        ]
         log = with_command(scenario, log, names)
         self.motion = RecordedMotion(self.robot, scenario.sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
-                memory = known.effect.memory_over_time(self.motion.signals, known, self.robot, self.motion.period)
+                memory = known.effect.memory_over_time(
+                    self.motion.signals, known, self.robot, self.motion.period
+                )
                 self.motion.signals = self._undone(known, memory)
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
@@ -76,7 +93,10 @@ class Predictor:
             residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
             residual = residual.minus(self.ground_gives_way())
-            residual = replace(residual, variance=residual.variance + self.sinking_variance / self._contact.stiffness**2)
+            residual = replace(
+                residual,
+                variance=residual.variance + self.sinking_variance / self._contact.stiffness**2,
+            )
         return self.doubted(residual, self._known)
 
     def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
@@ -86,8 +106,12 @@ class Predictor:
         """
         effects = list(effects)
         doubt = np.zeros_like(residual.variance)
-        doubt[:, : len(self.robot.joint_names)] = self.law_variance(e for e in effects if isinstance(e, ResolvedJointTorque))
-        softer = sum(float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance)
+        doubt[:, : len(self.robot.joint_names)] = self.law_variance(
+            e for e in effects if isinstance(e, ResolvedJointTorque)
+        )
+        softer = sum(
+            float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance
+        )
         if softer:
             nominal = 1.0 / self._contact.stiffness
             doubt += ((nominal + softer) ** 2 - nominal**2) * self.sinking_variance
@@ -100,12 +124,20 @@ class Predictor:
         Of a noise that is added to the measured forces once more.
         """
         force = self.motion.signals.pad_force
-        noise = force_noise(self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0))
+        noise = force_noise(
+            self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0)
+        )
         motions = [
-            [GroundCompliance.sole_motion(f, pads, self._sample_time) for f, pads in self._split_feet(forces)]
+            [
+                GroundCompliance.sole_motion(f, pads, self._sample_time)
+                for f, pads in self._split_feet(forces)
+            ]
             for forces in (force, force + noise)
         ]
-        clean, noisy = (self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both]) for both in motions)
+        clean, noisy = (
+            self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both])
+            for both in motions
+        )
         return np.nan_to_num(rms(noisy - clean, self.motion.known) ** 2)
 
     def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
@@ -131,7 +163,9 @@ class Predictor:
         """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are in the residual already."""
         result = np.zeros((len(self.motion.time), self.rows))
         if issubclass(effect.effect, JointTorqueEffect):
-            columns = self.joint_columns(effect.effect, effect.nonlinear, np.arange(len(effect.targets)))
+            columns = self.joint_columns(
+                effect.effect, effect.nonlinear, np.arange(len(effect.targets))
+            )
             amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
             result[:, : len(effect.targets)] = np.einsum("pbn,pn->bn", columns, amounts)
         elif issubclass(effect.effect, ContactEffect):
@@ -170,11 +204,18 @@ class Predictor:
         """What the links do not get of the command by the rigid model, smoothed over three blocks, step by step, (N - 1, n)."""
         motion, n = self.motion, len(self.robot.joint_names)
         loss = _smooth(motion.residual.value[:, :n])
-        time = motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
+        time = (
+            motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
+        )
         return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
 
     def joint_columns(
-        self, effect: type[JointTorqueEffect], nonlinear: np.ndarray, joints: np.ndarray, *, noisier: bool = False
+        self,
+        effect: type[JointTorqueEffect],
+        nonlinear: np.ndarray,
+        joints: np.ndarray,
+        *,
+        noisier: bool = False,
     ) -> np.ndarray:
         """Torque of a joint effect per unit of each linear parameter, averaged over blocks.
 
@@ -187,9 +228,19 @@ class Predictor:
             Shape (p, B, T), or (p, G, B, T).
         """
         whole = self.noisier_joint_motion if noisier else self.joint_motion
-        motion = whole._replace(**{name: getattr(whole, name)[:, joints] for name in ("velocity", "position", "command", "load")})
+        motion = whole._replace(
+            **{
+                name: getattr(whole, name)[:, joints]
+                for name in ("velocity", "position", "command", "load")
+            }
+        )
         if nonlinear.ndim == 2:
-            return np.stack([self.motion.averages(column) for column in basis_over_time(effect, motion, nonlinear)])
+            return np.stack(
+                [
+                    self.motion.averages(column)
+                    for column in basis_over_time(effect, motion, nonlinear)
+                ]
+            )
         sets = max(1, _CHUNK // motion.velocity.size)
         parts = []
         for start in range(0, nonlinear.shape[1], sets):
@@ -212,7 +263,9 @@ class Predictor:
         else:
             names = [name for name, parameter in effect.parameters.items() if parameter.linear]
             units = np.diag([_probe(effect, name) for name in names])
-            columns = [self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units]
+            columns = [
+                self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units
+            ]
             values = _without_rounding(np.stack(columns, axis=2))
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
@@ -227,7 +280,10 @@ class Predictor:
         low-passed: little noise is left in them, and smoothing would take motion."""
         if self.motion.recording.cutoff > 0:
             return blocks
-        smooth = {name: _smooth(getattr(blocks, name)) for name in ("joint_acceleration", "angular_acceleration")}
+        smooth = {
+            name: _smooth(getattr(blocks, name))
+            for name in ("joint_acceleration", "angular_acceleration")
+        }
         return replace(blocks, **smooth)
 
     @cached_property
@@ -244,8 +300,13 @@ class Predictor:
             "angular_velocity": sensors.imu.angular_velocity_noise,
         }
         more = {name: getattr(motion.signals, name) for name in noise}
-        added = {name: values + noise[name] * random.standard_normal(values.shape) for name, values in more.items()}
-        noisy_force = motion.signals.pad_force + force_noise(sensors.foot_force, self.robot, len(motion.signals.pad_force), random)
+        added = {
+            name: values + noise[name] * random.standard_normal(values.shape)
+            for name, values in more.items()
+        }
+        noisy_force = motion.signals.pad_force + force_noise(
+            sensors.foot_force, self.robot, len(motion.signals.pad_force), random
+        )
         return replace(motion.signals, pad_force=noisy_force, **added)
 
     @cached_property
@@ -255,21 +316,28 @@ class Predictor:
     @cached_property
     def noise_realization(self) -> np.ndarray:
         """What that noise adds to the residual, (B, R)."""
-        return self.motion.equation.residual(self._noisier_blocks) - self.motion.equation.residual(self.motion.blocks)
+        return self.motion.equation.residual(self._noisier_blocks) - self.motion.equation.residual(
+            self.motion.blocks
+        )
 
     def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
         """What that noise adds to the signature of an inertia effect: regressors are measured too."""
         columns = np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
         for k, name in enumerate(effect.parameters):
             unit = _probe(effect, name)
-            columns[:, :, k] = self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True) / unit
+            columns[:, :, k] = (
+                self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True)
+                / unit
+            )
         return replace(clean, values=columns[:, clean.rows] - clean.values)
 
     def is_possible(self, effect: type[Effect], target: str, linear: np.ndarray) -> bool:
         """Can a robot have an effect with these values? Not every inertia is that of a body."""
         if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
             return True
-        change = effect.from_values([target], {name: [value] for name, value in zip(effect.parameters, linear, strict=True)})
+        change = effect.from_values(
+            [target], {name: [value] for name, value in zip(effect.parameters, linear, strict=True)}
+        )
         believed = self.scenario.believed
         try:
             build_robot(replace(believed, effects={**believed.effects, "_change": change}))
@@ -291,7 +359,12 @@ class Predictor:
         return np.pad(added, ((0, 0), (0, self.rows - added.shape[1])))
 
     def signature_near(
-        self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray, elsewhere: Signature
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        elsewhere: Signature,
     ) -> Signature:
         """The signature of an inertia or sensor effect about values of its parameters, for what it adds is not quite linear.
 
@@ -307,16 +380,26 @@ class Predictor:
         for k, name in enumerate(names):
             moved = linear.copy()
             moved[k] += _probe(effect, name)
-            slopes.append((self._addition(effect, target, moved, nonlinear) - here) / _probe(effect, name))
+            slopes.append(
+                (self._addition(effect, target, moved, nonlinear) - here) / _probe(effect, name)
+            )
         values = _without_rounding(np.stack(slopes, axis=2))
         rows = elsewhere.rows
         return replace(elsewhere, values=values[:, rows], offset=(here - values @ linear)[:, rows])
 
-    def _addition(self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+    def _addition(
+        self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray
+    ) -> np.ndarray:
         """What an inertia or sensor effect with these values adds to the residual, (B, R)."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
-        values = {name: [value] for name, value in (*zip(names, linear, strict=True), *zip(fixed, nonlinear, strict=True))}
+        values = {
+            name: [value]
+            for name, value in (
+                *zip(names, linear, strict=True),
+                *zip(fixed, nonlinear, strict=True),
+            )
+        }
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
             return self._inertia_addition(changed)
@@ -328,25 +411,43 @@ class Predictor:
 
     def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
         """Signals that the effect turns into those of the log."""
-        return effect.effect.undone(self.motion.signals, memory, effect, self.robot, self.motion.period)
+        return effect.effect.undone(
+            self.motion.signals, memory, effect, self.robot, self.motion.period
+        )
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone, where `undone` needs it."""
         key = (effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
-            self._memories[key] = effect.memory_over_time(self.motion.signals, resolved, self.robot, self.motion.period)
+            self._memories[key] = effect.memory_over_time(
+                self.motion.signals, resolved, self.robot, self.motion.period
+            )
         return self._memories[key]
 
     def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
         """By the motion of the standing soles that the effect predicts, (B, R, p)."""
         if not self.robot.has_floating_base:
             return np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
-        motions = [effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces]
-        return np.moveaxis(np.array([self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))]), 0, 2)
+        motions = [
+            effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces
+        ]
+        return np.moveaxis(
+            np.array(
+                [
+                    self._sole_rows([(r[k], d[k]) for r, d in motions])
+                    for k in range(len(motions[0][0]))
+                ]
+            ),
+            0,
+            2,
+        )
 
     @cached_property
     def _sample_time(self) -> np.ndarray:
-        return self.motion.start + np.arange(len(self.motion.signals.joint_position)) * self.motion.period
+        return (
+            self.motion.start
+            + np.arange(len(self.motion.signals.joint_position)) * self.motion.period
+        )
 
     @cached_property
     def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -380,11 +481,16 @@ class Predictor:
             # R_WF^T g z for a sole turned by the rotation vector, less g z.
             tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)
             result[:, place : place + 3] = block_means(angular[:-1], length)
-            result[:, place + 3 : place + 6] = block_means(tilt[:-1] + np.diff(linear, axis=0) / period, length)
+            result[:, place + 3 : place + 6] = block_means(
+                tilt[:-1] + np.diff(linear, axis=0) / period, length
+            )
             velocities.append(block_means(linear[:-1], length))
             place += 6
         if len(motions) == 2:
-            left, right = (np.einsum("bij,bj->bi", R_BF, v) for R_BF, v in zip(self._sole_rotations, velocities, strict=True))
+            left, right = (
+                np.einsum("bij,bj->bi", R_BF, v)
+                for R_BF, v in zip(self._sole_rotations, velocities, strict=True)
+            )
             result[:, place:] = left - right
         return result
 
@@ -395,7 +501,9 @@ class Predictor:
 
     @cached_property
     def _contact(self) -> PadContact:
-        return pad_contact(self.scenario.believed.description, self.scenario.ground, self.scenario.plant)
+        return pad_contact(
+            self.scenario.believed.description, self.scenario.ground, self.scenario.plant
+        )
 
     def ground_gives_way(self) -> np.ndarray:
         """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""

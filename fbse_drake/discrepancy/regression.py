@@ -71,14 +71,20 @@ class WhitenedResidual:
             # A row without any noise, as from ideal sensors, is still told apart from rounding.
             band[0] = np.maximum(residual.variance[index, row], 1e-18)
             adjacent = np.diff(index) == 1
-            band[1, :-1] = np.where(adjacent, residual.covariance[index[:-1], row], 0.0) if len(index) else 0.0
+            band[1, :-1] = (
+                np.where(adjacent, residual.covariance[index[:-1], row], 0.0) if len(index) else 0.0
+            )
             self._factor.append(cholesky_banded(band, lower=True) if len(index) else band)
         # Values (B, R).
-        self.y = np.stack([self.whiten(row, values) for row, values in enumerate(residual.value.T)], axis=1)
+        self.y = np.stack(
+            [self.whiten(row, values) for row, values in enumerate(residual.value.T)], axis=1
+        )
         # Blocks that are known in each row, (R,).
         self.count = residual.known.sum(axis=0)
         # How many blocks' worth of each row's variance is doubt about laws rather than noise of sensors, (R,).
-        self.doubt = np.where(residual.known, residual.doubt / np.maximum(residual.variance, 1e-18), 0.0).sum(axis=0)
+        self.doubt = np.where(
+            residual.known, residual.doubt / np.maximum(residual.variance, 1e-18), 0.0
+        ).sum(axis=0)
         blocks = len(residual.time)
         per_stretch = max(_FEWEST_BLOCKS, round(STRETCH / (residual.time[1] - residual.time[0])))
         self.stretch = np.arange(blocks) // per_stretch
@@ -90,7 +96,9 @@ class WhitenedResidual:
         result = np.zeros(values.shape)
         if len(index):
             flat = values[index].reshape(len(index), -1)
-            result[index] = solve_banded((1, 0), self._factor[row], flat, check_finite=False).reshape(values[index].shape)
+            result[index] = solve_banded(
+                (1, 0), self._factor[row], flat, check_finite=False
+            ).reshape(values[index].shape)
         return result
 
     def whiten_signature(self, signature: Signature) -> Signature:
@@ -98,7 +106,9 @@ class WhitenedResidual:
         values = [self.whiten(row, signature.values[:, k]) for k, row in enumerate(signature.rows)]
         offset = signature.offset
         if isinstance(offset, np.ndarray):
-            offset = np.stack([self.whiten(row, offset[:, k]) for k, row in enumerate(signature.rows)], axis=1)
+            offset = np.stack(
+                [self.whiten(row, offset[:, k]) for k, row in enumerate(signature.rows)], axis=1
+            )
         return replace(signature, values=np.stack(values, axis=1), offset=offset)
 
     @cached_property
@@ -123,7 +133,11 @@ class WhitenedResidual:
         """
         sizes = [s.values.shape[2] for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        parameters, deviation, freedom = np.zeros(sum(sizes)), np.zeros(sum(sizes)), np.ones(sum(sizes))
+        parameters, deviation, freedom = (
+            np.zeros(sum(sizes)),
+            np.zeros(sum(sizes)),
+            np.ones(sum(sizes)),
+        )
         covariance = np.zeros((sum(sizes), sum(sizes)))
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         # Those that share no row have nothing to do with each other.
@@ -131,7 +145,11 @@ class WhitenedResidual:
             part = self._fit_together([signatures[k] for k in group])
             at = np.concatenate([places[k] for k in group])
             rows = np.unique(np.concatenate([signatures[k].rows for k in group]))
-            parameters[at], deviation[at], freedom[at] = part.parameters, part.deviation, part.freedom
+            parameters[at], deviation[at], freedom[at] = (
+                part.parameters,
+                part.deviation,
+                part.freedom,
+            )
             covariance[np.ix_(at, at)] = part.covariance
             sse[rows], held_out_sse[rows] = part.sse[rows], part.held_out_sse[rows]
         return Fit(parameters, deviation, freedom, covariance, sse, held_out_sse)
@@ -139,12 +157,20 @@ class WhitenedResidual:
     def _fit_together(self, signatures: Sequence[Signature]) -> Fit:
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
         size = sum(s.values.shape[2] for s in signatures)
-        X, prior, lowest = np.zeros((len(self.y), len(rows), size)), np.zeros(size), np.full(size, -np.inf)
+        X, prior, lowest = (
+            np.zeros((len(self.y), len(rows), size)),
+            np.zeros(size),
+            np.full(size, -np.inf),
+        )
         y = self.y[:, rows]
         start = 0
         for s in signatures:
             stop, places = start + s.values.shape[2], np.searchsorted(rows, s.rows)
-            X[:, places, start:stop], prior[start:stop], lowest[start:stop] = s.values, s.prior, s.lowest
+            X[:, places, start:stop], prior[start:stop], lowest[start:stop] = (
+                s.values,
+                s.prior,
+                s.lowest,
+            )
             y[:, places] -= s.offset
             start = stop
         # Units must not decide what counts as singular.
@@ -155,7 +181,9 @@ class WhitenedResidual:
         for _ in range(_REWEIGHTINGS if len(rows) > 1 else 1):
             grams, rights = _moments(X, y, scale)
             theta = bounded_least_squares(grams.sum(axis=0) + prior, rights.sum(axis=0), lowest)
-            scale = np.maximum(((y - X @ theta) ** 2).sum(axis=0) / np.maximum(self.count[rows], 1), 1.0)
+            scale = np.maximum(
+                ((y - X @ theta) ** 2).sum(axis=0) / np.maximum(self.count[rows], 1), 1.0
+            )
         grams, rights = _moments(X, y, scale)
         gram, right = grams.sum(axis=0) + prior, rights.sum(axis=0)
         theta = bounded_least_squares(gram, right, lowest)
@@ -170,21 +198,39 @@ class WhitenedResidual:
             sandwich = ((scores @ bread) ** 2).sum(axis=0) * len(edges) / max(1, len(edges) - size)
             information = np.add.reduceat(np.diagonal(grams, axis1=1, axis2=2), edges, axis=0)
             bearing = np.divide(
-                information.sum(axis=0) ** 2, (information**2).sum(axis=0), out=np.ones(size), where=information.any(axis=0)
+                information.sum(axis=0) ** 2,
+                (information**2).sum(axis=0),
+                out=np.ones(size),
+                where=information.any(axis=0),
             )
-            spread, degrees = np.sqrt(np.maximum(sandwich, np.diag(bread))), np.maximum(bearing - 1, 1.0)
+            spread, degrees = (
+                np.sqrt(np.maximum(sandwich, np.diag(bread))),
+                np.maximum(bearing - 1, 1.0),
+            )
             wider = student.ppf(0.975, degrees) * spread > student.ppf(0.975, freedom) * deviation
-            deviation, freedom = np.where(wider, spread, deviation), np.where(wider, degrees, freedom)
+            deviation, freedom = (
+                np.where(wider, spread, deviation),
+                np.where(wider, degrees, freedom),
+            )
 
         held_out = np.empty_like(left)
         for fold in range(FOLDS):
             out = self.fold == fold
-            held_out[out] = y[out] - X[out] @ bounded_least_squares(gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest)
+            held_out[out] = y[out] - X[out] @ bounded_least_squares(
+                gram - grams[out].sum(axis=0), right - rights[out].sum(axis=0), lowest
+            )
         sse, held_out_sse = self.sse.copy(), self.sse.copy()
         sse[rows], held_out_sse[rows] = (left**2).sum(axis=0), (held_out**2).sum(axis=0)
         # White noise alone would give the deviations of the bread.
         wider = deviation / np.maximum(np.sqrt(np.diag(bread)), 1e-300) / norm
-        return Fit(theta / norm, deviation / norm, freedom, bread * np.outer(wider, wider), sse, held_out_sse)
+        return Fit(
+            theta / norm,
+            deviation / norm,
+            freedom,
+            bread * np.outer(wider, wider),
+            sse,
+            held_out_sse,
+        )
 
 
 def _connected(signatures: Sequence[Signature]) -> list[list[int]]:

@@ -60,19 +60,32 @@ class Row:
 
 def residual_rows(robot: Robot) -> list[Row]:
     """The residual's rows for a robot, in order."""
-    rows = [Row(name, "joint", unit) for name, unit in zip(robot.joint_names, robot.torque_units, strict=True)]
+    rows = [
+        Row(name, "joint", unit)
+        for name, unit in zip(robot.joint_names, robot.torque_units, strict=True)
+    ]
     if not robot.has_floating_base:
         return rows
-    rows += [Row(f"base/{kind}_{axis}", "base", unit) for kind, unit in (("moment", "Nm"), ("force", "N")) for axis in _AXES]
+    rows += [
+        Row(f"base/{kind}_{axis}", "base", unit)
+        for kind, unit in (("moment", "Nm"), ("force", "N"))
+        for axis in _AXES
+    ]
     for side in robot.description.sides:
         kinds = (("angular_velocity", "rad/s"), ("specific_force", "m/s^2"))
-        rows += [Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit) for kind, unit in kinds for axis in _AXES]
+        rows += [
+            Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit)
+            for kind, unit in kinds
+            for axis in _AXES
+        ]
     if len(robot.description.sides) == 2:
         rows += [Row(f"soles/relative_velocity_{axis}", "kinematic", "m/s") for axis in _AXES]
     return rows
 
 
-def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[SensorSignals, np.ndarray]:
+def read_signals(
+    robot: Robot, log: Log, recording: RecordingConfig
+) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
     Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced; without
@@ -89,10 +102,16 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
     period, time = float(log.meta["period"]), log.time
     grid = time[0] + np.arange(round((time[-1] - time[0]) / period) + 1) * period
     even = len(grid) == len(time) and np.allclose(grid, time, rtol=0, atol=1e-6 * period)
-    after = np.clip(np.searchsorted(time, grid - 1e-9 * period), 1, len(time) - 1) if len(time) > 1 else np.zeros(1, dtype=int)
+    after = (
+        np.clip(np.searchsorted(time, grid - 1e-9 * period), 1, len(time) - 1)
+        if len(time) > 1
+        else np.zeros(1, dtype=int)
+    )
     known = np.ones(len(grid), dtype=bool)
     if not even:
-        known = (time[after] - time[after - 1] < 1.5 * period) | (time[after] - grid < 1e-3 * period)
+        known = (time[after] - time[after - 1] < 1.5 * period) | (
+            time[after] - grid < 1e-3 * period
+        )
     # What is smoothed or differenced is not so across the switching of a drive, where torques jump.
     latest = np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)
     stretches = _stretches(known, log["joint/enabled"][latest] if "joint/enabled" in log else None)
@@ -123,8 +142,13 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
     if robot.has_floating_base:
         for name in ("imu/linear_acceleration", "imu/angular_velocity"):
             if name not in log:
-                raise InputError(f"the log has no channel {name}, which the residual of a floating robot needs")
-        specific_force, angular_velocity = on_grid(log["imu/linear_acceleration"]), on_grid(log["imu/angular_velocity"])
+                raise InputError(
+                    f"the log has no channel {name}, which the residual of a floating robot needs"
+                )
+        specific_force, angular_velocity = (
+            on_grid(log["imu/linear_acceleration"]),
+            on_grid(log["imu/angular_velocity"]),
+        )
         pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
     measured = "joint/velocity" in log and recording.velocity == "measured"
@@ -140,14 +164,18 @@ def read_signals(robot: Robot, log: Log, recording: RecordingConfig) -> tuple[Se
     return signals, known
 
 
-def _low_passed(values: np.ndarray, cutoff: float, period: float, stretches: list[slice]) -> np.ndarray:
+def _low_passed(
+    values: np.ndarray, cutoff: float, period: float, stretches: list[slice]
+) -> np.ndarray:
     """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a corner of 0."""
     if cutoff == 0:
         return values
     result = values.copy()
     filter_ = _butterworth(cutoff, period)
     for stretch in stretches:
-        result[stretch] = sosfiltfilt(filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING))
+        result[stretch] = sosfiltfilt(
+            filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING)
+        )
     return result
 
 
@@ -218,7 +246,9 @@ def block_means(values: np.ndarray, length: int) -> np.ndarray:
 
 def averaged(instants: Instants, length: int) -> Instants:
     """The instants averaged over blocks."""
-    return Instants(**{name: block_means(values, length) for name, values in vars(instants).items()})
+    return Instants(
+        **{name: block_means(values, length) for name, values in vars(instants).items()}
+    )
 
 
 class _Remembered:
@@ -244,7 +274,9 @@ class EquationOfMotion:
         self.robot, plant = robot, robot.plant
         self._context = plant.CreateDefaultContext()
         self.pads = FootPads(robot)
-        self.weight = plant.CalcTotalMass(self._context) * float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+        self.weight = plant.CalcTotalMass(self._context) * float(
+            np.linalg.norm(plant.gravity_field().gravity_vector())
+        )
         self.gravity = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
         n = len(robot.joint_names)
         if robot.has_floating_base:
@@ -257,7 +289,11 @@ class EquationOfMotion:
             self._order = robot.velocity_index
         self._upright = robot.base_pose_positions(RigidTransform())
         self._joints = slice(len(self._order) - n, None)
-        self._soles = [robot.sole(side) for side in robot.description.sides] if robot.has_floating_base else []
+        self._soles = (
+            [robot.sole(side) for side in robot.description.sides]
+            if robot.has_floating_base
+            else []
+        )
         # An effect that is tried changes some signals; what depends on the others is not computed again.
         self._inverse_dynamics = _Remembered(self._calc_inverse_dynamics)
         self._jacobians = _Remembered(self._calc_jacobians)
@@ -265,7 +301,11 @@ class EquationOfMotion:
 
     def sole_rotations(self, at: Instants) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each."""
-        plant, context, soles = self.robot.plant, self._context, [self.robot.sole(side) for side in self.robot.description.sides]
+        plant, context, soles = (
+            self.robot.plant,
+            self._context,
+            [self.robot.sole(side) for side in self.robot.description.sides],
+        )
         result = np.empty((len(soles), len(at.joint_position), 3, 3))
         positions = self._upright.copy()
         for k, q in enumerate(at.joint_position):
@@ -278,14 +318,19 @@ class EquationOfMotion:
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
         parts = self.pads.split(pad_force)
-        return [part.reshape(len(part), -1) @ G.T for part, G in zip(parts, self.robot.grasp_maps, strict=True)]
+        return [
+            part.reshape(len(part), -1) @ G.T
+            for part, G in zip(parts, self.robot.grasp_maps, strict=True)
+        ]
 
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
         result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)
         for foot, force in enumerate(self.pads.split(pad_force)):
             normal = force[:, :, 2]
-            result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (normal.min(axis=1) > _STANDING_PAD * self.weight)
+            result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (
+                normal.min(axis=1) > _STANDING_PAD * self.weight
+            )
         return result
 
     def residual(self, at: Instants, *, kinematic: bool = True) -> np.ndarray:
@@ -295,8 +340,14 @@ class EquationOfMotion:
             kinematic: are the kinematic rows wanted? Else they are left out.
         """
         if len(at.joint_position) > _MOST_INSTANTS:
-            parts = [slice(start, start + _MOST_INSTANTS) for start in range(0, len(at.joint_position), _MOST_INSTANTS)]
-            pieces = [Instants(**{name: values[part] for name, values in vars(at).items()}) for part in parts]
+            parts = [
+                slice(start, start + _MOST_INSTANTS)
+                for start in range(0, len(at.joint_position), _MOST_INSTANTS)
+            ]
+            pieces = [
+                Instants(**{name: values[part] for name, values in vars(at).items()})
+                for part in parts
+            ]
             return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
         generalized = self._inverse_dynamics(states, accelerations)
@@ -307,16 +358,24 @@ class EquationOfMotion:
                 generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
             if kinematic:
                 velocity = np.einsum("fmij,mj->fmi", J, rates)
-                specific_force = np.einsum("fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]) + self._bias_accelerations(states)
+                specific_force = np.einsum(
+                    "fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]
+                ) + self._bias_accelerations(states)
                 specific_force[:, :, 2] -= self.gravity
-                kinematic_rows = [rows[foot] for foot in range(len(J)) for rows in (velocity[..., :3], specific_force)]
+                kinematic_rows = [
+                    rows[foot]
+                    for foot in range(len(J))
+                    for rows in (velocity[..., :3], specific_force)
+                ]
                 if len(J) == 2:
                     # The base's columns of J hold R_FB.
                     left, right = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
                     kinematic_rows.append(left - right)
         # Joints first.
         joints = at.torque_command - generalized[:, self._joints]
-        return np.concatenate([joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1)
+        return np.concatenate(
+            [joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1
+        )
 
     def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Generalized forces without those of the feet, (M, v), in our order."""
@@ -336,18 +395,27 @@ class EquationOfMotion:
         for k, position in enumerate(positions):
             plant.SetPositions(context, position)
             for foot, sole in enumerate(soles):
-                J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, sole, np.zeros(3), plant.world_frame(), sole)
+                J = plant.CalcJacobianSpatialVelocity(
+                    context, JacobianWrtVariable.kV, sole, np.zeros(3), plant.world_frame(), sole
+                )
                 result[foot, k] = J[:, self._order]
         return result
 
     def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
         """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
-        plant, context, soles, world = self.robot.plant, self._context, self._soles, self.robot.plant.world_frame()
+        plant, context, soles, world = (
+            self.robot.plant,
+            self._context,
+            self._soles,
+            self.robot.plant.world_frame(),
+        )
         result = np.empty((len(soles), len(states), 3))
         for k, state in enumerate(states):
             plant.SetPositionsAndVelocities(context, state)
             for foot, sole in enumerate(soles):
-                bias = plant.CalcBiasSpatialAcceleration(context, JacobianWrtVariable.kV, sole, np.zeros(3), world, sole)
+                bias = plant.CalcBiasSpatialAcceleration(
+                    context, JacobianWrtVariable.kV, sole, np.zeros(3), world, sole
+                )
                 result[foot, k] = bias.translational()
         return result
 
@@ -393,8 +461,14 @@ class EquationOfMotion:
         state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
         soles = [robot.sole(side) for side in robot.description.sides] if floating else []
         world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
-        wrench_variance = [deviation**2 for deviation in wrench_deviations(sensors.foot_force, robot)] if floating else []
-        scale = np.concatenate([np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)])
+        wrench_variance = (
+            [deviation**2 for deviation in wrench_deviations(sensors.foot_force, robot)]
+            if floating
+            else []
+        )
+        scale = np.concatenate(
+            [np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)]
+        )
         joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
         lever = _skew(self.p_BI) if floating else None
         for k in range(M):
@@ -407,7 +481,9 @@ class EquationOfMotion:
             differenced[k, :v] = ((H * scale) ** 2).sum(axis=1)
             place, relative = v, []
             for sole, variance in zip(soles, wrench_variance, strict=True):
-                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[:, order]
+                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[
+                    :, order
+                ]
                 white[k, :v] += (J**2).T[joints_first] @ variance
                 white[k, place : place + 3] = ((J[:3] * scale) ** 2).sum(axis=1)
                 white[k, place + 3 : place + 6] = accelerometer**2
@@ -424,7 +500,9 @@ def joint_velocity_noise(sensors: SensorsConfig) -> float:
     encoders = sensors.encoders
     if encoders.velocity == "exact":
         return encoders.velocity_noise
-    return float(np.sqrt(2) * np.hypot(encoders.noise, encoders.resolution / np.sqrt(12)) / encoders.period)
+    return float(
+        np.sqrt(2) * np.hypot(encoders.noise, encoders.resolution / np.sqrt(12)) / encoders.period
+    )
 
 
 def _skew(p: np.ndarray) -> np.ndarray:
@@ -492,11 +570,15 @@ class RecordedMotion:
         self.signals, self.measured = read_signals(robot, log, recording)
         self.length = max(1, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
-            raise InputError(f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed")
+            raise InputError(
+                f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed"
+            )
         names = [row.name for row in residual_rows(robot)]
         for pattern in recording.unused_rows:
             if not fnmatch.filter(names, pattern):
-                raise InputError(f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})")
+                raise InputError(
+                    f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})"
+                )
         self.start = float(log.time[0])
         self.equation = EquationOfMotion(robot)
 
@@ -510,7 +592,12 @@ class RecordedMotion:
 
     def averages(self, predicted: np.ndarray) -> np.ndarray:
         """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
-        return block_means(_low_passed(predicted, self.recording.recorded_cutoff, self.period, self._measured_steps), self.length)
+        return block_means(
+            _low_passed(
+                predicted, self.recording.recorded_cutoff, self.period, self._measured_steps
+            ),
+            self.length,
+        )
 
     @cached_property
     def _measured_steps(self) -> list[slice]:
@@ -525,32 +612,52 @@ class RecordedMotion:
     @cached_property
     def time(self) -> np.ndarray:
         """Centre of each block [s]."""
-        return self.start + (np.arange(len(self.blocks.joint_position)) + 0.5) * self.length * self.period
+        return (
+            self.start
+            + (np.arange(len(self.blocks.joint_position)) + 0.5) * self.length * self.period
+        )
 
     @cached_property
     def standing(self) -> np.ndarray:
         """Which soles stand throughout each block, (B, feet)."""
-        return block_means(self.equation.standing(self.steps.pad_force).astype(float), self.length) == 1.0
+        return (
+            block_means(self.equation.standing(self.steps.pad_force).astype(float), self.length)
+            == 1.0
+        )
 
     @cached_property
     def known(self) -> np.ndarray:
         """Which averages of which rows are known, (B, R)."""
         rows = residual_rows(self.robot)
         # A force at the end of the sensor's range is any force beyond it.
-        measured = self.measured & (np.abs(self.signals.pad_force) < self.sensors.foot_force.range).all(axis=(1, 2))
+        measured = self.measured & (
+            np.abs(self.signals.pad_force) < self.sensors.foot_force.range
+        ).all(axis=(1, 2))
         in_gap = block_means(1.0 - (measured[:-1] & measured[1:]), self.length) > 0
         known = np.repeat(~in_gap[:, None], len(rows), axis=1)
         if "joint/torque_command" not in self.log:
             known[:, [row.kind == "joint" for row in rows]] = False
-        known[:, [any(fnmatch.fnmatch(row.name, pattern) for pattern in self.recording.unused_rows) for row in rows]] = False
-        least = self.robot.description.per_joint(self.recording.least_speed, key="recording.least_speed", default=0.0)
-        known[:, : len(least)] &= block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
+        known[
+            :,
+            [
+                any(fnmatch.fnmatch(row.name, pattern) for pattern in self.recording.unused_rows)
+                for row in rows
+            ],
+        ] = False
+        least = self.robot.description.per_joint(
+            self.recording.least_speed, key="recording.least_speed", default=0.0
+        )
+        known[:, : len(least)] &= (
+            block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
+        )
         kinematic = np.array([row.kind == "kinematic" for row in rows])
         known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
         around = 2 * round(_ROLLING / (self.length * self.period)) + 1
         at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
         for foot, side in enumerate(self.robot.description.sides):
-            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= at_rest[:, foot, None]
+            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= at_rest[
+                :, foot, None
+            ]
         known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
         return known
 
@@ -562,7 +669,9 @@ class RecordedMotion:
             InputError: no row of it is known at any time.
         """
         if not self.known.any():
-            lacking = "" if "joint/torque_command" in self.log else ", joint/torque_command is missing"
+            lacking = (
+                "" if "joint/torque_command" in self.log else ", joint/torque_command is missing"
+            )
             raise InputError(
                 f"the log has nothing to compare a model with{lacking} (needed: torques, or feet and an IMU, without gaps for "
                 f"{self.recording.block:g} s, in rows that recording.unused_rows and recording.least_speed leave)"
@@ -576,11 +685,26 @@ class RecordedMotion:
             value = block_means(value, self.length)
         white, differenced = self.equation.noise(self.blocks, self.sensors)
         names = self.robot.description
-        torque_noise = names.per_joint(self.recording.torque_noise, key="recording.torque_noise", default=0.0)
-        torque_share = names.per_joint(self.recording.torque_noise_share, key="recording.torque_noise_share", default=0.0)
-        white[:, : len(torque_noise)] += torque_noise**2 + (torque_share * self.blocks.torque_command) ** 2
+        torque_noise = names.per_joint(
+            self.recording.torque_noise, key="recording.torque_noise", default=0.0
+        )
+        torque_share = names.per_joint(
+            self.recording.torque_noise_share, key="recording.torque_noise_share", default=0.0
+        )
+        white[:, : len(torque_noise)] += (
+            torque_noise**2 + (torque_share * self.blocks.torque_command) ** 2
+        )
         duration = self.length * self.period
         variance = white / self.length + 2 * differenced / duration**2
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
         covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
-        return Residual(residual_rows(self.robot), self.time, value, self.known, variance, covariance, self.standing, self.blocks)
+        return Residual(
+            residual_rows(self.robot),
+            self.time,
+            value,
+            self.known,
+            variance,
+            covariance,
+            self.standing,
+            self.blocks,
+        )

@@ -58,7 +58,11 @@ class RolloutError:
 
 
 def rollout(
-    scenario: Scenario, log: Log, *, planned_with: RobotConfig | None = None, progress: Callable[[float], None] | None = None
+    scenario: Scenario,
+    log: Log,
+    *,
+    planned_with: RobotConfig | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
@@ -88,7 +92,9 @@ def rollout(
     believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
     seeds = range(scenario.seed + 1, scenario.seed + 1 + _DRAWS)
     draws = [_simulated_error(replace(believed, seed=seed), log, progress) for seed in seeds]
-    return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[_DRAWS // 2]
+    return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[
+        _DRAWS // 2
+    ]
 
 
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
@@ -100,12 +106,16 @@ def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
     return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
 
 
-def _simulated_error(scenario: Scenario, log: Log, progress: Callable[[float], None] | None) -> RolloutError:
+def _simulated_error(
+    scenario: Scenario, log: Log, progress: Callable[[float], None] | None
+) -> RolloutError:
     """The error of a scenario's robot as it is simulated."""
     result = simulate(scenario, progress=progress)
     simulated = result.log
     rows = np.searchsorted(simulated.time, log.time - 1e-9)
-    shared = (rows < len(simulated.time)) & (np.abs(simulated.time[np.minimum(rows, len(simulated.time) - 1)] - log.time) < 1e-6)
+    shared = (rows < len(simulated.time)) & (
+        np.abs(simulated.time[np.minimum(rows, len(simulated.time) - 1)] - log.time) < 1e-6
+    )
     if not shared.any():
         raise InputError("the log and the simulated model have no sample time in common")
     there = {name: simulated[name][rows[shared]] for name in _COMPARED if name in log}
@@ -115,7 +125,13 @@ def _simulated_error(scenario: Scenario, log: Log, progress: Callable[[float], N
 _COMPARED = ("joint/position", "joint/velocity", "joint/torque_command")
 
 
-def _rollout_error(log: Log, rows: np.ndarray, simulated: Mapping[str, np.ndarray], time: float, failure: str | None) -> RolloutError:
+def _rollout_error(
+    log: Log,
+    rows: np.ndarray,
+    simulated: Mapping[str, np.ndarray],
+    time: float,
+    failure: str | None,
+) -> RolloutError:
     """The error of what was simulated.
 
     Args:
@@ -127,14 +143,21 @@ def _rollout_error(log: Log, rows: np.ndarray, simulated: Mapping[str, np.ndarra
         return dict(zip(log.joints, values.tolist(), strict=True))
 
     error = {name: values - log[name][rows] for name, values in simulated.items()}
-    rms = [by_joint(np.sqrt((error[name] ** 2).mean(axis=0))) if name in error else {} for name in _COMPARED]
+    rms = [
+        by_joint(np.sqrt((error[name] ** 2).mean(axis=0))) if name in error else {}
+        for name in _COMPARED
+    ]
     q = error["joint/position"]
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.linalg.norm(q, axis=0) / np.linalg.norm(log["joint/position"][rows], axis=0)
-    return RolloutError(*rms, time, failure, by_joint(np.abs(q).mean(axis=0)), by_joint(relative), log.time[rows], q)
+    return RolloutError(
+        *rms, time, failure, by_joint(np.abs(q).mean(axis=0)), by_joint(relative), log.time[rows], q
+    )
 
 
-def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None) -> RolloutError:
+def _recorded_rollout(
+    scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None
+) -> RolloutError:
     rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
     for stretch, constants in stretches(log):
         with located("control: "):
@@ -150,7 +173,13 @@ def _recorded_rollout(scenario: Scenario, recorded: Recorded, log: Log, progress
         if failure is not None:
             break
     names = [name for name in _COMPARED if name in log]
-    return _rollout_error(log, rows, {name: np.concatenate([c[name] for c in channels]) for name in names}, simulated_time, failure)
+    return _rollout_error(
+        log,
+        rows,
+        {name: np.concatenate([c[name] for c in channels]) for name in names},
+        simulated_time,
+        failure,
+    )
 
 
 def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
@@ -204,9 +233,20 @@ def _first_state(
     """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
     few = slice(0, _STARTING_SAMPLES)
     q = log["joint/position"][0]
-    v = log["joint/velocity"][0] if "joint/velocity" in log else np.polyfit(log.time[few] - log.time[0], log["joint/position"][few], 2)[1]
+    v = (
+        log["joint/velocity"][0]
+        if "joint/velocity" in log
+        else np.polyfit(log.time[few] - log.time[0], log["joint/position"][few], 2)[1]
+    )
     points = sum(leg.points for leg in robot.description.legs.values())
-    signals = SensorSignals(q[None], v[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, points, 3)), np.zeros_like(q)[None])
+    signals = SensorSignals(
+        q[None],
+        v[None],
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        np.zeros((1, points, 3)),
+        np.zeros_like(q)[None],
+    )
     for effect in reversed(effects):
         memory = np.zeros((effect.effect.memory_size, 1, len(effect.targets)))
         signals = effect.effect.undone(signals, memory, effect, robot, period)

@@ -44,13 +44,17 @@ def _check_angles(motion: RecordedMotion) -> None:
         limit = float(max(-model.position_lower_limits()[0], model.position_upper_limits()[0]))
         if angle > _LARGEST_ANGLE or angle > max(_BEYOND_LIMITS * limit, limit + _BEYOND):
             allowed = f" (the model's limit is {limit:.2g} rad)" if np.isfinite(limit) else ""
-            raise InputError(f"channel joint/position: {joint} reaches {angle:.3g} rad{allowed}; are these degrees?")
+            raise InputError(
+                f"channel joint/position: {joint} reaches {angle:.3g} rad{allowed}; are these degrees?"
+            )
 
 
 def _check_velocity(motion: RecordedMotion) -> None:
     """Joint velocities must be the derivative of joint angles."""
     length = motion.length
-    q = motion.signals.joint_position[: len(motion.signals.joint_position) // length * length : length]
+    q = motion.signals.joint_position[
+        : len(motion.signals.joint_position) // length * length : length
+    ]
     from_angles = np.diff(q, axis=0) / (length * motion.period)
     measured = motion.blocks.joint_velocity[: len(from_angles)]
     power = (from_angles**2).sum(axis=0)
@@ -65,17 +69,27 @@ def _check_velocity(motion: RecordedMotion) -> None:
                 else "unit or joint is wrong"
             )
             joint = motion.robot.joint_names[k]
-            raise InputError(f"channel joint/velocity: {joint} reads {slope:.2g} times the rate of joint/position; {hint}")
+            raise InputError(
+                f"channel joint/velocity: {joint} reads {slope:.2g} times the rate of joint/position; {hint}"
+            )
 
 
 def _check_gravity(motion: RecordedMotion) -> None:
     g = motion.equation.gravity
     mean = motion.signals.specific_force.mean(axis=0) @ motion.equation.R_BI.T
-    channel = "channel imu/linear_acceleration: in base axes its mean is [" + ", ".join(f"{x:.2f}" for x in mean) + "] m/s^2"
+    channel = (
+        "channel imu/linear_acceleration: in base axes its mean is ["
+        + ", ".join(f"{x:.2f}" for x in mean)
+        + "] m/s^2"
+    )
     if np.linalg.norm(mean) < _TOLERANCE * g:
-        raise InputError(f"{channel}; gravity is missing (expected the specific force, {g:.2f} m/s^2 upwards at rest)")
+        raise InputError(
+            f"{channel}; gravity is missing (expected the specific force, {g:.2f} m/s^2 upwards at rest)"
+        )
     if mean[2] < -(1 - _TOLERANCE) * g:
-        raise InputError(f"{channel}; its sign is reversed (expected the specific force, {g:.2f} m/s^2 upwards at rest)")
+        raise InputError(
+            f"{channel}; its sign is reversed (expected the specific force, {g:.2f} m/s^2 upwards at rest)"
+        )
     if not abs(np.linalg.norm(mean) / g - 1) < _TOLERANCE:
         raise InputError(f"{channel}; its unit is wrong (expected {g:.2f} m/s^2 upwards at rest)")
     if mean[2] < (1 - _TOLERANCE) * g:
@@ -87,22 +101,36 @@ def _check_weight(motion: RecordedMotion) -> None:
     wrenches = motion.equation.wrenches(motion.steps.pad_force)
     for side, wrench in zip(motion.robot.description.sides, wrenches, strict=True):
         pull, push = -np.quantile(wrench[:, 5], (0.02, 0.98)) / motion.equation.weight
-        if pull > _TOLERANCE > -push and len(wrenches) > 1 and sum(w[:, 5].mean() < 0 for w in wrenches) < len(wrenches):
+        if (
+            pull > _TOLERANCE > -push
+            and len(wrenches) > 1
+            and sum(w[:, 5].mean() < 0 for w in wrenches) < len(wrenches)
+        ):
             raise InputError(
                 f"channel foot/{side}: this foot pulls at the ground, with up to {100 * pull:.0f} % of the weight; its sign is reversed "
                 "(expected the ground's force on the foot, upwards)"
             )
     total = np.sum([wrench[:, 3:].mean(axis=0) for wrench in wrenches], axis=0)
     weight = motion.equation.weight
-    text = "[" + ", ".join(f"{x:.0f}" for x in total) + f"] N in the sole frames, the robot weighs {weight:.0f} N"
+    text = (
+        "["
+        + ", ".join(f"{x:.0f}" for x in total)
+        + f"] N in the sole frames, the robot weighs {weight:.0f} N"
+    )
     share = total[2] / weight
     sideways = np.abs(total[:2]).max() / weight
     if -1 - _TOLERANCE < share < -1 + _TOLERANCE:
-        raise InputError(f"channel foot/<side>: the mean force on the feet is {text}; its sign is reversed (expected upwards)")
+        raise InputError(
+            f"channel foot/<side>: the mean force on the feet is {text}; its sign is reversed (expected upwards)"
+        )
     if sideways > 0.5:
-        raise InputError(f"channel foot/<side>: the mean force on the feet is {text}; its frame is wrong (expected along z)")
+        raise InputError(
+            f"channel foot/<side>: the mean force on the feet is {text}; its frame is wrong (expected along z)"
+        )
     if abs(share - 1) > _TOLERANCE:
-        raise InputError(f"channel foot/<side>: the mean force on the feet is {text}; unit, scale or the model's mass is wrong")
+        raise InputError(
+            f"channel foot/<side>: the mean force on the feet is {text}; unit, scale or the model's mass is wrong"
+        )
 
 
 def rate_by_legs(motion: RecordedMotion, at: Instants) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +139,11 @@ def rate_by_legs(motion: RecordedMotion, at: Instants) -> tuple[np.ndarray, np.n
     Returns:
         Angular velocity of the base in its axes, (M, 3) [rad/s], and when a sole stands, (M,).
     """
-    still = replace(at, angular_velocity=np.zeros_like(at.angular_velocity), angular_acceleration=np.zeros_like(at.angular_acceleration))
+    still = replace(
+        at,
+        angular_velocity=np.zeros_like(at.angular_velocity),
+        angular_acceleration=np.zeros_like(at.angular_acceleration),
+    )
     of_soles = motion.equation.residual(still)[:, len(motion.robot.joint_names) + 6 :]
     standing = motion.equation.standing(at.pad_force)
     rates = np.zeros((len(standing), 3))
@@ -131,7 +163,11 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
     slope = float((rates[stands] * gyro[stands]).sum() / power)
     if not 0.5 < slope < 2.0:
         hint = (
-            "its sign is reversed" if slope < -0.5 else "are these degrees per second?" if 40 < slope < 75 else "its unit or frame is wrong"
+            "its sign is reversed"
+            if slope < -0.5
+            else "are these degrees per second?"
+            if 40 < slope < 75
+            else "its unit or frame is wrong"
         )
         raise InputError(
             f"channel imu/angular_velocity: reads {slope:.2g} times the rate at which the legs that stand turn the base; {hint}"
@@ -152,4 +188,6 @@ def _check_torque(motion: RecordedMotion) -> None:
                 f"channel joint/torque_command: {joint} pulls against what the model needs ({slope:.2g} times); its sign is reversed"
             )
         if not slope < 20:
-            raise InputError(f"channel joint/torque_command: {joint} reads {slope:.3g} times what the model needs; its unit is wrong (Nm)")
+            raise InputError(
+                f"channel joint/torque_command: {joint} reads {slope:.3g} times what the model needs; its unit is wrong (Nm)"
+            )

@@ -26,7 +26,9 @@ def stretches(log: Log) -> Iterator[tuple[slice, Mapping[str, Any]]]:
             yield slice(int(start), int(stop)), segment
 
 
-def scaled_gains(control: PositionLoopConfig, recorded: Recorded, constants: Mapping[str, Any]) -> PositionLoopConfig:
+def scaled_gains(
+    control: PositionLoopConfig, recorded: Recorded, constants: Mapping[str, Any]
+) -> PositionLoopConfig:
     """The controller of one stretch: its gains times the number that the log keeps with the stretch, see `Recorded.gain`.
 
     Raises:
@@ -37,8 +39,13 @@ def scaled_gains(control: PositionLoopConfig, recorded: Recorded, constants: Map
     factor = constants.get(recorded.gain)
     if not isinstance(factor, int | float):
         numbers = [name for name, value in constants.items() if isinstance(value, int | float)]
-        raise InputError(f"gain {recorded.gain}: expected a number that is kept with the log's stretches (there are: {', '.join(numbers)})")
-    gains = {key: {joint: factor * value for joint, value in getattr(control, key).items()} for key in ("kp", "kd")}
+        raise InputError(
+            f"gain {recorded.gain}: expected a number that is kept with the log's stretches (there are: {', '.join(numbers)})"
+        )
+    gains = {
+        key: {joint: factor * value for joint, value in getattr(control, key).items()}
+        for key in ("kp", "kd")
+    }
     return replace(control, **gains)
 
 
@@ -52,7 +59,11 @@ def with_command(scenario: Scenario, log: Log, names: RobotDescription) -> Log:
         InputError: see `scaled_gains`; or a derivative gain, but no velocities in the log.
     """
     recorded = scenario.reference
-    if "joint/torque_command" in log or not isinstance(recorded, Recorded) or "reference/joint/position" not in log:
+    if (
+        "joint/torque_command" in log
+        or not isinstance(recorded, Recorded)
+        or "reference/joint/position" not in log
+    ):
         return log
     q, q_ref = log["joint/position"], log["reference/joint/position"]
     zero = np.zeros_like(q)
@@ -60,11 +71,25 @@ def with_command(scenario: Scenario, log: Log, names: RobotDescription) -> Log:
     for rows, constants in stretches(log):
         with located("control: "):
             control = scaled_gains(scenario.control, recorded, constants)
-            kp, kd, limit = (names.per_joint(getattr(control, key), key=key) for key in ("kp", "kd", "torque_limit"))
+            kp, kd, limit = (
+                names.per_joint(getattr(control, key), key=key)
+                for key in ("kp", "kd", "torque_limit")
+            )
             if kd.any() and "joint/velocity" not in log:
-                raise InputError("kd: the log has no channel joint/velocity, from which the torque of the position loop would follow")
-        error, error_rate = q_ref[rows] - q[rows], (log.get("reference/joint/velocity", zero) - log.get("joint/velocity", zero))[rows]
-        feedforward = log.get("reference/joint/feedforward_torque", zero)[rows] if control.feedforward else 0.0
-        torque[rows] = np.clip(position_loop(error, error_rate, kp, kd) + feedforward, -limit, limit)
+                raise InputError(
+                    "kd: the log has no channel joint/velocity, from which the torque of the position loop would follow"
+                )
+        error, error_rate = (
+            q_ref[rows] - q[rows],
+            (log.get("reference/joint/velocity", zero) - log.get("joint/velocity", zero))[rows],
+        )
+        feedforward = (
+            log.get("reference/joint/feedforward_torque", zero)[rows]
+            if control.feedforward
+            else 0.0
+        )
+        torque[rows] = np.clip(
+            position_loop(error, error_rate, kp, kd) + feedforward, -limit, limit
+        )
     torque *= log.get("joint/enabled", 1.0)
     return Log({**log.channels, "joint/torque_command": torque}, log.meta)

@@ -35,7 +35,9 @@ class TorqueHum(JointTorqueEffect):
     frequency: dict[str, float] = field(default_factory=lambda: {"all": 5.0})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (np.sin(2 * np.pi * nonlinear[0] * motion.time),), (0.0,)
 
 
@@ -43,7 +45,9 @@ class TorqueHum(JointTorqueEffect):
 class NeighbourTorque(JointTorqueEffect):
     """Some of the torque that is commanded to the joint before it in the order of the joints: u = share * command of the neighbour."""
 
-    description: ClassVar[str] = "A joint feels the torque of its neighbour, as through crossed wires or a coupled gear."
+    description: ClassVar[str] = (
+        "A joint feels the torque of its neighbour, as through crossed wires or a coupled gear."
+    )
     signature: ClassVar[str] = "Torque in proportion to another joint's command."
     experiment: ClassVar[str] = "Load one joint at a time."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -53,7 +57,9 @@ class NeighbourTorque(JointTorqueEffect):
     share: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (np.roll(motion.command, 1, axis=-1),), (0.0,)
 
 
@@ -62,7 +68,9 @@ class UnevenFriction(JointTorqueEffect):
     """Coulomb friction that changes along the way: u = coulomb (1 + unevenness sin(3 q)) tanh(w / 0.01 rad/s)."""
 
     description: ClassVar[str] = "Friction that depends on the angle, as of a bent shaft."
-    signature: ClassVar[str] = "Torque against the motion whose size is a wave over the joint angle."
+    signature: ClassVar[str] = (
+        "Torque against the motion whose size is a wave over the joint angle."
+    )
     experiment: ClassVar[str] = "Move each joint to and fro through a large angle."
     parameters: ClassVar[dict[str, Parameter]] = {
         "coulomb": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
@@ -73,7 +81,9 @@ class UnevenFriction(JointTorqueEffect):
     unevenness: dict[str, float] = field(default_factory=lambda: {"all": 0.9})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         size = 1.0 + nonlinear[0] * np.sin(3.0 * motion.position)
         sign, slope = smooth_sign(motion.velocity, _TRANSITION)
         return (size * sign,), (size * slope,)
@@ -90,13 +100,19 @@ class TorqueDropouts(JointTorqueEffect):
     description: ClassVar[str] = "The motor fails for moments, as from a loose contact."
     signature: ClassVar[str] = "Torque in proportion to the command, now and then."
     experiment: ClassVar[str] = "Hold each joint under load for long."
-    parameters: ClassVar[dict[str, Parameter]] = {"depth": Parameter("1", linear=True, plausible=(0.0, 1.0))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "depth": Parameter("1", linear=True, plausible=(0.0, 1.0))
+    }
 
     depth: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:  # noqa: ARG004
-        wave = sum(np.sin(2 * np.pi * frequency * motion.time) for frequency in _DROPOUT_FREQUENCIES)
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        wave = sum(
+            np.sin(2 * np.pi * frequency * motion.time) for frequency in _DROPOUT_FREQUENCIES
+        )
         return (motion.command * (wave > _DROPOUT_LEVEL),), (0.0,)
 
 
@@ -118,7 +134,9 @@ class RoughSpot(JointTorqueEffect):
     width: dict[str, float] = field(default_factory=lambda: {"all": 0.05})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         angle, width = nonlinear
         bump = np.exp(-(((motion.position - angle) / width) ** 2))
         sign, slope = smooth_sign(motion.velocity, _TRANSITION)
@@ -130,5 +148,6 @@ class RoughSpot(JointTorqueEffect):
 
 
 STRANGERS: dict[str, type[JointTorqueEffect]] = {
-    effect.__name__: effect for effect in (TorqueHum, NeighbourTorque, UnevenFriction, TorqueDropouts, RoughSpot)
+    effect.__name__: effect
+    for effect in (TorqueHum, NeighbourTorque, UnevenFriction, TorqueDropouts, RoughSpot)
 }

@@ -33,7 +33,9 @@ class Structure:
     share: float
 
 
-def leftover_structure(motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray) -> list[Structure]:
+def leftover_structure(
+    motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray
+) -> list[Structure]:
     """Rows in which more than noise is left.
 
     Args:
@@ -52,10 +54,15 @@ def leftover_structure(motion: RecordedMotion, white: WhitenedResidual, left: np
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            if ratio < tolerated and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
+            if (
+                ratio < tolerated
+                and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]
+            ):
                 continue
         excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
-        shares = {name: _explained(white, left, k, basis) / excess for name, basis in variables.items()}
+        shares = {
+            name: _explained(white, left, k, basis) / excess for name, basis in variables.items()
+        }
         best = max(shares, key=lambda name: shares[name])
         result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
     return result
@@ -78,7 +85,9 @@ def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dic
         # Fine near standstill, coarse elsewhere.
         result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
         result["load"] = hat_functions(blocks.torque_command[:, row])
-        result["acceleration"] = hat_functions(np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row])))
+        result["acceleration"] = hat_functions(
+            np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row]))
+        )
         others = [j for j in range(n) if j != row]
         result["other joints' torque"] = blocks.torque_command[:, others]
     else:
@@ -96,7 +105,9 @@ def hat_functions(x: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(x, knots, np.eye(len(knots))[k]) for k in range(len(knots))], axis=1)
 
 
-def _fit(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> tuple[float, float]:
+def _fit(
+    white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray
+) -> tuple[float, float]:
     """Sums of squares of a row on held-out data, without and with a smooth function."""
     X = white.whiten(row, basis)
     X = X[:, np.abs(X).max(axis=0) > 0]
@@ -105,7 +116,10 @@ def _fit(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray)
     grams, rights = [A.T @ A for A, _ in parts], [A.T @ b for A, b in parts]
     gram, right = sum(grams), sum(rights)
     ridge = 1e-3 * np.diag(np.diag(gram))
-    left_over = [b - A @ np.linalg.solve(gram - G + ridge, right - r) for (A, b), G, r in zip(parts, grams, rights, strict=True)]
+    left_over = [
+        b - A @ np.linalg.solve(gram - G + ridge, right - r)
+        for (A, b), G, r in zip(parts, grams, rights, strict=True)
+    ]
     held_out = np.concatenate(left_over)
     return float((y**2).sum()), float((held_out**2).sum())
 
@@ -113,7 +127,15 @@ def _fit(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray)
 def _drop(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:
     count = white.count[row]
     before, after = (max(sse / count, 1e-9) for sse in _fit(white, left, row, basis))
-    return float(count * (np.log(max(before, 1)) + before / max(before, 1) - np.log(max(after, 1)) - after / max(after, 1)))
+    return float(
+        count
+        * (
+            np.log(max(before, 1))
+            + before / max(before, 1)
+            - np.log(max(after, 1))
+            - after / max(after, 1)
+        )
+    )
 
 
 def _explained(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:

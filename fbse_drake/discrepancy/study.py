@@ -41,18 +41,31 @@ def model_error(predictor: Predictor) -> ModelError:
     """What the model of a predictor leaves over on its log."""
     residual, n = predictor.residual, len(predictor.robot.joint_names)
     known = residual.known[:, :n]
-    left, torque = (rms(values[:, :n], known) * np.sqrt(known.sum(axis=0)) for values in (residual.value, residual.signals.torque_command))
+    left, torque = (
+        rms(values[:, :n], known) * np.sqrt(known.sum(axis=0))
+        for values in (residual.value, residual.signals.torque_command)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         by_joint = dict(zip(predictor.robot.joint_names, (left / torque).tolist(), strict=True))
         relative = float(np.sqrt(np.nansum(left**2)) / np.sqrt(np.nansum(torque**2)))
     of_rows = rms(residual.value, residual.known).tolist()
-    return ModelError(relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True)))
+    return ModelError(
+        relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True))
+    )
 
 
 def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
     """The share of a log that models are fitted to, and the rest if there is one; see `RecordingConfig.train_share`."""
-    split = int(np.searchsorted(log.time, log.time[0] + scenario.recording.train_share * (log.time[-1] - log.time[0]), side="right"))
-    return log.part(slice(0, split)), log.part(slice(split, None)) if split < len(log.time) else None
+    split = int(
+        np.searchsorted(
+            log.time,
+            log.time[0] + scenario.recording.train_share * (log.time[-1] - log.time[0]),
+            side="right",
+        )
+    )
+    return log.part(slice(0, split)), log.part(slice(split, None)) if split < len(
+        log.time
+    ) else None
 
 
 @dataclass(frozen=True)
@@ -116,7 +129,9 @@ def study(
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
 
-    def measured_step(added: Sequence[Finding], held_out_rmse: float, train_rmse: float) -> StudyStep:
+    def measured_step(
+        added: Sequence[Finding], held_out_rmse: float, train_rmse: float
+    ) -> StudyStep:
         others = {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
         errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
         rolled, test_rolled = None, {}
@@ -138,12 +153,17 @@ def study(
         if not steps:
             steps.append(measured_step((), diagnosis.held_out_before, diagnosis.held_out_before))
         least_gain = _LEAST_GAIN if diagnosis.held_out_before > 1.0 else _LEAST_GAIN_IN_NOISE
-        worthwhile = diagnosis.held_out_after < (1.0 - least_gain * (len(diagnoses) > 1)) * diagnosis.held_out_before
+        worthwhile = (
+            diagnosis.held_out_after
+            < (1.0 - least_gain * (len(diagnoses) > 1)) * diagnosis.held_out_before
+        )
         if not diagnosis.chosen or not worthwhile:
             break
         scenario = add(scenario, diagnosis.chosen)
         predictor = Predictor(scenario, log)
-        steps.append(measured_step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after))
+        steps.append(
+            measured_step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after)
+        )
     return Study(tuple(steps), tuple(diagnoses), _reason(diagnoses), scenario)
 
 
@@ -178,7 +198,11 @@ def study_json(result: Study) -> dict[str, Any]:
                     for name, error in step.rollouts.items()
                 },
                 "errors": {
-                    name: {"relative": error.relative, "relative_by_joint": error.relative_by_joint, "rms": error.rms}
+                    name: {
+                        "relative": error.relative,
+                        "relative_by_joint": error.relative_by_joint,
+                        "rms": error.rms,
+                    }
                     for name, error in step.errors.items()
                 },
             }
@@ -195,4 +219,8 @@ def study_json(result: Study) -> dict[str, Any]:
 def _rollout_json(error: RolloutError | None) -> dict[str, float]:
     if error is None:
         return {"joint_position": np.nan, "joint_torque_command": np.nan, "time": np.nan}
-    return {"joint_position": error.mean_position, "joint_torque_command": error.mean_torque_command, "time": error.time}
+    return {
+        "joint_position": error.mean_position,
+        "joint_torque_command": error.mean_torque_command,
+        "time": error.time,
+    }

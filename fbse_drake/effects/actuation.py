@@ -15,7 +15,9 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
 class TorqueGain(JointTorqueEffect):
     """The motor gives (1 - shortfall) of the commanded torque: u = shortfall * command."""
 
-    description: ClassVar[str] = "The motor gives another share of the commanded torque than believed, as from a wrong torque constant."
+    description: ClassVar[str] = (
+        "The motor gives another share of the commanded torque than believed, as from a wrong torque constant."
+    )
     signature: ClassVar[str] = "Torque in proportion to the command."
     experiment: ClassVar[str] = "Hold each joint under several loads."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -25,7 +27,9 @@ class TorqueGain(JointTorqueEffect):
     shortfall: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:
         return (motion.command,), (0.0,)
 
 
@@ -34,7 +38,9 @@ class TorqueGain(JointTorqueEffect):
 class TorqueBias(JointTorqueEffect):
     """The motor lacks a constant torque: u = bias."""
 
-    description: ClassVar[str] = "A constant torque is missing, as from the offset of a current sensor."
+    description: ClassVar[str] = (
+        "A constant torque is missing, as from the offset of a current sensor."
+    )
     signature: ClassVar[str] = "The same torque at all times."
     experiment: ClassVar[str] = "Hold each joint still without load."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -44,7 +50,9 @@ class TorqueBias(JointTorqueEffect):
     bias: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[float], Sequence[float]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[float], Sequence[float]]:
         return (1.0,), (0.0,)
 
 
@@ -59,18 +67,26 @@ class TorqueDelay(JointTorqueEffect):
     description: ClassVar[str] = "The commanded torque comes late by a fixed time."
     signature: ClassVar[str] = "Torque in proportion to how fast the command changes."
     experiment: ClassVar[str] = "Command torques that change fast."
-    parameters: ClassVar[dict[str, Parameter]] = {"delay": Parameter("s", linear=False, plausible=(5e-4, 3e-2), neutral=0.0)}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "delay": Parameter("s", linear=False, plausible=(5e-4, 3e-2), neutral=0.0)
+    }
     has_memory: ClassVar[bool] = True
 
     delay: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         # Memory: past commands, the last one first.
-        commands = np.concatenate([np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory])
+        commands = np.concatenate(
+            [np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory]
+        )
         whole = np.floor(nonlinear / motion.time_step).astype(int)
         share = nonlinear / motion.time_step - whole
-        late = (1.0 - share) * np.take_along_axis(commands, whole, axis=0) + share * np.take_along_axis(commands, whole + 1, axis=0)
+        late = (1.0 - share) * np.take_along_axis(
+            commands, whole, axis=0
+        ) + share * np.take_along_axis(commands, whole + 1, axis=0)
         return (motion.command - late[0],), (0.0,)
 
     @staticmethod
@@ -80,7 +96,9 @@ class TorqueDelay(JointTorqueEffect):
 
     @staticmethod
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
-        return np.concatenate([np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory[:-1]])
+        return np.concatenate(
+            [np.broadcast_to(motion.command, motion.memory[:1].shape), motion.memory[:-1]]
+        )
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -98,7 +116,9 @@ class TorqueLag(JointTorqueEffect):
     Exact for a command that is held over the step; y is then its mean over the step. It starts at the command.
     """
 
-    description: ClassVar[str] = "The commanded torque builds up gradually, as in a slow current loop or an elastic gear."
+    description: ClassVar[str] = (
+        "The commanded torque builds up gradually, as in a slow current loop or an elastic gear."
+    )
     signature: ClassVar[str] = "After each change of the command a torque that fades away."
     experiment: ClassVar[str] = "Command torques that change fast."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -109,9 +129,13 @@ class TorqueLag(JointTorqueEffect):
     time_constant: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         change = motion.command - motion.memory[0]
-        return (change * (1.0 - _kept(motion, nonlinear)) * nonlinear[0] / motion.time_step,), (0.0,)
+        return (change * (1.0 - _kept(motion, nonlinear)) * nonlinear[0] / motion.time_step,), (
+            0.0,
+        )
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -119,7 +143,9 @@ class TorqueLag(JointTorqueEffect):
 
     @staticmethod
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        return (motion.command + (motion.memory[0] - motion.command) * _kept(motion, nonlinear))[None]
+        return (motion.command + (motion.memory[0] - motion.command) * _kept(motion, nonlinear))[
+            None
+        ]
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -138,7 +164,9 @@ class TorqueSaturation(JointTorqueEffect):
     """The motor gives no more than a limit: u = command - clip(command, -limit, limit)."""
 
     description: ClassVar[str] = "The motor gives no torque beyond a limit."
-    signature: ClassVar[str] = "Torque only where the command is large, and then all that is beyond."
+    signature: ClassVar[str] = (
+        "Torque only where the command is large, and then all that is beyond."
+    )
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
     parameters: ClassVar[dict[str, Parameter]] = {
         "limit": Parameter("Nm", linear=False, plausible=(2.0, 300.0), neutral=np.inf, grid=300),
@@ -147,7 +175,9 @@ class TorqueSaturation(JointTorqueEffect):
     limit: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (motion.command - np.clip(motion.command, -nonlinear[0], nonlinear[0]),), (0.0,)
 
 
@@ -156,19 +186,32 @@ class TorqueSaturation(JointTorqueEffect):
 class TorqueRollOff(JointTorqueEffect):
     """The motor gives ever less of what is commanded: u = command - command / (1 + |command| / half)."""
 
-    description: ClassVar[str] = "The harder a motor is driven, the less of the command it gives: iron saturates, the supply gives way."
+    description: ClassVar[str] = (
+        "The harder a motor is driven, the less of the command it gives: iron saturates, the supply gives way."
+    )
     signature: ClassVar[str] = "Torque that grows with the square of the command."
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
     parameters: ClassVar[dict[str, Parameter]] = {
         # The command of which half arrives.
-        "half": Parameter("Nm", linear=False, plausible=(0.5, 2000.0), bounds=(1e-9, np.inf), neutral=np.inf, grid=30),
+        "half": Parameter(
+            "Nm",
+            linear=False,
+            plausible=(0.5, 2000.0),
+            bounds=(1e-9, np.inf),
+            neutral=np.inf,
+            grid=30,
+        ),
     }
 
     half: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
-        return (motion.command - motion.command / (1.0 + np.abs(motion.command) / nonlinear[0]),), (0.0,)
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        return (motion.command - motion.command / (1.0 + np.abs(motion.command) / nonlinear[0]),), (
+            0.0,
+        )
 
 
 @in_library
@@ -181,13 +224,21 @@ class DcMotor(JointTorqueEffect):
     off: the motor is open, and nothing brakes it.
     """
 
-    description: ClassVar[str] = "A motor that is driven by a voltage has less torque the faster it turns."
-    signature: ClassVar[str] = "Torque rises linearly with the velocity, but not while the drive is switched off."
-    experiment: ClassVar[str] = "Move each joint at several constant speeds, and let it swing with the drive switched off."
+    description: ClassVar[str] = (
+        "A motor that is driven by a voltage has less torque the faster it turns."
+    )
+    signature: ClassVar[str] = (
+        "Torque rises linearly with the velocity, but not while the drive is switched off."
+    )
+    experiment: ClassVar[str] = (
+        "Move each joint at several constant speeds, and let it swing with the drive switched off."
+    )
     parameters: ClassVar[dict[str, Parameter]] = {
         # At the joint: of the motor's own constant, times the gear ratio.
         "kt": Parameter("Nm/A", linear=False, plausible=(1e-2, 20.0), neutral=0.0),
-        "resistance": Parameter("ohm", linear=False, plausible=(1e-2, 20.0), bounds=(1e-9, np.inf), neutral=np.inf),
+        "resistance": Parameter(
+            "ohm", linear=False, plausible=(1e-2, 20.0), bounds=(1e-9, np.inf), neutral=np.inf
+        ),
     }
     composite: ClassVar[bool] = True
 
@@ -195,7 +246,9 @@ class DcMotor(JointTorqueEffect):
     resistance: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         kt, resistance = nonlinear
         damping = kt * kt / resistance * (np.asarray(motion.command) != 0)
         return (damping * motion.velocity,), (damping,)

@@ -13,7 +13,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numba import njit
 from pydrake.geometry import ProximityProperties
-from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    CalcContactFrictionFromSurfaceProperties,
+    CoulombFriction,
+    MultibodyPlantConfig,
+)
 
 from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.errors import InputError
@@ -32,7 +36,9 @@ class ContactEffect(Effect):
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
 
     @abstractmethod
-    def contact(self, ground: Ground, plant: MultibodyPlantConfig, friction: float) -> tuple[Ground, MultibodyPlantConfig]:
+    def contact(
+        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+    ) -> tuple[Ground, MultibodyPlantConfig]:
         """The ground and the plant's settings with this effect.
 
         Args:
@@ -44,7 +50,9 @@ class ContactEffect(Effect):
 
     @staticmethod
     @abstractmethod
-    def sole_motion(pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sole_motion(
+        pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """How a sole that stands moves against one on level, rigid ground that holds it, per unit of each of the p parameters.
 
         Args:
@@ -94,7 +102,11 @@ def _friction(description: str, ground: Ground) -> float:
     """Friction coefficient between pads and ground as Drake combines it."""
     of_ground = CoulombFriction(ground.friction, ground.friction)
     properties = _pad_properties(description)
-    of_pad = properties.GetProperty("material", "coulomb_friction") if properties.HasProperty("material", "coulomb_friction") else of_ground
+    of_pad = (
+        properties.GetProperty("material", "coulomb_friction")
+        if properties.HasProperty("material", "coulomb_friction")
+        else of_ground
+    )
     return CalcContactFrictionFromSurfaceProperties(of_pad, of_ground).dynamic_friction()
 
 
@@ -111,22 +123,33 @@ class GroundSlope(ContactEffect):
     """
 
     description: ClassVar[str] = "The ground is not level."
-    signature: ClassVar[str] = "Standing soles that are tilted against gravity, both feet alike, wherever the robot steps."
-    experiment: ClassVar[str] = "Stand still; then turn the robot, to tell the slope from a tilted IMU."
+    signature: ClassVar[str] = (
+        "Standing soles that are tilted against gravity, both feet alike, wherever the robot steps."
+    )
+    experiment: ClassVar[str] = (
+        "Stand still; then turn the robot, to tell the slope from a tilted IMU."
+    )
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-1.0, 1.0)) for axis in "xy"
+        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-1.0, 1.0))
+        for axis in "xy"
     }
 
     x: float = 0.0
     y: float = 0.0
 
-    def contact(self, ground: Ground, plant: MultibodyPlantConfig, friction: float) -> tuple[Ground, MultibodyPlantConfig]:  # noqa: ARG002
+    def contact(
+        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+    ) -> tuple[Ground, MultibodyPlantConfig]:
         return replace(ground, slope=[ground.slope[0] + self.x, ground.slope[1] + self.y]), plant
 
     @staticmethod
-    def sole_motion(pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # noqa: ARG004
+    def sole_motion(
+        pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         still = _still(len(time))
-        return np.stack([still + [1.0, 0.0, 0.0], still + [0.0, 1.0, 0.0]]), np.stack([still, still])
+        return np.stack([still + [1.0, 0.0, 0.0], still + [0.0, 1.0, 0.0]]), np.stack(
+            [still, still]
+        )
 
 
 @in_library
@@ -141,17 +164,25 @@ class GroundCompliance(ContactEffect):
     description: ClassVar[str] = "Ground or soles give way under load."
     signature: ClassVar[str] = "Standing feet sink and tilt as load and centre of pressure move."
     experiment: ClassVar[str] = "Sway from foot to foot, and lean forward and back."
-    parameters: ClassVar[dict[str, Parameter]] = {"compliance": Parameter("m/N", linear=True, plausible=(5e-7, 5e-6))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "compliance": Parameter("m/N", linear=True, plausible=(5e-7, 5e-6))
+    }
 
     compliance: float = 0.0
 
-    def contact(self, ground: Ground, plant: MultibodyPlantConfig, friction: float) -> tuple[Ground, MultibodyPlantConfig]:  # noqa: ARG002
+    def contact(
+        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+    ) -> tuple[Ground, MultibodyPlantConfig]:
         # Drake puts the springs of both surfaces in series, so this adds to the compliance of the contact as a whole.
         share = 1.0 / (1.0 + self.compliance * ground.stiffness)
-        return replace(ground, stiffness=share * ground.stiffness, dissipation=share * ground.dissipation), plant
+        return replace(
+            ground, stiffness=share * ground.stiffness, dissipation=share * ground.dissipation
+        ), plant
 
     @staticmethod
-    def sole_motion(pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sole_motion(
+        pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         # Height of a pad: that of the origin plus the tilt's, h + a y - b x; the plane that fits the pads best.
         x, y, _ = pad_positions.T
         h, a, b = np.linalg.pinv(np.stack([np.ones_like(x), y, -x], axis=1)) @ -pad_force[:, :, 2].T
@@ -171,26 +202,38 @@ class FootCreep(ContactEffect):
     """
 
     description: ClassVar[str] = "Feet slip slowly while they stand."
-    signature: ClassVar[str] = "The distance between standing feet changes, the faster the more they push sideways."
+    signature: ClassVar[str] = (
+        "The distance between standing feet changes, the faster the more they push sideways."
+    )
     experiment: ClassVar[str] = "Stand and sway with the feet pushing apart; walk."
-    parameters: ClassVar[dict[str, Parameter]] = {"creep": Parameter("m/s", linear=True, plausible=(1e-3, 5e-2))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "creep": Parameter("m/s", linear=True, plausible=(1e-3, 5e-2))
+    }
 
     creep: float = 0.0
 
-    def contact(self, ground: Ground, plant: MultibodyPlantConfig, friction: float) -> tuple[Ground, MultibodyPlantConfig]:
+    def contact(
+        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+    ) -> tuple[Ground, MultibodyPlantConfig]:
         if plant.discrete_contact_approximation not in _CREEPING:
             found = plant.discrete_contact_approximation
-            raise InputError(f"plant.discrete_contact_approximation: FootCreep needs lagged or similar, found {found}")
+            raise InputError(
+                f"plant.discrete_contact_approximation: FootCreep needs lagged or similar, found {found}"
+            )
         changed = copy(plant)
         changed.stiction_tolerance += self.creep * friction
         return ground, changed
 
     @staticmethod
-    def sole_motion(pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sole_motion(
+        pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         # Velocity (v_x, v_y) of the origin and rate w about z so that the pads' forces -F_n (v + w x p) add up to what they are.
         x, y, _ = pad_positions.T
         ones, zeros = np.ones_like(x), np.zeros_like(x)
-        motion = np.stack([np.stack([ones, zeros, -y], axis=1), np.stack([zeros, ones, x], axis=1)], axis=1)
+        motion = np.stack(
+            [np.stack([ones, zeros, -y], axis=1), np.stack([zeros, ones, x], axis=1)], axis=1
+        )
         load = np.maximum(pad_force[:, :, 2], _LEAST_LOAD)
         resistance = np.einsum("np,pia,pib->nab", load, motion, motion)
         push = np.einsum("npi,pia->na", pad_force[:, :, :2], motion)
@@ -214,14 +257,24 @@ class PadContact:
 def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -> PadContact:
     """The contact between a robot's pads and the ground, as Drake combines the two and solves it with these settings."""
     slides = plant.discrete_contact_approximation in _CREEPING
-    creep = plant.stiction_tolerance / _friction(description, ground) if slides and ground.friction > 0 else 0.0
+    creep = (
+        plant.stiction_tolerance / _friction(description, ground)
+        if slides and ground.friction > 0
+        else 0.0
+    )
     properties = _pad_properties(description)
     of_pad = properties.GetPropertyOrDefault("material", "point_contact_stiffness", np.inf)
-    dissipation = properties.GetPropertyOrDefault("material", "hunt_crossley_dissipation", ground.dissipation)
+    dissipation = properties.GetPropertyOrDefault(
+        "material", "hunt_crossley_dissipation", ground.dissipation
+    )
     if np.isinf(of_pad):
         return PadContact(ground.stiffness, ground.dissipation, creep)
     total = of_pad + ground.stiffness
-    return PadContact(of_pad * ground.stiffness / total, (ground.stiffness * dissipation + of_pad * ground.dissipation) / total, creep)
+    return PadContact(
+        of_pad * ground.stiffness / total,
+        (ground.stiffness * dissipation + of_pad * ground.dissipation) / total,
+        creep,
+    )
 
 
 def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -> np.ndarray:
@@ -232,7 +285,9 @@ def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -
         period: between samples [s].
     """
     result = np.empty_like(normal_force)
-    _fill_spring_force(result, np.maximum(normal_force, 0.0), contact.stiffness * period / contact.dissipation)
+    _fill_spring_force(
+        result, np.maximum(normal_force, 0.0), contact.stiffness * period / contact.dissipation
+    )
     return result
 
 

@@ -64,7 +64,9 @@ class Parameter:
         """The same for a prismatic joint, with m and N in the place of rad and Nm; its bounds, which are of no size, stay."""
         unit, _ = _AT_PRISMATIC_JOINT.get(self.unit, (self.unit, 0))
         low, high = self.plausible
-        return replace(self, unit=unit, plausible=(self.lever_factor * low, self.lever_factor * high))
+        return replace(
+            self, unit=unit, plausible=(self.lever_factor * low, self.lever_factor * high)
+        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,11 @@ class Effect(ABC):
     @classmethod
     def parameters_at(cls, unit: str) -> dict[str, Parameter]:
         """Its parameters at a joint whose torque has this unit: Nm, or N for a prismatic joint."""
-        return cls.parameters if unit == "Nm" else {name: parameter.at_prismatic_joint for name, parameter in cls.parameters.items()}
+        return (
+            cls.parameters
+            if unit == "Nm"
+            else {name: parameter.at_prismatic_joint for name, parameter in cls.parameters.items()}
+        )
 
     @classmethod
     def largest_plausible(cls, unit: str = "Nm") -> float:
@@ -109,7 +115,11 @@ class Effect(ABC):
         defaults, arguments = cls(), {}
         for name, numbers in values.items():
             given = dict(zip(targets, (float(number) for number in numbers), strict=True))
-            arguments[name] = getattr(defaults, name) | given if cls.acts_on != "robot" else next(iter(given.values()))
+            arguments[name] = (
+                getattr(defaults, name) | given
+                if cls.acts_on != "robot"
+                else next(iter(given.values()))
+            )
         return cls(**arguments)
 
     def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedEffect":
@@ -122,13 +132,20 @@ class Effect(ABC):
         linear, nonlinear = [], []
         for name, parameter in self.parameters.items():
             where = f"{key}.{name}".lstrip(".")
-            values = self._values(name, targets, names, where, 0.0 if parameter.linear else parameter.neutral)
+            values = self._values(
+                name, targets, names, where, 0.0 if parameter.linear else parameter.neutral
+            )
             low, high = parameter.bounds
             if not np.all((low <= values) & (values <= high)):
-                raise InputError(f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}")
+                raise InputError(
+                    f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}"
+                )
             (linear if parameter.linear else nonlinear).append(values)
         columns = len(targets)
-        linear, nonlinear = (np.array(values, dtype=float).reshape(len(values), columns) for values in (linear, nonlinear))
+        linear, nonlinear = (
+            np.array(values, dtype=float).reshape(len(values), columns)
+            for values in (linear, nonlinear)
+        )
         return ResolvedEffect(type(self), targets, linear, nonlinear)
 
     def _targets(self, names: RobotDescription) -> list[str]:
@@ -141,7 +158,14 @@ class Effect(ABC):
         # Bodies: those that are named; whether the model has them, the plant says.
         return list(dict.fromkeys(body for name in self.parameters for body in getattr(self, name)))
 
-    def _values(self, name: str, targets: list[str], names: RobotDescription, key: str, default: float | None) -> np.ndarray:
+    def _values(
+        self,
+        name: str,
+        targets: list[str],
+        names: RobotDescription,
+        key: str,
+        default: float | None,
+    ) -> np.ndarray:
         values = getattr(self, name)
         if self.acts_on == "joint":
             return names.per_joint(values, key=key, default=default)
@@ -149,7 +173,9 @@ class Effect(ABC):
             return np.array([values], dtype=float)
         for target in values:
             if target not in targets and target != "all":
-                raise InputError(f"{key}.{target}: unknown {self.acts_on} (allowed: {', '.join(['all', *targets])})")
+                raise InputError(
+                    f"{key}.{target}: unknown {self.acts_on} (allowed: {', '.join(['all', *targets])})"
+                )
         result = [values.get(target, values.get("all", default)) for target in targets]
         if None in result:
             raise InputError(f"{key}: no value for {targets[result.index(None)]}")
@@ -182,10 +208,14 @@ def in_library(effect: T) -> T:
         if not hasattr(effect, name):
             raise InputError(f"effect {effect.__name__}: the class variable {name} is missing")
     if effect.__abstractmethods__:
-        raise InputError(f"effect {effect.__name__}: the method {min(effect.__abstractmethods__)} is missing")
+        raise InputError(
+            f"effect {effect.__name__}: the method {min(effect.__abstractmethods__)} is missing"
+        )
     names = [field.name for field in fields(effect)]
     if names != list(effect.parameters):
-        raise InputError(f"effect {effect.__name__}: expected a dataclass with the fields {list(effect.parameters)}, found {names}")
+        raise InputError(
+            f"effect {effect.__name__}: expected a dataclass with the fields {list(effect.parameters)}, found {names}"
+        )
     for name, parameter in effect.parameters.items():
         if not parameter.linear and not 0 < parameter.plausible[0] < parameter.plausible[1]:
             raise InputError(
@@ -193,8 +223,13 @@ def in_library(effect: T) -> T:
                 f"expected 0 < low < high, found {parameter.plausible}"
             )
     known = _LIBRARY.get(effect.__name__)
-    if known is not None and (known.__module__, known.__qualname__) != (effect.__module__, effect.__qualname__):
-        raise InputError(f"effect {effect.__name__}: the library has another effect of this name, in {known.__module__}")
+    if known is not None and (known.__module__, known.__qualname__) != (
+        effect.__module__,
+        effect.__qualname__,
+    ):
+        raise InputError(
+            f"effect {effect.__name__}: the library has another effect of this name, in {known.__module__}"
+        )
     _LIBRARY[effect.__name__] = effect
     return effect
 

@@ -31,7 +31,9 @@ class CoulombFriction(JointTorqueEffect):
     """Coulomb friction with the sign smoothed: u = coulomb tanh(w / transition)."""
 
     description: ClassVar[str] = "Friction of constant size against the motion."
-    signature: ClassVar[str] = "Torque jumps when the velocity changes sign and is constant otherwise."
+    signature: ClassVar[str] = (
+        "Torque jumps when the velocity changes sign and is constant otherwise."
+    )
     experiment: ClassVar[str] = "Move each joint to and fro."
     of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "transition": _TRANSITION}
@@ -40,7 +42,9 @@ class CoulombFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign,), (slope,)
 
@@ -54,7 +58,9 @@ class CoulombFriction(JointTorqueEffect):
 class ViscousFriction(JointTorqueEffect):
     """Viscous friction: u = viscous w."""
 
-    description: ClassVar[str] = "Friction in proportion to speed, as of grease and of the motor's own damping."
+    description: ClassVar[str] = (
+        "Friction in proportion to speed, as of grease and of the motor's own damping."
+    )
     signature: ClassVar[str] = "Torque rises linearly with the velocity, without a jump at rest."
     experiment: ClassVar[str] = "Move each joint at several constant speeds."
     of_velocity_alone: ClassVar[bool] = True
@@ -63,7 +69,9 @@ class ViscousFriction(JointTorqueEffect):
     viscous: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (motion.velocity,), (1.0,)
 
     @staticmethod
@@ -79,9 +87,15 @@ class StribeckFriction(JointTorqueEffect):
     u = gamma1 (tanh(gamma2 w) - tanh(gamma3 w)) + gamma4 tanh(gamma5 w) + gamma6 w
     """
 
-    description: ClassVar[str] = "Friction that is largest just after the joint starts to move, then falls, then grows with speed."
-    signature: ClassVar[str] = "Torque changes sign with the velocity and peaks at a few hundredths of a rad/s."
-    experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds, some below 0.05 rad/s."
+    description: ClassVar[str] = (
+        "Friction that is largest just after the joint starts to move, then falls, then grows with speed."
+    )
+    signature: ClassVar[str] = (
+        "Torque changes sign with the velocity and peaks at a few hundredths of a rad/s."
+    )
+    experiment: ClassVar[str] = (
+        "Move each joint to and fro at several constant speeds, some below 0.05 rad/s."
+    )
     of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "gamma1": Parameter("Nm", linear=True, plausible=(0.0, 20.0)),
@@ -101,7 +115,9 @@ class StribeckFriction(JointTorqueEffect):
     gamma6: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
         # Rows: gamma2, gamma3, gamma5.
         tanh = np.tanh(nonlinear * motion.velocity)
         slope = nonlinear * (1.0 - tanh * tanh)
@@ -118,11 +134,19 @@ class StribeckFriction(JointTorqueEffect):
 class CoulombViscousFriction(JointTorqueEffect):
     """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb tanh(w / transition) + viscous w."""
 
-    description: ClassVar[str] = "Friction of constant size against the motion, plus a part that grows with speed."
-    signature: ClassVar[str] = "Torque jumps when the velocity changes sign and rises linearly with it."
+    description: ClassVar[str] = (
+        "Friction of constant size against the motion, plus a part that grows with speed."
+    )
+    signature: ClassVar[str] = (
+        "Torque jumps when the velocity changes sign and rises linearly with it."
+    )
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
     of_velocity_alone: ClassVar[bool] = True
-    parameters: ClassVar[dict[str, Parameter]] = {"coulomb": _COULOMB, "viscous": _VISCOUS, "transition": _TRANSITION}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "coulomb": _COULOMB,
+        "viscous": _VISCOUS,
+        "transition": _TRANSITION,
+    }
     composite: ClassVar[bool] = True
 
     coulomb: dict[str, float] = field(default_factory=dict)
@@ -130,7 +154,9 @@ class CoulombViscousFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign, motion.velocity), (slope, 1.0)
 
@@ -152,7 +178,9 @@ class DirectionalFriction(JointTorqueEffect):
     experiment: ClassVar[str] = "Move each joint to and fro, with stops between."
     of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "asymmetry": Parameter("Nm", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
+        "asymmetry": Parameter(
+            "Nm", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)
+        ),
         "transition": _TRANSITION,
     }
 
@@ -160,7 +188,9 @@ class DirectionalFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (sign * sign,), (2.0 * sign * slope,)
 
@@ -177,18 +207,26 @@ class DirectionalViscousFriction(JointTorqueEffect):
     Beside viscous friction, whose coefficient is then viscous + asymmetry forwards and viscous - asymmetry backwards.
     """
 
-    description: ClassVar[str] = "Friction grows faster with speed in one direction of motion than in the other."
-    signature: ClassVar[str] = "Torque of the same sign in both directions that rises with the speed."
+    description: ClassVar[str] = (
+        "Friction grows faster with speed in one direction of motion than in the other."
+    )
+    signature: ClassVar[str] = (
+        "Torque of the same sign in both directions that rises with the speed."
+    )
     experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
     of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "asymmetry": Parameter("Nm s/rad", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)),
+        "asymmetry": Parameter(
+            "Nm s/rad", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf)
+        ),
     }
 
     asymmetry: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         return (np.abs(motion.velocity),), (np.sign(motion.velocity),)
 
 
@@ -202,7 +240,9 @@ class LoadDependentFriction(JointTorqueEffect):
     """
 
     description: ClassVar[str] = "Friction that grows with the torque through the gear."
-    signature: ClassVar[str] = "Torque against the motion that is large in stance and small in swing."
+    signature: ClassVar[str] = (
+        "Torque against the motion that is large in stance and small in swing."
+    )
     experiment: ClassVar[str] = "Move each joint to and fro with and without load."
     parameters: ClassVar[dict[str, Parameter]] = {
         "coefficient": Parameter("1", linear=True, plausible=(0.0, 0.5), bounds=(0.0, 1.0)),
@@ -213,7 +253,9 @@ class LoadDependentFriction(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         load = np.abs(motion.load)
         sign, slope = smooth_sign(motion.velocity, nonlinear[0])
         return (load * sign,), (load * slope,)
@@ -232,12 +274,16 @@ class QuadraticDrag(JointTorqueEffect):
     signature: ClassVar[str] = "Torque against the motion that only shows at high speed."
     experiment: ClassVar[str] = "Move each joint slowly and as fast as it can."
     of_velocity_alone: ClassVar[bool] = True
-    parameters: ClassVar[dict[str, Parameter]] = {"drag": Parameter("Nm s^2/rad^2", linear=True, plausible=(0.0, 10.0))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "drag": Parameter("Nm s^2/rad^2", linear=True, plausible=(0.0, 10.0))
+    }
 
     drag: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         speed = np.abs(motion.velocity)
         return (motion.velocity * speed,), (2.0 * speed,)
 
@@ -252,12 +298,18 @@ class ThermalDrift(JointTorqueEffect):
     """Coulomb friction that changes while the joint warms up: u = change (1 - exp(-t / warm_up)) tanh(w / transition)."""
 
     description: ClassVar[str] = "Friction that changes over minutes as the joint warms up."
-    signature: ClassVar[str] = "Torque against (or with) the motion that is not there at first and settles slowly."
-    experiment: ClassVar[str] = "Repeat one motion from a cold start for longer than the warm-up takes."
+    signature: ClassVar[str] = (
+        "Torque against (or with) the motion that is not there at first and settles slowly."
+    )
+    experiment: ClassVar[str] = (
+        "Repeat one motion from a cold start for longer than the warm-up takes."
+    )
     parameters: ClassVar[dict[str, Parameter]] = {
         "change": Parameter("Nm", linear=True, plausible=(-20.0, 20.0), bounds=(-np.inf, np.inf)),
         # Much faster, and it would be Coulomb friction by another name.
-        "warm_up": Parameter("s", linear=False, plausible=(3.0, 1000.0), bounds=(1e-9, np.inf), grid=5),
+        "warm_up": Parameter(
+            "s", linear=False, plausible=(3.0, 1000.0), bounds=(1e-9, np.inf), grid=5
+        ),
         "transition": _TRANSITION,
     }
 
@@ -266,7 +318,9 @@ class ThermalDrift(JointTorqueEffect):
     transition: dict[str, float] = field(default_factory=_sharp)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         warm_up, transition = nonlinear
         warmth = -np.expm1(-motion.time / warm_up)
         sign, slope = smooth_sign(motion.velocity, transition)

@@ -43,7 +43,9 @@ class InertiaEffect(Effect):
         raise NotImplementedError
 
 
-def inertia_changes(effects: Mapping[str, Effect], robot: Robot) -> tuple[np.ndarray, list[PointMass]]:
+def inertia_changes(
+    effects: Mapping[str, Effect], robot: Robot
+) -> tuple[np.ndarray, list[PointMass]]:
     """What the inertia effects among some effects add to a robot: rotor inertia of each joint, shape (n,) [kg m^2], and point masses.
 
     Args:
@@ -74,9 +76,13 @@ class ReflectedInertia(InertiaEffect):
     `rotor_inertia`."""
 
     description: ClassVar[str] = "Inertia of motor and gears, as felt at the joint."
-    signature: ClassVar[str] = "Torque in step with the joint's own acceleration, also where the link barely loads the joint."
+    signature: ClassVar[str] = (
+        "Torque in step with the joint's own acceleration, also where the link barely loads the joint."
+    )
     experiment: ClassVar[str] = "Swing each joint fast, with the robot hanging and its feet free."
-    parameters: ClassVar[dict[str, Parameter]] = {"inertia": Parameter("kg m^2", linear=True, plausible=(0.02, 0.6))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "inertia": Parameter("kg m^2", linear=True, plausible=(0.02, 0.6))
+    }
 
     inertia: dict[str, float] = field(default_factory=dict)
 
@@ -91,10 +97,14 @@ class BodyMass(InertiaEffect):
     """Mass at the centre of mass of a body; negative where the model has too much. A payload elsewhere is this with `BodyCentreOfMass`."""
 
     description: ClassVar[str] = "A body is heavier or lighter than the model says."
-    signature: ClassVar[str] = "Too much or too little force under the feet, and torque in the joints that carry the body, with its weight."
+    signature: ClassVar[str] = (
+        "Too much or too little force under the feet, and torque in the joints that carry the body, with its weight."
+    )
     experiment: ClassVar[str] = "Squat and sway; for a leg's body also lift that leg."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
-    parameters: ClassVar[dict[str, Parameter]] = {"mass": Parameter("kg", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "mass": Parameter("kg", linear=True, plausible=(-10.0, 10.0), bounds=(-np.inf, np.inf))
+    }
 
     mass: dict[str, float] = field(default_factory=dict)
 
@@ -113,11 +123,16 @@ class BodyCentreOfMass(InertiaEffect):
     """
 
     description: ClassVar[str] = "The centre of mass of a body is elsewhere than the model says."
-    signature: ClassVar[str] = "Moments and joint torques with the body's weight and tilt, but the right force under the feet."
-    experiment: ClassVar[str] = "Squat and sway slowly; for its height, tilt or accelerate the body."
+    signature: ClassVar[str] = (
+        "Moments and joint torques with the body's weight and tilt, but the right force under the feet."
+    )
+    experiment: ClassVar[str] = (
+        "Squat and sway slowly; for its height, tilt or accelerate the body."
+    )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("m", linear=True, plausible=(-0.05, 0.05), bounds=(-np.inf, np.inf)) for axis in "xyz"
+        axis: Parameter("m", linear=True, plausible=(-0.05, 0.05), bounds=(-np.inf, np.inf))
+        for axis in "xyz"
     }
 
     x: dict[str, float] = field(default_factory=dict)
@@ -147,13 +162,20 @@ class InertialParameters(InertiaEffect):
     A log shows them only in combinations; see `fbse_drake.discrepancy.inertial`, which finds values that some distribution of mass has.
     """
 
-    description: ClassVar[str] = "Mass, centre of mass and rotational inertia of a body are not what the model says."
-    signature: ClassVar[str] = "Torque with posture, velocity and acceleration, in all joints that carry the body."
-    experiment: ClassVar[str] = "Move all joints that carry the body at once, through many postures and fast."
+    description: ClassVar[str] = (
+        "Mass, centre of mass and rotational inertia of a body are not what the model says."
+    )
+    signature: ClassVar[str] = (
+        "Torque with posture, velocity and acceleration, in all joints that carry the body."
+    )
+    experiment: ClassVar[str] = (
+        "Move all joints that carry the body at once, through many postures and fast."
+    )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
     composite: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        name: Parameter(unit, linear=True, plausible=(-size, size), bounds=(-np.inf, np.inf)) for name, (unit, size) in _INERTIAL.items()
+        name: Parameter(unit, linear=True, plausible=(-size, size), bounds=(-np.inf, np.inf))
+        for name, (unit, size) in _INERTIAL.items()
     }
 
     mass: dict[str, float] = field(default_factory=dict)
@@ -172,7 +194,10 @@ class InertialParameters(InertiaEffect):
         values = {}
         for name in self.parameters:
             ours, theirs = getattr(self, name), getattr(further, name)
-            values[name] = {body: ours.get(body, 0.0) + theirs.get(body, 0.0) for body in dict.fromkeys([*ours, *theirs])}
+            values[name] = {
+                body: ours.get(body, 0.0) + theirs.get(body, 0.0)
+                for body in dict.fromkeys([*ours, *theirs])
+            }
         return InertialParameters(**values)
 
     @staticmethod
@@ -189,7 +214,9 @@ class InertialParameters(InertiaEffect):
 def inertial_parameters(inertia: SpatialInertia) -> np.ndarray:
     """The ten parameters of a spatial inertia in the order of `InertialParameters`, shape (10,)."""
     mass, I_BBo = inertia.get_mass(), inertia.CalcRotationalInertia()
-    return np.array([mass, *(mass * inertia.get_com()), *I_BBo.get_moments(), *I_BBo.get_products()])
+    return np.array(
+        [mass, *(mass * inertia.get_com()), *I_BBo.get_moments(), *I_BBo.get_products()]
+    )
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
@@ -199,7 +226,12 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     """
     m, mx, my, mz, xx, yy, zz, xy, xz, yz = np.moveaxis(np.asarray(parameters), -1, 0)
     half = 0.5 * (xx + yy + zz)
-    rows = [[half - xx, -xy, -xz, mx], [-xy, half - yy, -yz, my], [-xz, -yz, half - zz, mz], [mx, my, mz, m]]
+    rows = [
+        [half - xx, -xy, -xz, mx],
+        [-xy, half - yy, -yz, my],
+        [-xz, -yz, half - zz, mz],
+        [mx, my, mz, m],
+    ]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
@@ -210,9 +242,15 @@ def equal_point_masses(J: np.ndarray, name: str) -> list[tuple[float, np.ndarray
         InputError: no distribution of mass has it; `name` is the body's.
     """
     mass = J[3, 3]
-    spread, axes = np.linalg.eigh(J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / mass) if mass > 0 else (np.array([-1.0]), None)
+    spread, axes = (
+        np.linalg.eigh(J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / mass)
+        if mass > 0
+        else (np.array([-1.0]), None)
+    )
     if spread.min() < -_ROUNDING * np.trace(J):
-        raise InputError(f"{name}: expected the inertia of a body, found one that no distribution of mass has")
+        raise InputError(
+            f"{name}: expected the inertia of a body, found one that no distribution of mass has"
+        )
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     places = J[:3, 3] / mass + corners * np.sqrt(np.maximum(spread, 0.0) / mass) @ axes.T
     return [(mass / 4, place) for place in places]

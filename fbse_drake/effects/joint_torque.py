@@ -69,7 +69,9 @@ class JointTorqueEffect(Effect):
 
     @staticmethod
     @abstractmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray | float], Sequence[np.ndarray | float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray | float], Sequence[np.ndarray | float]]:
         """Torque per unit of each linear parameter, and its derivative with respect to the joint velocity.
 
         Args:
@@ -150,7 +152,9 @@ class ResolvedJointTorque(ResolvedEffect):
         return torque, slope
 
 
-def basis_over_time(effect: type[JointTorqueEffect], motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+def basis_over_time(
+    effect: type[JointTorqueEffect], motion: JointMotion, nonlinear: np.ndarray
+) -> np.ndarray:
     """Basis torques of an effect over N steps that follow each other, memory included.
 
     Args:
@@ -203,12 +207,19 @@ def affine_recursion(start: np.ndarray | float, keep: np.ndarray, add: np.ndarra
     first = np.broadcast_to(start, (*add.shape[:-2], add.shape[-1]))
     result = np.empty(add.shape)
     rows = (-1, *add.shape[-2:])
-    _fill_recursion(result.reshape(rows), np.ascontiguousarray(first).reshape(-1, add.shape[-1]), keep.reshape(rows), add.reshape(rows))
+    _fill_recursion(
+        result.reshape(rows),
+        np.ascontiguousarray(first).reshape(-1, add.shape[-1]),
+        keep.reshape(rows),
+        add.reshape(rows),
+    )
     return result
 
 
 @njit(cache=True)
-def _fill_recursion(result: np.ndarray, start: np.ndarray, keep: np.ndarray, add: np.ndarray) -> None:
+def _fill_recursion(
+    result: np.ndarray, start: np.ndarray, keep: np.ndarray, add: np.ndarray
+) -> None:
     for row in range(result.shape[0]):
         result[row, 0] = start[row]
         for k in range(result.shape[1] - 1):

@@ -51,7 +51,9 @@ class SensorEffect(Effect):
 
     @staticmethod
     @abstractmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         """What the sensors read if this is what they ought to read.
 
         Args:
@@ -60,7 +62,13 @@ class SensorEffect(Effect):
         """
 
     @staticmethod
-    def remembered(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+    def remembered(
+        signals: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,
+        period: float,
+    ) -> np.ndarray:
         """The memory at the next tick, shape (memory_size, targets).
 
         Args:
@@ -71,7 +79,9 @@ class SensorEffect(Effect):
         raise NotImplementedError
 
     @classmethod
-    def memory_over_time(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+    def memory_over_time(
+        cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float
+    ) -> np.ndarray:
         """What is remembered at each tick of a log, shape (memory_size, ticks, targets).
 
         Args:
@@ -88,7 +98,14 @@ class SensorEffect(Effect):
         return memory
 
     @classmethod
-    def undone(cls, measured: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:  # noqa: ARG003
+    def undone(
+        cls,
+        measured: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,
+        period: float,
+    ) -> SensorSignals:
         """What the sensors ought to read over a whole log if this is what they read.
 
         By taking off, again and again, what the effect adds: it is small, and each time leaves a share of its own size.
@@ -101,14 +118,21 @@ class SensorEffect(Effect):
         for _ in range(_UNDOING):
             read = cls.reading(signals, memory, values, robot)
             signals = SensorSignals(
-                **{name: signal + getattr(measured, name) - getattr(read, name) for name, signal in vars(signals).items()}
+                **{
+                    name: signal + getattr(measured, name) - getattr(read, name)
+                    for name, signal in vars(signals).items()
+                }
             )
         return signals
 
     @classmethod
-    def distorted(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:
+    def distorted(
+        cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float
+    ) -> SensorSignals:
         """What the sensors read over a whole log; see `memory_over_time` and `reading`."""
-        return cls.reading(signals, cls.memory_over_time(signals, values, robot, period), values, robot)
+        return cls.reading(
+            signals, cls.memory_over_time(signals, values, robot, period), values, robot
+        )
 
 
 def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
@@ -123,7 +147,9 @@ def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
 
 def _with_wrenches(signals: SensorSignals, added: np.ndarray, robot: Robot) -> SensorSignals:
     """Signals with wrenches (..., feet, 6) added to those on the feet, by the smallest forces that have them."""
-    forces = [added[..., foot, :] @ np.linalg.pinv(grasp).T for foot, grasp in enumerate(robot.grasp_maps)]
+    forces = [
+        added[..., foot, :] @ np.linalg.pinv(grasp).T for foot, grasp in enumerate(robot.grasp_maps)
+    ]
     more = np.concatenate([force.reshape(*force.shape[:-1], -1, 3) for force in forces], axis=-2)
     return replace(signals, pad_force=signals.pad_force + more)
 
@@ -138,16 +164,24 @@ def _pads_of(values: np.ndarray, robot: Robot) -> np.ndarray:
 class FootForceGain(SensorEffect):
     """The force sensors of a foot read (1 + gain) times the force."""
 
-    description: ClassVar[str] = "The force sensors of a foot read a share more or less than the force."
-    signature: ClassVar[str] = "The feet seem to carry more or less than the weight, in proportion to the load on the one foot."
+    description: ClassVar[str] = (
+        "The force sensors of a foot read a share more or less than the force."
+    )
+    signature: ClassVar[str] = (
+        "The feet seem to carry more or less than the weight, in proportion to the load on the one foot."
+    )
     experiment: ClassVar[str] = "Shift the weight slowly from foot to foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
-    parameters: ClassVar[dict[str, Parameter]] = {"gain": Parameter("1", linear=True, plausible=(-0.2, 0.2), bounds=(-1.0, np.inf))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "gain": Parameter("1", linear=True, plausible=(-0.2, 0.2), bounds=(-1.0, np.inf))
+    }
 
     gain: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         gain = _pads_of(values.linear[0], robot)
         return replace(signals, pad_force=(1.0 + gain[:, None]) * signals.pad_force)
 
@@ -161,19 +195,29 @@ class FootForceBias(SensorEffect):
     signature: ClassVar[str] = "Force on the foot while it is in the air."
     experiment: ClassVar[str] = "Lift each foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
-    parameters: ClassVar[dict[str, Parameter]] = {axis: Parameter("N", linear=True, plausible=(-20.0, 20.0), bounds=_ANY) for axis in "xyz"}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        axis: Parameter("N", linear=True, plausible=(-20.0, 20.0), bounds=_ANY) for axis in "xyz"
+    }
 
     x: dict[str, float] = field(default_factory=dict)
     y: dict[str, float] = field(default_factory=dict)
     z: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         has_pads = np.array([bool(leg.pads) for leg in robot.description.legs.values()])
-        signals = replace(signals, pad_force=signals.pad_force + _pads_of(has_pads * values.linear, robot).T)
+        signals = replace(
+            signals, pad_force=signals.pad_force + _pads_of(has_pads * values.linear, robot).T
+        )
         if has_pads.all():
             return signals
-        return _with_wrenches(signals, np.concatenate([np.zeros_like(values.linear), ~has_pads * values.linear]).T, robot)
+        return _with_wrenches(
+            signals,
+            np.concatenate([np.zeros_like(values.linear), ~has_pads * values.linear]).T,
+            robot,
+        )
 
 
 @in_library
@@ -185,15 +229,21 @@ class FootMomentBias(SensorEffect):
     signature: ClassVar[str] = "Moment on the foot while it is in the air."
     experiment: ClassVar[str] = "Lift each foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
-    parameters: ClassVar[dict[str, Parameter]] = {axis: Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=_ANY) for axis in "xyz"}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        axis: Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=_ANY) for axis in "xyz"
+    }
 
     x: dict[str, float] = field(default_factory=dict)
     y: dict[str, float] = field(default_factory=dict)
     z: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
-        return _with_wrenches(signals, np.concatenate([values.linear, np.zeros_like(values.linear)]).T, robot)
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
+        return _with_wrenches(
+            signals, np.concatenate([values.linear, np.zeros_like(values.linear)]).T, robot
+        )
 
 
 @in_library
@@ -204,11 +254,14 @@ class FootForceMisalignment(SensorEffect):
     """
 
     description: ClassVar[str] = "The force sensors of a foot are mounted askew."
-    signature: ClassVar[str] = "Horizontal force under a foot in proportion to its load, that no motion needs."
+    signature: ClassVar[str] = (
+        "Horizontal force under a foot in proportion to its load, that no motion needs."
+    )
     experiment: ClassVar[str] = "Stand still on level ground, on one foot and then on the other."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi)) for axis in "xyz"
+        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi))
+        for axis in "xyz"
     }
 
     x: dict[str, float] = field(default_factory=dict)
@@ -216,11 +269,15 @@ class FootForceMisalignment(SensorEffect):
     z: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         wrenches = _wrenches(signals.pad_force, robot)
         # S: the axes that the sensors really have.
         R_FS = Rotation.from_rotvec(values.linear.T).as_matrix()
-        turned = np.einsum("...fki,fij->...fkj", wrenches.reshape(*wrenches.shape[:-1], 2, 3), R_FS).reshape(wrenches.shape)
+        turned = np.einsum(
+            "...fki,fij->...fkj", wrenches.reshape(*wrenches.shape[:-1], 2, 3), R_FS
+        ).reshape(wrenches.shape)
         return _with_wrenches(signals, turned - wrenches, robot)
 
 
@@ -233,39 +290,72 @@ class FootForceLag(SensorEffect):
     time_constant times its rate.
     """
 
-    description: ClassVar[str] = "The force sensors of a foot are read through a low-pass, and so come late."
-    signature: ClassVar[str] = "Force under the foot that lags behind what the motion needs, and is smoother, at touch-down most of all."
+    description: ClassVar[str] = (
+        "The force sensors of a foot are read through a low-pass, and so come late."
+    )
+    signature: ClassVar[str] = (
+        "Force under the foot that lags behind what the motion needs, and is smoother, at touch-down most of all."
+    )
     experiment: ClassVar[str] = "Shift the weight to and fro fast; step on the spot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
-    parameters: ClassVar[dict[str, Parameter]] = {"time_constant": Parameter("s", linear=True, plausible=(0.0, 0.1))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "time_constant": Parameter("s", linear=True, plausible=(0.0, 0.1))
+    }
     # The wrench that was read last, and the share of it that stays.
     memory_size: ClassVar[int] = 7
 
     time_constant: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         read_last, stays = np.moveaxis(memory[:6], 0, -1), memory[6][..., None]
-        return _with_wrenches(signals, stays * (read_last - _wrenches(signals.pad_force, robot)), robot)
+        return _with_wrenches(
+            signals, stays * (read_last - _wrenches(signals.pad_force, robot)), robot
+        )
 
     @classmethod
-    def remembered(cls, signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+    def remembered(
+        cls,
+        signals: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,
+        period: float,
+    ) -> np.ndarray:
         read = _wrenches(cls.reading(signals, memory, values, robot).pad_force, robot)
         return np.concatenate([read.T, [_what_stays(values.linear[0], period)]])
 
     @classmethod
-    def memory_over_time(cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float) -> np.ndarray:
+    def memory_over_time(
+        cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float
+    ) -> np.ndarray:
         true, stays = _wrenches(signals.pad_force, robot), _what_stays(values.linear[0], period)
         memory = np.zeros((cls.memory_size, *true.shape[:2]))
         for foot, share in enumerate(stays):
-            read = lfilter([1.0 - share], [1.0, -share], true[:, foot], axis=0, zi=share * true[:1, foot])[0]
+            read = lfilter(
+                [1.0 - share], [1.0, -share], true[:, foot], axis=0, zi=share * true[:1, foot]
+            )[0]
             memory[:6, 1:, foot], memory[6, 1:, foot] = read[:-1].T, share
         return memory
 
     @classmethod
-    def undone(cls, measured: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot, period: float) -> SensorSignals:  # noqa: ARG003
-        read, stays = _wrenches(measured.pad_force, robot), _what_stays(values.linear[0], period)[:, None]
-        return _with_wrenches(measured, stays / (1.0 - stays) * np.diff(read, axis=0, prepend=read[:1]), robot)
+    def undone(
+        cls,
+        measured: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,
+        period: float,
+    ) -> SensorSignals:
+        read, stays = (
+            _wrenches(measured.pad_force, robot),
+            _what_stays(values.linear[0], period)[:, None],
+        )
+        return _with_wrenches(
+            measured, stays / (1.0 - stays) * np.diff(read, axis=0, prepend=read[:1]), robot
+        )
 
 
 def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
@@ -278,16 +368,24 @@ def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
 class AccelerometerGain(SensorEffect):
     """The accelerometer reads (1 + gain) times the specific force."""
 
-    description: ClassVar[str] = "The accelerometer reads a share more or less than the specific force."
-    signature: ClassVar[str] = "A resting robot whose specific force is not gravity, in whatever way it is tilted."
+    description: ClassVar[str] = (
+        "The accelerometer reads a share more or less than the specific force."
+    )
+    signature: ClassVar[str] = (
+        "A resting robot whose specific force is not gravity, in whatever way it is tilted."
+    )
     experiment: ClassVar[str] = "Stand still, then with the trunk tilted."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
-    parameters: ClassVar[dict[str, Parameter]] = {"gain": Parameter("1", linear=True, plausible=(-0.05, 0.05), bounds=(-1.0, np.inf))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "gain": Parameter("1", linear=True, plausible=(-0.05, 0.05), bounds=(-1.0, np.inf))
+    }
 
     gain: float = 0.0
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         return replace(signals, specific_force=(1.0 + values.linear[0, 0]) * signals.specific_force)
 
 
@@ -297,7 +395,9 @@ class AccelerometerBias(SensorEffect):
     """The accelerometer reads this specific force too much, in the IMU frame."""
 
     description: ClassVar[str] = "The accelerometer reads a constant too much."
-    signature: ClassVar[str] = "A specific force at rest that is not gravity; a trunk that seems tilted."
+    signature: ClassVar[str] = (
+        "A specific force at rest that is not gravity; a trunk that seems tilted."
+    )
     experiment: ClassVar[str] = "Stand still on level ground, then with the trunk turned or tilted."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -309,7 +409,9 @@ class AccelerometerBias(SensorEffect):
     z: float = 0.0
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         return replace(signals, specific_force=signals.specific_force + values.linear[:, 0])
 
 
@@ -323,7 +425,8 @@ class GyroscopeBias(SensorEffect):
     experiment: ClassVar[str] = "Stand still."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad/s", linear=True, plausible=(-0.05, 0.05), bounds=_ANY) for axis in "xyz"
+        axis: Parameter("rad/s", linear=True, plausible=(-0.05, 0.05), bounds=_ANY)
+        for axis in "xyz"
     }
 
     x: float = 0.0
@@ -331,7 +434,9 @@ class GyroscopeBias(SensorEffect):
     z: float = 0.0
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         return replace(signals, angular_velocity=signals.angular_velocity + values.linear[:, 0])
 
 
@@ -344,11 +449,16 @@ class ImuMisalignment(SensorEffect):
     """
 
     description: ClassVar[str] = "The IMU is mounted askew."
-    signature: ClassVar[str] = "A trunk that seems tilted at rest, and turns about axes that seem turned."
-    experiment: ClassVar[str] = "Stand still on level ground; sway and turn for the angle about the vertical."
+    signature: ClassVar[str] = (
+        "A trunk that seems tilted at rest, and turns about axes that seem turned."
+    )
+    experiment: ClassVar[str] = (
+        "Stand still on level ground; sway and turn for the angle about the vertical."
+    )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.05, 0.05), bounds=(-np.pi, np.pi)) for axis in "xyz"
+        axis: Parameter("rad", linear=True, plausible=(-0.05, 0.05), bounds=(-np.pi, np.pi))
+        for axis in "xyz"
     }
 
     x: float = 0.0
@@ -356,10 +466,16 @@ class ImuMisalignment(SensorEffect):
     z: float = 0.0
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         # S: the axes that the sensors really have.
         R_IS = Rotation.from_rotvec(values.linear[:, 0]).as_matrix()
-        return replace(signals, specific_force=signals.specific_force @ R_IS, angular_velocity=signals.angular_velocity @ R_IS)
+        return replace(
+            signals,
+            specific_force=signals.specific_force @ R_IS,
+            angular_velocity=signals.angular_velocity @ R_IS,
+        )
 
 
 @in_library
@@ -368,14 +484,20 @@ class EncoderOffset(SensorEffect):
     """The encoder of a joint reads this angle too much."""
 
     description: ClassVar[str] = "The zero of a joint's encoder is off."
-    signature: ClassVar[str] = "Gravity torques of another posture, and feet that do not fit the ground: tilted while they stand flat."
+    signature: ClassVar[str] = (
+        "Gravity torques of another posture, and feet that do not fit the ground: tilted while they stand flat."
+    )
     experiment: ClassVar[str] = "Stand in several postures; squat and sway."
-    parameters: ClassVar[dict[str, Parameter]] = {"offset": Parameter("rad", linear=True, plausible=(-0.01, 0.01), bounds=_ANY)}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "offset": Parameter("rad", linear=True, plausible=(-0.01, 0.01), bounds=_ANY)
+    }
 
     offset: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         return replace(signals, joint_position=signals.joint_position + values.linear[0])
 
 
@@ -390,12 +512,20 @@ class TransmissionElasticity(SensorEffect):
     kd * compliance < time_constant.
     """
 
-    description: ClassVar[str] = "The transmission twists under torque, and the encoder sits on the motor's side of it."
-    signature: ClassVar[str] = "Joint angles off in proportion to the torque command; a foot that stands seems to give way under load."
-    experiment: ClassVar[str] = "Stand on one leg and shift the weight, or squat: large torques with little motion."
+    description: ClassVar[str] = (
+        "The transmission twists under torque, and the encoder sits on the motor's side of it."
+    )
+    signature: ClassVar[str] = (
+        "Joint angles off in proportion to the torque command; a foot that stands seems to give way under load."
+    )
+    experiment: ClassVar[str] = (
+        "Stand on one leg and shift the weight, or squat: large torques with little motion."
+    )
     parameters: ClassVar[dict[str, Parameter]] = {
         "compliance": Parameter("rad/Nm", linear=True, plausible=(1e-5, 1e-4)),
-        "time_constant": Parameter("s", linear=False, plausible=(4e-3, 2e-2), bounds=(1e-6, np.inf)),
+        "time_constant": Parameter(
+            "s", linear=False, plausible=(4e-3, 2e-2), bounds=(1e-6, np.inf)
+        ),
     }
     memory_size: ClassVar[int] = 2
 
@@ -403,13 +533,16 @@ class TransmissionElasticity(SensorEffect):
     time_constant: dict[str, float] = field(default_factory=lambda: {"all": 5e-3})
 
     @staticmethod
-    def reading(signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot) -> SensorSignals:  # noqa: ARG004
+    def reading(
+        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+    ) -> SensorSignals:
         (compliance,), (time_constant,) = values.linear, values.nonlinear
         followed, command = memory
         return replace(
             signals,
             joint_position=signals.joint_position + compliance * followed,
-            joint_velocity=signals.joint_velocity + compliance * (command - followed) / time_constant,
+            joint_velocity=signals.joint_velocity
+            + compliance * (command - followed) / time_constant,
         )
 
     @staticmethod
@@ -422,7 +555,9 @@ class TransmissionElasticity(SensorEffect):
     ) -> np.ndarray:
         """Torque that the spring has followed so far, and the command of the tick's step, (2, n) [Nm]."""
         command = signals.torque_command
-        return np.stack([command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command])
+        return np.stack(
+            [command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command]
+        )
 
 
 class SensorEffects(LeafSystem):
@@ -453,13 +588,21 @@ class SensorEffects(LeafSystem):
             period: of the control [s].
         """
         super().__init__()
-        n, pads = len(robot.joint_names), len(_pads_of(np.zeros(len(robot.description.sides)), robot))
+        n, pads = (
+            len(robot.joint_names),
+            len(_pads_of(np.zeros(len(robot.description.sides)), robot)),
+        )
         self._effects, self._robot, self._period = list(effects), robot, period
         sizes = {"joint_state": 2 * n, "imu": 6, "pad_force": 3 * pads}
         self._readings = [self.DeclareVectorInputPort(name, size) for name, size in sizes.items()]
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self._memories = [self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets)) for effect in effects]
-        sources = {self.input_port_ticket(port.get_index()) for port in self._readings} | {self.xd_ticket()}
+        self._memories = [
+            self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets))
+            for effect in effects
+        ]
+        sources = {self.input_port_ticket(port.get_index()) for port in self._readings} | {
+            self.xd_ticket()
+        }
         self.DeclareVectorOutputPort("measured", sum(sizes.values()), self._calc, sources)
         if any(effect.effect.memory_size for effect in effects):
             self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._remember)
@@ -467,7 +610,9 @@ class SensorEffects(LeafSystem):
     def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
         joint_state, imu, pad_force = (port.Eval(context) for port in self._readings)
         position, velocity = np.split(joint_state, 2)
-        return SensorSignals(position, velocity, imu[:3], imu[3:], pad_force.reshape(-1, 3), torque_command)
+        return SensorSignals(
+            position, velocity, imu[:3], imu[3:], pad_force.reshape(-1, 3), torque_command
+        )
 
     def _memory(self, context: Context, place: int) -> np.ndarray:
         values = context.get_discrete_state(self._memories[place]).value()
@@ -476,8 +621,16 @@ class SensorEffects(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         signals = self._signals(context, np.full(self._torque_command.size(), np.nan))
         for place, effect in enumerate(self._effects):
-            signals = effect.effect.reading(signals, self._memory(context, place), effect, self._robot)
-        read = (signals.joint_position, signals.joint_velocity, signals.specific_force, signals.angular_velocity, signals.pad_force.ravel())
+            signals = effect.effect.reading(
+                signals, self._memory(context, place), effect, self._robot
+            )
+        read = (
+            signals.joint_position,
+            signals.joint_velocity,
+            signals.specific_force,
+            signals.angular_velocity,
+            signals.pad_force.ravel(),
+        )
         output.SetFromVector(np.concatenate(read))
 
     def _remember(self, context: Context, state: State) -> None:

@@ -16,7 +16,9 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
 class TorqueRipple(JointTorqueEffect):
     """Torque that repeats with the joint's angle: u = sine sin(cycles q) + cosine cos(cycles q)."""
 
-    description: ClassVar[str] = "Torque that repeats with the angle of the joint, from gear teeth or motor poles."
+    description: ClassVar[str] = (
+        "Torque that repeats with the angle of the joint, from gear teeth or motor poles."
+    )
     signature: ClassVar[str] = "A wave over the joint angle, the same in both directions of motion."
     experiment: ClassVar[str] = "Move each joint slowly through a large angle."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -31,7 +33,9 @@ class TorqueRipple(JointTorqueEffect):
     cycles: dict[str, float] = field(default_factory=lambda: {"all": 50.0})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         angle = nonlinear[0] * motion.position
         return (np.sin(angle), np.cos(angle)), (0.0, 0.0)
 
@@ -59,7 +63,9 @@ class JointSpring(JointTorqueEffect):
     preload: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:  # noqa: ARG004
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:
         return (motion.position, 1.0), (0.0, 0.0)
 
 
@@ -73,12 +79,20 @@ class PreslidingHysteresis(JointTorqueEffect):
     z, in [-1, 1], starts at 0 and is exact for a velocity that is constant over the step.
     """
 
-    description: ClassVar[str] = "Friction that builds up like a spring before the joint really slips."
-    signature: ClassVar[str] = "After each reversal the torque changes over an angle, not at once: a loop over the joint angle."
-    experiment: ClassVar[str] = "Move each joint to and fro by amounts from a thousandth to a tenth of a rad."
+    description: ClassVar[str] = (
+        "Friction that builds up like a spring before the joint really slips."
+    )
+    signature: ClassVar[str] = (
+        "After each reversal the torque changes over an angle, not at once: a loop over the joint angle."
+    )
+    experiment: ClassVar[str] = (
+        "Move each joint to and fro by amounts from a thousandth to a tenth of a rad."
+    )
     parameters: ClassVar[dict[str, Parameter]] = {
         "coulomb": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
-        "displacement": Parameter("rad", linear=False, plausible=(2e-4, 5e-2), bounds=(1e-9, np.inf)),
+        "displacement": Parameter(
+            "rad", linear=False, plausible=(2e-4, 5e-2), bounds=(1e-9, np.inf)
+        ),
     }
     has_memory: ClassVar[bool] = True
 
@@ -86,7 +100,9 @@ class PreslidingHysteresis(JointTorqueEffect):
     displacement: dict[str, float] = field(default_factory=lambda: {"all": 0.005})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         (z,), rate = motion.memory, motion.time_step / nonlinear[0]
         sign = np.sign(motion.velocity)
         bent = (z - sign) * np.exp(-np.abs(motion.velocity) * rate)
@@ -124,12 +140,18 @@ class Backlash(JointTorqueEffect):
     the impact at the other side. The step in which the gap closes counts in part.
     """
 
-    description: ClassVar[str] = "Play in the gear, which the motor must cross whenever its torque changes sign."
-    signature: ClassVar[str] = "No torque reaches the link for some milliseconds after the command changes sign."
+    description: ClassVar[str] = (
+        "Play in the gear, which the motor must cross whenever its torque changes sign."
+    )
+    signature: ClassVar[str] = (
+        "No torque reaches the link for some milliseconds after the command changes sign."
+    )
     experiment: ClassVar[str] = "Swing each joint so that its torque changes sign often."
     parameters: ClassVar[dict[str, Parameter]] = {
         "gap": Parameter("rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0),
-        "rotor_inertia": Parameter("kg m^2", linear=False, plausible=(0.02, 1.0), bounds=(1e-9, np.inf), grid=3),
+        "rotor_inertia": Parameter(
+            "kg m^2", linear=False, plausible=(0.02, 1.0), bounds=(1e-9, np.inf), grid=3
+        ),
     }
     has_memory: ClassVar[bool] = True
 
@@ -137,7 +159,9 @@ class Backlash(JointTorqueEffect):
     rotor_inertia: dict[str, float] = field(default_factory=lambda: {"all": 0.25})
 
     @staticmethod
-    def basis(motion: JointMotion, nonlinear: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         _, _, share = _cross(motion, nonlinear)
         return (share * motion.command,), (0.0,)
 
@@ -156,7 +180,10 @@ class Backlash(JointTorqueEffect):
         first = Backlash.start(motion._replace(command=motion.command[:1]), nonlinear)
         # Time first, all else in one axis.
         command, *values = np.broadcast_arrays(motion.command, *nonlinear)
-        steps = [np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1) for array in (command, *values)]
+        steps = [
+            np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1)
+            for array in (command, *values)
+        ]
         ends = _crossings(first[0].ravel(), first[1].ravel(), *steps, motion.time_step)[:2, :-1]
         ends = np.moveaxis(ends.reshape(2, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
         return np.concatenate([first, ends], axis=-2)
@@ -171,7 +198,12 @@ def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _crossings(
-    offset: np.ndarray, velocity: np.ndarray, command: np.ndarray, gap: np.ndarray, inertia: np.ndarray, time_step: float
+    offset: np.ndarray,
+    velocity: np.ndarray,
+    command: np.ndarray,
+    gap: np.ndarray,
+    inertia: np.ndarray,
+    time_step: float,
 ) -> np.ndarray:
     """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step, and for which share of the step they were
     free, (3, N, C).

@@ -28,7 +28,9 @@ def import_effect_modules(entries: Iterable[str], folder: Path) -> list[str]:
             _import_file(name) if entry.endswith(".py") else importlib.import_module(name)
         except Exception as error:
             message = str(error).partition("\n")[0]
-            raise InputError(f"effect_modules: {name}: cannot be imported: {type(error).__name__}: {message}") from None
+            raise InputError(
+                f"effect_modules: {name}: cannot be imported: {type(error).__name__}: {message}"
+            ) from None
         imported.append(name)
     return imported
 

@@ -79,7 +79,9 @@ USUAL_SENSORS = SensorBeliefs(
 _FINEST = 0.1
 
 
-def beliefs_of(encoders: EncoderConfig, imu: ImuConfig, foot_force: FootForceConfig) -> SensorBeliefs:
+def beliefs_of(
+    encoders: EncoderConfig, imu: ImuConfig, foot_force: FootForceConfig
+) -> SensorBeliefs:
     """What a scenario says of its robot's sensors; a noise of zero becomes a small one."""
     angle = encoders.angle_noise
     differenced = encoders.velocity == "differenced"

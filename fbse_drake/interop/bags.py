@@ -16,10 +16,21 @@ from fbse_drake.interop.mapping import ChannelMap, LogMap
 from fbse_drake.interop.messages import Layout
 from fbse_drake.interop.tables import Growing, Progress, listed, readable
 
-JOINT_STATE, IMU, WRENCH = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu", "geometry_msgs/msg/WrenchStamped"
+JOINT_STATE, IMU, WRENCH = (
+    "sensor_msgs/msg/JointState",
+    "sensor_msgs/msg/Imu",
+    "geometry_msgs/msg/WrenchStamped",
+)
 # Channel -> field of the standard message.
-_JOINT_STATE_FIELDS = {"joint/position": "position", "joint/velocity": "velocity", "joint/torque_command": "effort"}
-_IMU_FIELDS = {"imu/linear_acceleration": "linear_acceleration", "imu/angular_velocity": "angular_velocity"}
+_JOINT_STATE_FIELDS = {
+    "joint/position": "position",
+    "joint/velocity": "velocity",
+    "joint/torque_command": "effort",
+}
+_IMU_FIELDS = {
+    "imu/linear_acceleration": "linear_acceleration",
+    "imu/angular_velocity": "angular_velocity",
+}
 _WRENCH_FIELDS = ["wrench.torque", "wrench.force"]
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 # Messages that are decoded at a time.
@@ -60,12 +71,27 @@ class Bag:
         Raises:
             InputError: a topic that the map names is not there, it is not clear which is meant, or there are no joint positions.
         """
-        present = {topic: connection.msgtype for topic, connection in self._connections.items() if connection.msgcount}
-        mapped = {name: c for name, c in log_map.channels.items() if not (c.optional and c.topic and c.topic not in present)}
-        for topic in [*log_map.topics, *(channel.topic for channel in mapped.values() if channel.topic)]:
+        present = {
+            topic: connection.msgtype
+            for topic, connection in self._connections.items()
+            if connection.msgcount
+        }
+        mapped = {
+            name: c
+            for name, c in log_map.channels.items()
+            if not (c.optional and c.topic and c.topic not in present)
+        }
+        for topic in [
+            *log_map.topics,
+            *(channel.topic for channel in mapped.values() if channel.topic),
+        ]:
             if topic not in present:
-                raise InputError(f"topic {topic}: not in this bag, or empty (there are: {listed(list(present))})")
-        standard, left_out = self._standard_channels(mapped, {topic: present[topic] for topic in log_map.topics or present})
+                raise InputError(
+                    f"topic {topic}: not in this bag, or empty (there are: {listed(list(present))})"
+                )
+        standard, left_out = self._standard_channels(
+            mapped, {topic: present[topic] for topic in log_map.topics or present}
+        )
         channels = dict(standard)
         for name, channel in mapped.items():
             known = standard.get(name, ChannelMap())
@@ -73,31 +99,54 @@ class Bag:
             if not topic:
                 raise InputError(f"channels.{name}: no topic is named")
             wrench = _WRENCH_FIELDS if present[topic] == WRENCH else []
-            channels[name] = replace(channel, topic=topic, columns=channel.columns or known.columns or wrench)
+            channels[name] = replace(
+                channel, topic=topic, columns=channel.columns or known.columns or wrench
+            )
         if "joint/position" not in channels:
-            raise InputError(f"no {JOINT_STATE} topic, and no map names joint/position (topics: {listed(list(present))})")
+            raise InputError(
+                f"no {JOINT_STATE} topic, and no map names joint/position (topics: {listed(list(present))})"
+            )
         return channels, left_out
 
-    def _standard_channels(self, mapped: Mapping[str, ChannelMap], present: Mapping[str, str]) -> tuple[dict[str, ChannelMap], list[str]]:
+    def _standard_channels(
+        self, mapped: Mapping[str, ChannelMap], present: Mapping[str, str]
+    ) -> tuple[dict[str, ChannelMap], list[str]]:
         channels: dict[str, ChannelMap] = {}
         left_out = []
         for kind, fields in ((JOINT_STATE, _JOINT_STATE_FIELDS), (IMU, _IMU_FIELDS)):
-            chosen = dict.fromkeys(mapped[name].topic for name in fields if name in mapped and mapped[name].topic)
+            chosen = dict.fromkeys(
+                mapped[name].topic for name in fields if name in mapped and mapped[name].topic
+            )
             topics = [topic for topic in chosen or present if present.get(topic) == kind]
             if len(topics) > 1 and not chosen:
-                raise InputError(f"several {kind} topics ({listed(topics)}); a map's key topics chooses")
+                raise InputError(
+                    f"several {kind} topics ({listed(topics)}); a map's key topics chooses"
+                )
             for topic in topics[:1]:
                 first, names = self.first(topic), self.joints(topic)
-                columns = {name: field for name, field in fields.items() if first.width(field) == (len(names) or 3)}
-                channels |= {name: ChannelMap(topic=topic, columns=[field]) for name, field in columns.items()}
+                columns = {
+                    name: field
+                    for name, field in fields.items()
+                    if first.width(field) == (len(names) or 3)
+                }
+                channels |= {
+                    name: ChannelMap(topic=topic, columns=[field])
+                    for name, field in columns.items()
+                }
         chosen = dict.fromkeys(channel.topic for channel in mapped.values())
-        for topic in (topic for topic, kind in present.items() if kind == WRENCH and topic not in chosen):
+        for topic in (
+            topic for topic, kind in present.items() if kind == WRENCH and topic not in chosen
+        ):
             side = _side(topic)
             name = f"foot/{side}/wrench"
             if side is None:
-                left_out.append(f"topic {topic}, a wrench, is left out: its name says neither left nor right; a map can")
+                left_out.append(
+                    f"topic {topic}, a wrench, is left out: its name says neither left nor right; a map can"
+                )
             elif name in channels:
-                raise InputError(f"topics {channels[name].topic} and {topic} are both {side}; a map's key topics chooses")
+                raise InputError(
+                    f"topics {channels[name].topic} and {topic} are both {side}; a map's key topics chooses"
+                )
             elif not (name in mapped and mapped[name].topic):
                 channels[name] = ChannelMap(topic=topic, columns=_WRENCH_FIELDS)
         return channels, left_out
@@ -111,7 +160,11 @@ class Bag:
 
     def joints(self, topic: str) -> list[str]:
         """The joints that the messages of a topic name."""
-        return self.first(topic).texts.get("name", []) if self._connections[topic].msgtype == JOINT_STATE else []
+        return (
+            self.first(topic).texts.get("name", [])
+            if self._connections[topic].msgtype == JOINT_STATE
+            else []
+        )
 
     def read(
         self, wanted: Mapping[str, Sequence[str]], joints: Sequence[str], progress: Progress
@@ -133,13 +186,21 @@ class Bag:
             first, names = self.first(topic), self.joints(topic)
             for path in paths:
                 if not first.width(path):
-                    raise InputError(f"topic {topic}: its messages have no numbers {path} (there are: {listed(list(first.numbers))})")
+                    raise InputError(
+                        f"topic {topic}: its messages have no numbers {path} (there are: {listed(list(first.numbers))})"
+                    )
             for joint in joints:
                 if names and joint not in names:
-                    raise InputError(f"joints: {joint} is not in the messages of {topic} (there are: {listed(names)})")
+                    raise InputError(
+                        f"joints: {joint} is not in the messages of {topic} (there are: {listed(names)})"
+                    )
             widths = {path: len(joints) if names else first.width(path) for path in paths}
             topics[topic] = _Collected(widths, joints if names else [])
-        connections = [c for c in self._reader.connections if c.topic in wanted and c.msgtype == self._connections[c.topic].msgtype]
+        connections = [
+            c
+            for c in self._reader.connections
+            if c.topic in wanted and c.msgtype == self._connections[c.topic].msgtype
+        ]
         total = sum(connection.msgcount for connection in connections)
         for count, (connection, received, raw) in enumerate(self._reader.messages(connections)):
             topic = topics[connection.topic]
@@ -159,7 +220,12 @@ class Bag:
 
     def _layout(self, topic: str, raw: bytes) -> Layout:
         with located(f"topic {topic}: "):
-            return Layout.of(bytes(raw), self._connections[topic].msgtype, self._definitions, cdr=self._reader.is2)
+            return Layout.of(
+                bytes(raw),
+                self._connections[topic].msgtype,
+                self._definitions,
+                cdr=self._reader.is2,
+            )
 
 
 @dataclass
@@ -189,7 +255,9 @@ class _Collected:
         while todo.size:
             layout = layout_of(self.pending[todo[0]])
             rows = todo[sizes[todo] == layout.size]
-            block = np.frombuffer(b"".join(self.pending[row] for row in rows), np.uint8).reshape(-1, layout.size)
+            block = np.frombuffer(b"".join(self.pending[row] for row in rows), np.uint8).reshape(
+                -1, layout.size
+            )
             fits = layout.fits(block)
             rows, block = rows[fits], block[fits]
             todo = np.setdiff1d(todo, rows, assume_unique=True)
@@ -216,7 +284,11 @@ class _Collected:
 
     def rows(self) -> TopicRows:
         """All that was decoded."""
-        return TopicRows(self._stamps.rows(), self._received.rows(), {path: column.rows() for path, column in self._columns.items()})
+        return TopicRows(
+            self._stamps.rows(),
+            self._received.rows(),
+            {path: column.rows() for path, column in self._columns.items()},
+        )
 
 
 @contextmanager
@@ -230,7 +302,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         if path.is_dir() and not (path / "metadata.yaml").is_file():
             files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
             if len(files) != 1:
-                raise InputError(f"expected the folder of a bag, with a metadata.yaml or one bag file; found {len(files)} bag files")
+                raise InputError(
+                    f"expected the folder of a bag, with a metadata.yaml or one bag file; found {len(files)} bag files"
+                )
             path = files[0]
         if not path.is_dir() and path.stat().st_size == 0:
             raise InputError("empty")

@@ -49,7 +49,9 @@ def read_log(path: Path, log_map: str | Path | None = None) -> Log:
     return read_logs([path], log_map)
 
 
-def read_logs(paths: Sequence[Path], log_map: str | Path | None = None, *, progress: Progress = lambda _: None) -> Log:
+def read_logs(
+    paths: Sequence[Path], log_map: str | Path | None = None, *, progress: Progress = lambda _: None
+) -> Log:
     """As `read_log`, with several recordings as one log."""
     if len(paths) == 1 and paths[0].suffix == ".npz" and log_map is None:
         return Log.load(paths[0])
@@ -84,23 +86,37 @@ def _read_table(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
     table = open_table(path, log_map.records)
     with located(f"{path}: "):
         if not log_map.joints or not log_map.channels:
-            raise InputError(f"a map must name the joints and say what the columns are (columns: {listed(table.names)})")
+            raise InputError(
+                f"a map must name the joints and say what the columns are (columns: {listed(table.names)})"
+            )
         for name in log_map.constants:
             if name not in table.constants:
-                raise InputError(f"constants: {name} is not in this file (there are: {listed(list(table.constants))})")
+                raise InputError(
+                    f"constants: {name} is not in this file (there are: {listed(list(table.constants))})"
+                )
         channels = {
             name: channel
             for name, channel in log_map.channels.items()
-            if not channel.optional or all(_split(column, table.names)[0] in table.names for column in channel.columns)
+            if not channel.optional
+            or all(_split(column, table.names)[0] in table.names for column in channel.columns)
         }
-        fields = [column for channel in channels.values() for column in (*channel.columns, *channel.times)]
-        wanted = dict.fromkeys(_split(column, table.names)[0] for column in [*fields, *filter(None, [log_map.time.column])])
+        fields = [
+            column for channel in channels.values() for column in (*channel.columns, *channel.times)
+        ]
+        wanted = dict.fromkeys(
+            _split(column, table.names)[0]
+            for column in [*fields, *filter(None, [log_map.time.column])]
+        )
         for name in wanted:
             if name not in table.names:
                 raise InputError(f"column {name} is missing (there are: {listed(table.names)})")
     columns = table.read(list(wanted), progress)
     with located(f"{path}: "):
-        samples = len(columns[log_map.time.column]) if log_map.time.column else max(values.shape[0] for values in columns.values())
+        samples = (
+            len(columns[log_map.time.column])
+            if log_map.time.column
+            else max(values.shape[0] for values in columns.values())
+        )
         rows = {name: _in_rows(name, values, samples) for name, values in columns.items()}
         made = _channels(channels, lambda _, column: _taken(column, rows), len(log_map.joints))
     if log_map.time.column:
@@ -110,13 +126,19 @@ def _read_table(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
     # Seconds since 1970 are not as fine as the clock's own unit.
     origin = clock[np.isfinite(clock)][:1].sum()
     constants = {name: table.constants[name] for name in log_map.constants}
-    return _Recording(path.name, log_map.joints, (clock - origin) * unit, origin * unit, made, constants, [])
+    return _Recording(
+        path.name, log_map.joints, (clock - origin) * unit, origin * unit, made, constants, []
+    )
 
 
 def _read_bag(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
     with open_bag(path) as bag:
         channels, left_out = bag.channels(log_map)
-        recorded = log_map.recorded_joints or log_map.joints or bag.joints(channels["joint/position"].topic)
+        recorded = (
+            log_map.recorded_joints
+            or log_map.joints
+            or bag.joints(channels["joint/position"].topic)
+        )
         if not recorded:
             raise InputError("the map names no joints")
         wanted: dict[str, list[str]] = {}
@@ -137,11 +159,21 @@ def _read_bag(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
             if topic == base:
                 return values
             with located(f"topic {topic}: "):
-                return _interpolated((times[base] - origin) / 1e9, (times[topic] - origin) / 1e9, values)
+                return _interpolated(
+                    (times[base] - origin) / 1e9, (times[topic] - origin) / 1e9, values
+                )
 
         made = _channels(channels, take, len(recorded))
     joints = log_map.joints or list(recorded)
-    return _Recording(path.name, joints, (times[base] - origin) / 1e9, origin / 1e9, made, {}, [*left_out, *foreign])
+    return _Recording(
+        path.name,
+        joints,
+        (times[base] - origin) / 1e9,
+        origin / 1e9,
+        made,
+        {},
+        [*left_out, *foreign],
+    )
 
 
 def _split(column: str, names: Sequence[str]) -> tuple[str, slice]:
@@ -166,11 +198,15 @@ def _in_rows(name: str, values: np.ndarray, samples: int) -> np.ndarray:
     """(samples, k), also of an array that has its samples in columns."""
     rows = values[:, None] if values.ndim == 1 else values if len(values) == samples else values.T
     if len(rows) != samples:
-        raise InputError(f"column {name}: expected {samples} rows as in the time, found {' x '.join(map(str, values.shape))}")
+        raise InputError(
+            f"column {name}: expected {samples} rows as in the time, found {' x '.join(map(str, values.shape))}"
+        )
     return rows
 
 
-def _channels(channels: Mapping[str, ChannelMap], take: Callable[[str, str], np.ndarray], joints: int) -> dict[str, np.ndarray]:
+def _channels(
+    channels: Mapping[str, ChannelMap], take: Callable[[str, str], np.ndarray], joints: int
+) -> dict[str, np.ndarray]:
     """Makes the channels of a recording.
 
     Args:
@@ -187,7 +223,9 @@ def _channels(channels: Mapping[str, ChannelMap], take: Callable[[str, str], np.
             if not channel.columns:
                 raise InputError("no columns are named")
             times = together(channel.topic, channel.times) if channel.times else None
-            made[name] = channel.channel(name, together(channel.topic, channel.columns), times, joints)
+            made[name] = channel.channel(
+                name, together(channel.topic, channel.columns), times, joints
+            )
     return made
 
 
@@ -207,7 +245,9 @@ def _interpolated(base: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.
     if len(time) > 1:
         after = np.clip(np.searchsorted(time, base), 1, len(time) - 1)
         gap = time[after] - time[after - 1]
-        known = (gap <= _NEIGHBOURS * np.median(np.diff(time))) & (base >= time[0]) & (base <= time[-1])
+        known = (
+            (gap <= _NEIGHBOURS * np.median(np.diff(time))) & (base >= time[0]) & (base <= time[-1])
+        )
         for column, result_column in zip(values.T, result.T, strict=True):
             result_column[known] = np.interp(base[known], time, column)
     return result
@@ -244,13 +284,17 @@ def _cleaned(recording: _Recording, log_map: LogMap) -> _Recording:
                 continue
             raise InputError(f"no row has numbers in {name}")
         if not known.all():
-            findings.append(f"{int((~known).sum())} rows without numbers in {name} are left out (the first is row {int(known.argmin())})")
+            findings.append(
+                f"{int((~known).sum())} rows without numbers in {name} are left out (the first is row {int(known.argmin())})"
+            )
         whole &= known
     rows = np.flatnonzero(whole)
     if rows.size:
         rows = rows[_later(time[rows])]
     if rows.size < whole.sum():
-        findings.append(f"{int(whole.sum()) - rows.size} rows at the time of the row before are left out")
+        findings.append(
+            f"{int(whole.sum()) - rows.size} rows at the time of the row before are left out"
+        )
     elapsed = time[rows] - time[rows[:1]]
     end = np.inf if log_map.end is None else log_map.end
     rows = rows[(elapsed >= log_map.start - _TICK) & (elapsed <= end + _TICK)]
@@ -270,13 +314,18 @@ def _cleaned(recording: _Recording, log_map: LogMap) -> _Recording:
 def _check_period(time: np.ndarray, period: float | None) -> None:
     median = float(np.median(np.diff(time)))
     if period is not None and not 1 / _OTHER_UNIT < median / period < _OTHER_UNIT:
-        raise InputError(f"time: rows are {median:g} s apart, but the map's period is {period:g} s; is the time's unit right?")
+        raise InputError(
+            f"time: rows are {median:g} s apart, but the map's period is {period:g} s; is the time's unit right?"
+        )
 
 
 def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
     first = recordings[0]
     for other in recordings[1:]:
-        for what, ours, theirs in (("joints", first.joints, other.joints), ("channels", list(first.channels), list(other.channels))):
+        for what, ours, theirs in (
+            ("joints", first.joints, other.joints),
+            ("channels", list(first.channels), list(other.channels)),
+        ):
             if ours != theirs:
                 raise InputError(
                     f"{other.source}: cannot be one log with {first.source}: its {what} are {listed(theirs)}, not {listed(ours)}"
@@ -286,12 +335,20 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
     for recording in recordings:
         times.append(begin + recording.time)
         span = {"start": float(times[-1][0]), "end": float(times[-1][-1])}
-        segments.append(span | {"source": recording.source, "recorded_start": recording.origin} | recording.constants)
+        segments.append(
+            span
+            | {"source": recording.source, "recorded_start": recording.origin}
+            | recording.constants
+        )
         begin = span["end"] + log_map.gap
-    channels = {"time": _chained(times)} | {name: _chained([r.channels[name] for r in recordings]) for name in first.channels}
+    channels = {"time": _chained(times)} | {
+        name: _chained([r.channels[name] for r in recordings]) for name in first.channels
+    }
     several = len(recordings) > 1
     source = f"{first.source} and {len(recordings) - 1} more" if several else first.source
-    sides = dict.fromkeys(match[1] for name in channels if (match := re.match(r"foot/(\w+)/", name)))
+    sides = dict.fromkeys(
+        match[1] for name in channels if (match := re.match(r"foot/(\w+)/", name))
+    )
     meta = {
         "joints": list(first.joints),
         "sides": list(sides),
@@ -299,7 +356,11 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
         "title": f"Recording {source}",
         "source": source,
         "segments": segments,
-        "findings": [f"{r.source}: {finding}" if several else finding for r in recordings for finding in r.findings],
+        "findings": [
+            f"{r.source}: {finding}" if several else finding
+            for r in recordings
+            for finding in r.findings
+        ],
     }
     return Log(channels, meta | ({"pads": log_map.pads} if log_map.pads else {}))
 

@@ -39,7 +39,9 @@ def write_mcap(log: Log, path: Path) -> None:
     """
     stamps = np.rint(log.time * 1e9).astype(np.int64)
     if stamps[0] < 0:
-        raise InputError(f"{path}: messages cannot have times before 0; this log begins at {log.time[0]:g} s")
+        raise InputError(
+            f"{path}: messages cannot have times before 0; this log begins at {log.time[0]:g} s"
+        )
     store = get_typestore(Stores.ROS2_HUMBLE)
     topics = list(_topics(log, store.types))
 
@@ -50,7 +52,9 @@ def write_mcap(log: Log, path: Path) -> None:
             made = []
             for topic, message, fields in topics:
                 kind = message.__msgtype__
-                schema = writer.register_schema(kind, "ros2msg", store.generate_msgdef(kind, ros_version=2)[0].encode())
+                schema = writer.register_schema(
+                    kind, "ros2msg", store.generate_msgdef(kind, ros_version=2)[0].encode()
+                )
                 raw = bytes(store.serialize_cdr(message, kind))
                 layout = Layout.of(raw, kind, store.fielddefs, cdr=True)
                 made.append((writer.register_channel(topic, "cdr", schema), layout, raw, fields))
@@ -58,12 +62,27 @@ def write_mcap(log: Log, path: Path) -> None:
                 rows = slice(start, start + _BLOCK)
                 stamp = np.stack(np.divmod(stamps[rows], 10**9), axis=1)
                 blocks = [
-                    (channel, layout.encode(raw, {"header.stamp": stamp, **{name: values[rows] for name, values in fields.items()}}))
+                    (
+                        channel,
+                        layout.encode(
+                            raw,
+                            {
+                                "header.stamp": stamp,
+                                **{name: values[rows] for name, values in fields.items()},
+                            },
+                        ),
+                    )
                     for channel, layout, raw, fields in made
                 ]
                 for row, time in enumerate(stamps[rows].tolist()):
                     for channel, block in blocks:
-                        writer.add_message(channel, log_time=time, data=block[row].tobytes(), publish_time=time, sequence=start + row)
+                        writer.add_message(
+                            channel,
+                            log_time=time,
+                            data=block[row].tobytes(),
+                            publish_time=time,
+                            sequence=start + row,
+                        )
             writer.finish()
 
     write_atomically(path, write)
@@ -74,10 +93,21 @@ def write_csv(log: Log, path: Path) -> None:
     names = []
     for name, values in log.items():
         width = values[0].size
-        parts = [""] if values.ndim == 1 else [f"/{j}" for j in log.joints] if "joint/" in name else [f"[{i}]" for i in range(width)]
+        parts = (
+            [""]
+            if values.ndim == 1
+            else [f"/{j}" for j in log.joints]
+            if "joint/" in name
+            else [f"[{i}]" for i in range(width)]
+        )
         names.extend(f"{name}{part}" for part in parts)
     rows = np.hstack([values.reshape(len(log.time), -1) for values in log.values()])
-    write_atomically(path, lambda partial: np.savetxt(partial, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments=""))
+    write_atomically(
+        path,
+        lambda partial: np.savetxt(
+            partial, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments=""
+        ),
+    )
 
 
 def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[str, np.ndarray]]]:
@@ -91,24 +121,47 @@ def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[st
 
     joints = {
         field: log[name]
-        for field, name in (("position", "joint/position"), ("velocity", "joint/velocity"), ("effort", "joint/torque_command"))
+        for field, name in (
+            ("position", "joint/position"),
+            ("velocity", "joint/velocity"),
+            ("effort", "joint/torque_command"),
+        )
         if name in log
     }
-    values = [np.zeros(len(log.joints) if field in joints else 0) for field in ("position", "velocity", "effort")]
+    values = [
+        np.zeros(len(log.joints) if field in joints else 0)
+        for field in ("position", "velocity", "effort")
+    ]
     yield "/joint_states", types[JOINT_STATE](header(""), list(log.joints), *values), joints
 
-    imu = {field: log[f"imu/{field}"] for field in ("angular_velocity", "linear_acceleration") if f"imu/{field}" in log}
+    imu = {
+        field: log[f"imu/{field}"]
+        for field in ("angular_velocity", "linear_acceleration")
+        if f"imu/{field}" in log
+    }
     if imu:
         # The convention for: no orientation is measured.
         no_orientation = np.array([-1.0, *np.zeros(8)])
         upright = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        yield "/imu", types[IMU](header("imu"), upright, no_orientation, zero(), np.zeros(9), zero(), np.zeros(9)), imu
+        yield (
+            "/imu",
+            types[IMU](
+                header("imu"), upright, no_orientation, zero(), np.zeros(9), zero(), np.zeros(9)
+            ),
+            imu,
+        )
 
     for side in log.sides:
         wrench = _wrench(log, side)
         if wrench is not None:
-            message = types[WRENCH](header(f"{side}_sole"), types["geometry_msgs/msg/Wrench"](zero(), zero()))
-            yield f"/foot/{side}/wrench", message, {"wrench.torque": wrench[:, :3], "wrench.force": wrench[:, 3:]}
+            message = types[WRENCH](
+                header(f"{side}_sole"), types["geometry_msgs/msg/Wrench"](zero(), zero())
+            )
+            yield (
+                f"/foot/{side}/wrench",
+                message,
+                {"wrench.torque": wrench[:, :3], "wrench.force": wrench[:, 3:]},
+            )
 
 
 def _wrench(log: Log, side: str) -> np.ndarray | None:
@@ -118,7 +171,12 @@ def _wrench(log: Log, side: str) -> np.ndarray | None:
     if f"foot/{side}/pad_force" not in log:
         return None
     with located(f"channel foot/{side}/pad_force: "):
-        forces, places = log[f"foot/{side}/pad_force"], np.array(log.meta.get("pads", {}).get(side, []))
+        forces, places = (
+            log[f"foot/{side}/pad_force"],
+            np.array(log.meta.get("pads", {}).get(side, [])),
+        )
         if places.shape != forces.shape[1:]:
-            raise InputError("meta has no pads for it: where the force sensors are, in the sole frame")
+            raise InputError(
+                "meta has no pads for it: where the force sensors are, in the sole frame"
+            )
     return np.hstack([np.cross(places, forces).sum(axis=1), forces.sum(axis=1)])

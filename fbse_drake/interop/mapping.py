@@ -52,11 +52,17 @@ class ChannelMap:
             if len(getattr(self, key)) not in (0, 3):
                 raise InputError(f"{key}: expected three numbers, found {len(getattr(self, key))}")
         if len(self.times) not in (0, 1, len(self.columns)):
-            raise InputError(f"times: expected one column or {len(self.columns)} as in columns, found {len(self.times)}")
+            raise InputError(
+                f"times: expected one column or {len(self.columns)} as in columns, found {len(self.times)}"
+            )
         if not 0 <= self.signed_bits <= 32:
-            raise InputError(f"signed_bits: expected a number from 0 to 32, found {self.signed_bits}")
+            raise InputError(
+                f"signed_bits: expected a number from 0 to 32, found {self.signed_bits}"
+            )
 
-    def channel(self, name: str, columns: np.ndarray, times: np.ndarray | None, joints: int) -> np.ndarray:
+    def channel(
+        self, name: str, columns: np.ndarray, times: np.ndarray | None, joints: int
+    ) -> np.ndarray:
         """Makes a channel, (N, ...), of recorded columns, (N, k).
 
         Args:
@@ -71,13 +77,23 @@ class ChannelMap:
         width = columns.shape[1]
         if name.endswith("/orientation") and width == 3:
             return self._quaternions(columns)
-        expected = ("n" in shape and joints) or int(np.prod([size for size in shape if isinstance(size, int)]))
+        expected = ("n" in shape and joints) or int(
+            np.prod([size for size in shape if isinstance(size, int)])
+        )
         if width != expected and not ("m" in shape and width and width % expected == 0):
-            several = " for each pad" if "m" in shape else f", one for each of {joints} joints" if "n" in shape else ""
+            several = (
+                " for each pad"
+                if "m" in shape
+                else f", one for each of {joints} joints"
+                if "n" in shape
+                else ""
+            )
             raise InputError(f"columns: expected {expected} in all{several}, found {width}")
         for key in ("gains", "offsets"):
             if len(getattr(self, key)) not in (0, width):
-                raise InputError(f"{key}: expected {width} numbers, one for each component, found {len(getattr(self, key))}")
+                raise InputError(
+                    f"{key}: expected {width} numbers, one for each component, found {len(getattr(self, key))}"
+                )
         values = columns
         if self.signed_bits:
             half = 2.0 ** (self.signed_bits - 1)
@@ -91,7 +107,9 @@ class ChannelMap:
             values = values + factor * np.array(self.offsets)
         if self.rotation_deg or self.position:
             values = self._in_log_frame(values)
-        return values.reshape(len(values), *(-1 if size == "m" else joints if size == "n" else size for size in shape))
+        return values.reshape(
+            len(values), *(-1 if size == "m" else joints if size == "n" else size for size in shape)
+        )
 
     def _quaternions(self, columns: np.ndarray) -> np.ndarray:
         """Orientations [w, x, y, z], (N, 4), of recorded roll, pitch and yaw, (N, 3)."""
@@ -99,7 +117,9 @@ class ChannelMap:
         return np.array([RollPitchYaw(row).ToQuaternion().wxyz() for row in angles])
 
     def _in_log_frame(self, values: np.ndarray) -> np.ndarray:
-        R_LS = RotationMatrix(RollPitchYaw(np.deg2rad(self.rotation_deg or [0.0, 0.0, 0.0]))).matrix()
+        R_LS = RotationMatrix(
+            RollPitchYaw(np.deg2rad(self.rotation_deg or [0.0, 0.0, 0.0]))
+        ).matrix()
         vectors = values.reshape(len(values), -1, 3) @ R_LS.T
         if self.position:
             moment, force = vectors[:, 0], vectors[:, 1]
@@ -152,7 +172,9 @@ class LogMap:
         if len(set(self.joints)) != len(self.joints):
             raise InputError("joints: a name is given twice")
         if self.recorded_joints and len(self.recorded_joints) != len(self.joints):
-            raise InputError(f"recorded_joints: expected {len(self.joints)} names as in joints, found {len(self.recorded_joints)}")
+            raise InputError(
+                f"recorded_joints: expected {len(self.joints)} names as in joints, found {len(self.recorded_joints)}"
+            )
         if not self.time.column and self.period is None:
             raise InputError("period: needed where time has no column")
         for name, channel in self.channels.items():
@@ -163,7 +185,9 @@ class LogMap:
                 if channel.unit:
                     si_factor(channel.unit, unit, joint="n" in shape)
                 if channel.rotation_deg and not name.startswith(("imu/", "foot/")):
-                    raise InputError("rotation_deg: only channels imu/... and foot/... can be turned")
+                    raise InputError(
+                        "rotation_deg: only channels imu/... and foot/... can be turned"
+                    )
                 if channel.position and not name.endswith("/wrench"):
                     raise InputError("position: only wrenches have one")
 
@@ -175,8 +199,20 @@ def load_map(name_or_path: str | Path) -> LogMap:
         InputError: file not found, unknown key, wrong type, unit or channel.
     """
     shipped = resources.folder("scenarios")
-    file = next((path for path in (Path(name_or_path), shipped / f"{name_or_path}.map.yaml") if path.is_file()), None)
+    file = next(
+        (
+            path
+            for path in (Path(name_or_path), shipped / f"{name_or_path}.map.yaml")
+            if path.is_file()
+        ),
+        None,
+    )
     if file is None:
-        names = sorted(str(path.relative_to(shipped)).removesuffix(".map.yaml") for path in shipped.rglob("*.map.yaml"))
-        raise InputError(f"{name_or_path}: no such file, and no such map in scenarios/ (there are: {', '.join(names)})")
+        names = sorted(
+            str(path.relative_to(shipped)).removesuffix(".map.yaml")
+            for path in shipped.rglob("*.map.yaml")
+        )
+        raise InputError(
+            f"{name_or_path}: no such file, and no such map in scenarios/ (there are: {', '.join(names)})"
+        )
     return schema.build(LogMap, schema.load_tree(file), file=str(file))

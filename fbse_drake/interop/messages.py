@@ -14,7 +14,21 @@ from rosbags.interfaces import Nodetype
 
 from fbse_drake.errors import InputError
 
-_DTYPES = {name: name for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64")}
+_DTYPES = {
+    name: name
+    for name in (
+        "int8",
+        "int16",
+        "int32",
+        "int64",
+        "uint8",
+        "uint16",
+        "uint32",
+        "uint64",
+        "float32",
+        "float64",
+    )
+}
 _DTYPES |= {"bool": "uint8", "byte": "uint8", "char": "uint8"}
 
 # Fields of message types, as rosbags.typesys.store.Typestore.fielddefs.
@@ -50,7 +64,9 @@ class Layout:
         except (struct.error, UnicodeDecodeError, KeyError, ValueError) as error:
             raise InputError(f"a damaged {kind} message: {' '.join(str(error).split())}") from None
         fixed = np.array(walk.fixed, dtype=int)
-        numbers = {path: (dtype, np.concatenate(places)) for path, (dtype, places) in walk.numbers.items()}
+        numbers = {
+            path: (dtype, np.concatenate(places)) for path, (dtype, places) in walk.numbers.items()
+        }
         return cls(len(raw), numbers, walk.texts, fixed, np.frombuffer(raw, np.uint8)[fixed])
 
     def leaves(self, path: str) -> list[str]:
@@ -67,7 +83,10 @@ class Layout:
 
     def decode(self, block: np.ndarray, path: str) -> np.ndarray:
         """A field's numbers in messages of this layout, bytes (B, size) -> (B, k)."""
-        return np.hstack([self._decode(block, *self.numbers[name]) for name in self.leaves(path)] or [np.empty((len(block), 0))])
+        return np.hstack(
+            [self._decode(block, *self.numbers[name]) for name in self.leaves(path)]
+            or [np.empty((len(block), 0))]
+        )
 
     def encode(self, raw: bytes, fields: Mapping[str, np.ndarray]) -> np.ndarray:
         """Copies of a message of this layout with other numbers in some fields, (B, k) each -> bytes (B, size)."""
@@ -77,7 +96,9 @@ class Layout:
             for name in self.leaves(path):
                 dtype, places = self.numbers[name]
                 numbers = np.ascontiguousarray(values[:, first : first + len(places)], dtype=dtype)
-                block[:, (places[:, None] + np.arange(dtype.itemsize)).ravel()] = numbers.view(np.uint8)
+                block[:, (places[:, None] + np.arange(dtype.itemsize)).ravel()] = numbers.view(
+                    np.uint8
+                )
                 first += len(places)
         return block
 
@@ -130,7 +151,9 @@ class _Walk:
         if count:
             self.align(dtype.itemsize)
         start = self.advance(count * dtype.itemsize)
-        self.numbers.setdefault(path, (dtype, []))[1].append(start + dtype.itemsize * np.arange(count))
+        self.numbers.setdefault(path, (dtype, []))[1].append(
+            start + dtype.itemsize * np.arange(count)
+        )
 
     def length(self) -> int:
         self.align(4)

@@ -72,7 +72,9 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from None
     except FileNotFoundError:
         raise InputError(f"{path}: No such file or directory") from None
-    except Exception as error:  # Parsers of other people's formats raise anything when bytes are damaged.
+    except (
+        Exception
+    ) as error:  # Parsers of other people's formats raise anything when bytes are damaged.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, or not {kind}: {reason[:200]}") from None
 
@@ -108,7 +110,9 @@ def open_table(path: Path, records: str) -> Table:
 
     def read(names: Sequence[str], progress: Progress) -> dict[str, np.ndarray]:
         with readable(path, kind):
-            return {name: _numbers(name, values) for name, values in table.read(names, progress).items()}
+            return {
+                name: _numbers(name, values) for name, values in table.read(names, progress).items()
+            }
 
     return Table(table.path, table.names, table.constants, read)
 
@@ -116,7 +120,9 @@ def open_table(path: Path, records: str) -> Table:
 def _numbers(name: str, values: Any) -> np.ndarray:
     array = np.asarray(values)
     if array.dtype.kind not in "fiub" or array.ndim not in (1, 2):
-        raise InputError(f"column {name}: expected numbers in rows, found an array of {array.dtype} with {array.ndim} dimensions")
+        raise InputError(
+            f"column {name}: expected numbers in rows, found an array of {array.dtype} with {array.ndim} dimensions"
+        )
     return array.astype(float, copy=False)
 
 
@@ -147,7 +153,9 @@ def _open_csv(path: Path) -> Table:
     return Table(path, names, {}, read)
 
 
-def _csv_rows(lines: list[str], first: int, delimiter: str, *, fields: list[str], indices: list[int]) -> np.ndarray:
+def _csv_rows(
+    lines: list[str], first: int, delimiter: str, *, fields: list[str], indices: list[int]
+) -> np.ndarray:
     """Numbers of some lines, (N, columns); what is empty is NaN.
 
     Args:
@@ -156,7 +164,9 @@ def _csv_rows(lines: list[str], first: int, delimiter: str, *, fields: list[str]
     # Numpy looks at the wanted columns only: it would not see that a line has too many.
     if all(line.count(delimiter) == len(fields) - 1 and not line.isspace() for line in lines):
         with contextlib.suppress(ValueError):
-            return np.loadtxt(lines, delimiter=delimiter, usecols=indices, ndmin=2, comments=None, quotechar='"')
+            return np.loadtxt(
+                lines, delimiter=delimiter, usecols=indices, ndmin=2, comments=None, quotechar='"'
+            )
     rows = []
     for number, line in enumerate(lines, first):
         cells = next(csv.reader([line], delimiter=delimiter), [])
@@ -168,7 +178,9 @@ def _csv_rows(lines: list[str], first: int, delimiter: str, *, fields: list[str]
         for i in indices:
             text = cells[i].strip()
             if text and not _is_number(text):
-                raise InputError(f"line {number}, column {fields[i]}: expected a number, found {text[:40]!r}")
+                raise InputError(
+                    f"line {number}, column {fields[i]}: expected a number, found {text[:40]!r}"
+                )
             row.append(float(text or "nan"))
         rows.append(row)
     return np.array(rows).reshape(-1, len(indices))
@@ -188,7 +200,11 @@ def _open_json(path: Path, records: str) -> Table:
         content = {"": content}
     if not isinstance(content, dict):
         raise InputError("expected records, or a mapping that has them")
-    lists = [key for key, value in content.items() if isinstance(value, list) and value and isinstance(value[0], dict)]
+    lists = [
+        key
+        for key, value in content.items()
+        if isinstance(value, list) and value and isinstance(value[0], dict)
+    ]
     if records:
         lists = [key for key in lists if key == records]
     if len(lists) != 1:
@@ -199,9 +215,14 @@ def _open_json(path: Path, records: str) -> Table:
     names = list(rows[0])
 
     def read(wanted: Sequence[str], _: Progress) -> dict[str, np.ndarray]:
-        return {name: np.array([_json_number(row, name, number) for number, row in enumerate(rows)]) for name in wanted}
+        return {
+            name: np.array([_json_number(row, name, number) for number, row in enumerate(rows)])
+            for name in wanted
+        }
 
-    constants = {key: value for key, value in content.items() if isinstance(value, int | float | str)}
+    constants = {
+        key: value for key, value in content.items() if isinstance(value, int | float | str)
+    }
     return Table(path, names, constants, read)
 
 
@@ -240,7 +261,11 @@ def _open_hdf5(path: Path) -> Table:
     with h5py.File(path) as file:
 
         def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-            if name.startswith("#") or not isinstance(item, h5py.Dataset) or item.dtype.kind not in "fiub":
+            if (
+                name.startswith("#")
+                or not isinstance(item, h5py.Dataset)
+                or item.dtype.kind not in "fiub"
+            ):
                 return
             if item.attrs.get("MATLAB_class") == b"char":
                 constants[name.replace("/", ".")] = "".join(map(chr, item[()].ravel()))
@@ -264,7 +289,11 @@ def _flattened(content: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     for name, value in content.items():
         if name.startswith("__"):
             continue
-        flat |= _flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flat |= (
+            _flattened(value, f"{prefix}{name}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{name}": value}
+        )
     return flat
 
 
@@ -284,7 +313,9 @@ def _table_of_arrays(path: Path, arrays: Mapping[str, Any]) -> Table:
             constants[name] = float(array.item())
         elif array.dtype.kind in "fiub" and array.ndim in (1, 2):
             columns[name] = _in_rows(array)
-    return Table(path, list(columns), constants, lambda wanted, _: {name: columns[name] for name in wanted})
+    return Table(
+        path, list(columns), constants, lambda wanted, _: {name: columns[name] for name in wanted}
+    )
 
 
 def _in_rows(array: np.ndarray) -> np.ndarray:

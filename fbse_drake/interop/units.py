@@ -61,7 +61,9 @@ def si_factor(unit: str, si: str, *, joint: bool = False) -> float:
     if kind not in wanted:
         allowed = ", ".join(name for name, (other, _) in _UNITS.items() if other in wanted)
         if not allowed:
-            raise InputError(f"unit: none can be given for {si}; gains make SI units of the columns")
+            raise InputError(
+                f"unit: none can be given for {si}; gains make SI units of the columns"
+            )
         hint = f"; what is measured in {unit} needs a gain that makes {si} of it" if kind else ""
         raise InputError(f"unit: expected one of {allowed}, found {unit}{hint}")
     return factor

@@ -20,7 +20,15 @@ from fbse_drake.effects.effect import library
 from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy_figures import by_effect, finding_name, spaced, targets_text
-from fbse_drake.report.html import Details, FigureBlock, Report, Section, Table, number, write_report
+from fbse_drake.report.html import (
+    Details,
+    FigureBlock,
+    Report,
+    Section,
+    Table,
+    number,
+    write_report,
+)
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, dump_scenario
 
@@ -49,31 +57,65 @@ class Inputs:
     hygiene: Hygiene = field(default_factory=Hygiene)
 
 
-def write_compare_report(path: str | Path, comparison: Comparison, predictor: Predictor, inputs: Inputs) -> None:
+def write_compare_report(
+    path: str | Path, comparison: Comparison, predictor: Predictor, inputs: Inputs
+) -> None:
     """Writes where a model fails as one HTML file."""
     outcome = inputs.hygiene.before(compare_outcome(comparison))
     rows = (
         ("Error of the whole residual", _times_noise(comparison.rmse)),
-        ("Is it a mere offset?", f"A constant taken off every channel leaves {_times_noise(comparison.held_out_rmse)} on held-out data."),
+        (
+            "Is it a mere offset?",
+            f"A constant taken off every channel leaves {_times_noise(comparison.held_out_rmse)} on held-out data.",
+        ),
         ("Where it fails", _kinds(comparison)),
         (
             "What to do next",
-            f"fbse diagnose {inputs.scenario} {inputs.log}" if comparison.failures else "Nothing: there is nothing to explain.",
+            f"fbse diagnose {inputs.scenario} {inputs.log}"
+            if comparison.failures
+            else "Nothing: there is nothing to explain.",
         ),
     )
-    sections = [_summary(rows), _where(comparison, predictor), _hygiene(predictor, inputs), _reproduce("compare", predictor, inputs)]
-    write_report(path, Report(f"{inputs.name}: model against log", not comparison.failures, outcome, tuple(sections)))
+    sections = [
+        _summary(rows),
+        _where(comparison, predictor),
+        _hygiene(predictor, inputs),
+        _reproduce("compare", predictor, inputs),
+    ]
+    write_report(
+        path,
+        Report(
+            f"{inputs.name}: model against log", not comparison.failures, outcome, tuple(sections)
+        ),
+    )
 
 
-def write_diagnosis_report(path: str | Path, diagnosis: Diagnosis, comparison: Comparison, predictor: Predictor, inputs: Inputs) -> None:
+def write_diagnosis_report(
+    path: str | Path,
+    diagnosis: Diagnosis,
+    comparison: Comparison,
+    predictor: Predictor,
+    inputs: Inputs,
+) -> None:
     """Writes which effects a model lacks as one HTML file.
 
     Args:
         comparison: of the model as it is.
     """
-    outcome, statuses = inputs.hygiene.before(diagnosis_outcome(diagnosis)), _applicable(diagnosis.effects)
+    outcome, statuses = (
+        inputs.hygiene.before(diagnosis_outcome(diagnosis)),
+        _applicable(diagnosis.effects),
+    )
     rows = (
-        ("How sure", how_sure(diagnosis.chosen, diagnosis.held_out_before, diagnosis.held_out_after, diagnosis.train_after)),
+        (
+            "How sure",
+            how_sure(
+                diagnosis.chosen,
+                diagnosis.held_out_before,
+                diagnosis.held_out_after,
+                diagnosis.train_after,
+            ),
+        ),
         ("What else it could be", _what_else(diagnosis.chosen)),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", next_step(diagnosis, inputs)),
@@ -88,7 +130,10 @@ def write_diagnosis_report(path: str | Path, diagnosis: Diagnosis, comparison: C
         _reproduce("diagnose", predictor, inputs),
     ]
     passed = diagnosis.verdict in ("effect_found", "nothing_missing")
-    write_report(path, Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)))
+    write_report(
+        path,
+        Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)),
+    )
 
 
 def write_study_report(
@@ -109,7 +154,10 @@ def write_study_report(
     rows = (
         *_relative_fall(study),
         ("Why it stopped there", _sentence(study.stopped_because)),
-        ("How sure", how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse)),
+        (
+            "How sure",
+            how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse),
+        ),
         ("What else it could be", _what_else(study.found)),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", _after_study(study, inputs)),
@@ -118,14 +166,26 @@ def write_study_report(
     sections = [
         _summary(rows),
         _where(before[1], before[0]),
-        *_why([step.added for step in study.steps[1:]], study.diagnoses[0].ranking, study.diagnoses[-1].unexplained),
+        *_why(
+            [step.added for step in study.steps[1:]],
+            study.diagnoses[0].ranking,
+            study.diagnoses[-1].unexplained,
+        ),
         _what_was_looked_for(statuses),
         *([_fall(study, before, after, tests or {})] if study.found else []),
         _hygiene(before[0], inputs),
         _reproduce("study", before[0], inputs, completed),
     ]
     passed = study.diagnoses[-1].verdict in ("effect_found", "nothing_missing")
-    write_report(path, Report(f"{inputs.name}: the missing physics", passed, inputs.hygiene.before(study_outcome(study)), tuple(sections)))
+    write_report(
+        path,
+        Report(
+            f"{inputs.name}: the missing physics",
+            passed,
+            inputs.hygiene.before(study_outcome(study)),
+            tuple(sections),
+        ),
+    )
 
 
 def compare_outcome(comparison: Comparison) -> str:
@@ -143,7 +203,9 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     """The verdict in one or two sentences."""
     found = _listed(diagnosis.chosen)
     if diagnosis.verdict == "effect_found":
-        doubtful = dict.fromkeys(name for finding in diagnosis.chosen for name in finding.confusable_with)
+        doubtful = dict.fromkeys(
+            name for finding in diagnosis.chosen for name in finding.confusable_with
+        )
         return f"The model lacks {found}{f'; this log cannot tell that from {_either(doubtful)}' if doubtful else ''}."
     if diagnosis.verdict == "nothing_missing":
         return f"Nothing is missing: what the model leaves over is the sensors' noise ({number(diagnosis.held_out_before)} times it)."
@@ -156,7 +218,9 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
-    places = ", ".join(f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained)
+    places = ", ".join(
+        f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained
+    )
     return f"Something is missing that no effect of the library explains, in {places}."
 
 
@@ -166,7 +230,11 @@ def study_outcome(study: Study) -> str:
         return diagnosis_outcome(study.diagnoses[-1])
     first, last = study.steps[0], study.steps[-1]
     course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
-    rest = f" {_unexplained(study.diagnoses[-1])}" if study.diagnoses[-1].verdict == "unknown_effect" else ""
+    rest = (
+        f" {_unexplained(study.diagnoses[-1])}"
+        if study.diagnoses[-1].verdict == "unknown_effect"
+        else ""
+    )
     return (
         f"The model lacked {_listed(study.found)}. With it, the held-out error {course} from {number(first.held_out_rmse)} to "
         f"{number(last.held_out_rmse)} times the sensors' noise.{rest}"
@@ -192,8 +260,13 @@ def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
     """What to do, with the command."""
     steps = _experiments_next(diagnosis, diagnosis.chosen)
     if diagnosis.chosen:
-        steps.append(f"Add it to the model: fbse add {inputs.scenario} {inputs.out} --out {inputs.name}_completed.yaml")
-    return " ".join(steps) or "Nothing. A motion that loads and moves the joints more would show smaller effects."
+        steps.append(
+            f"Add it to the model: fbse add {inputs.scenario} {inputs.out} --out {inputs.name}_completed.yaml"
+        )
+    return (
+        " ".join(steps)
+        or "Nothing. A motion that loads and moves the joints more would show smaller effects."
+    )
 
 
 def _after_study(study: Study, inputs: Inputs) -> str:
@@ -201,7 +274,9 @@ def _after_study(study: Study, inputs: Inputs) -> str:
     if not study.found:
         return next_step(last, inputs)
     steps = _experiments_next(last, study.found)
-    steps.append(f"Try the completed model on a log that it has not seen: fbse compare {inputs.out}/completed.yaml ANOTHER_LOG")
+    steps.append(
+        f"Try the completed model on a log that it has not seen: fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
+    )
     return " ".join(steps)
 
 
@@ -211,11 +286,15 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[st
     doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
     steps = []
     if diagnosis.verdict == "unknown_effect":
-        steps.append("Look at the pictures of the channels that are left, and register an effect of your own that looks like them.")
+        steps.append(
+            "Look at the pictures of the channels that are left, and register an effect of your own that looks like them."
+        )
     if doubtful:
         steps.append(f"To tell them apart: {_experiments(doubtful)}")
     if diagnosis.verdict == "not_visible":
-        hidden = {name: status for name, status in statuses.items() if status.verdict == "not_visible"}
+        hidden = {
+            name: status for name, status in statuses.items() if status.verdict == "not_visible"
+        }
         steps.append(f"Record a motion that shows more: {_experiments(hidden)}")
     return steps
 
@@ -229,7 +308,9 @@ def parameter_text(name: str, estimate: Estimate) -> str:
 
 def parameters_text(finding: Finding) -> str:
     """All parameters with their 95 % intervals."""
-    return ", ".join(parameter_text(name, estimate) for name, estimate in finding.parameters.items())
+    return ", ".join(
+        parameter_text(name, estimate) for name, estimate in finding.parameters.items()
+    )
 
 
 def _times_noise(value: float) -> str:
@@ -258,7 +339,9 @@ _NAMES = ("Coulomb", "Stribeck", "IMU")
 
 def _effects_in(effects: Sequence[str], targets: Sequence[str]) -> str:
     names = _enumerated([_inside(effect) for effect in effects])
-    return names if list(targets) == ["robot"] else f"{names} in {targets_text(targets, effects[0])}"
+    return (
+        names if list(targets) == ["robot"] else f"{names} in {targets_text(targets, effects[0])}"
+    )
 
 
 def _inside(effect: str) -> str:
@@ -276,7 +359,9 @@ def _what_else(found: Sequence[Finding]) -> str:
     for finding in found:
         equal.setdefault(finding.confusable_with, []).append(finding)
     told = [
-        f"{_sentence(_either(names))[:-1]} explains this log as well as {_listed(findings)}." for names, findings in equal.items() if names
+        f"{_sentence(_either(names))[:-1]} explains this log as well as {_listed(findings)}."
+        for names, findings in equal.items()
+        if names
     ]
     if told:
         return " ".join(told)
@@ -304,8 +389,19 @@ _KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of t
 def _kinds(comparison: Comparison) -> str:
     """How many channels of each kind stand out from the noise."""
     failing = {failure.row.name for failure in comparison.failures}
-    counts = {kind: [c.row.name in failing for c in comparison.channels if c.row.kind == kind] for kind in _KINDS}
-    return "In " + ", ".join(f"{sum(fails)} of {len(fails)} {_KINDS[kind]}" for kind, fails in counts.items() if fails) + "."
+    counts = {
+        kind: [c.row.name in failing for c in comparison.channels if c.row.kind == kind]
+        for kind in _KINDS
+    }
+    return (
+        "In "
+        + ", ".join(
+            f"{sum(fails)} of {len(fails)} {_KINDS[kind]}"
+            for kind, fails in counts.items()
+            if fails
+        )
+        + "."
+    )
 
 
 def _applicable(statuses: Mapping[str, EffectStatus]) -> dict[str, EffectStatus]:
@@ -318,7 +414,14 @@ def _statuses(study: Study) -> dict[str, EffectStatus]:
     found = {finding.effect for finding in study.found}
     equal = {name for finding in study.found for name in finding.confusable_with}
     return {
-        name: replace(status, verdict="present" if name in found else "confusable" if name in equal else status.verdict)
+        name: replace(
+            status,
+            verdict="present"
+            if name in found
+            else "confusable"
+            if name in equal
+            else status.verdict,
+        )
         for name, status in _applicable(study.diagnoses[-1].effects).items()
     }
 
@@ -326,7 +429,11 @@ def _statuses(study: Study) -> dict[str, EffectStatus]:
 def _verdicts(statuses: Mapping[str, EffectStatus]) -> str:
     """How many effects of the library have each verdict."""
     verdicts = [status.verdict for status in statuses.values()]
-    counts = ", ".join(f"{verdicts.count(name)} {words(name)}" for name in figures.VERDICT_COLORS if name in verdicts)
+    counts = ", ".join(
+        f"{verdicts.count(name)} {words(name)}"
+        for name in figures.VERDICT_COLORS
+        if name in verdicts
+    )
     return f"{len(verdicts)} effects: {counts}. Absent means that it would have been seen."
 
 
@@ -338,7 +445,11 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
         drawn = figures.robot_errors(robot, comparison, motion.blocks.joint_position.mean(axis=0))
         blocks = [FigureBlock("Error over noise, by joint and by phase", _BY_PHASE, drawn)]
     else:
-        blocks = [FigureBlock("Error over noise, by joint", _RATIOS, figures.channel_errors(known))] if len(known) > 1 else []
+        blocks = (
+            [FigureBlock("Error over noise, by joint", _RATIOS, figures.channel_errors(known))]
+            if len(known) > 1
+            else []
+        )
     if worst := _worst(comparison):
         blocks += [
             FigureBlock(
@@ -354,12 +465,19 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
             ),
         ]
     text = _METHOD if comparison.failures else f"{_METHOD} No failure above the noise."
-    return Section("Where the model fails", text, (*_failure_tables(comparison), _channel_table(known)), tuple(blocks))
+    return Section(
+        "Where the model fails",
+        text,
+        (*_failure_tables(comparison), _channel_table(known)),
+        tuple(blocks),
+    )
 
 
 def _worst(comparison: Comparison) -> list[Channel]:
     by_name = {channel.row.name: channel for channel in comparison.channels}
-    return [by_name[name] for name in dict.fromkeys(failure.row.name for failure in comparison.failures)][:_CHANNELS]
+    return [
+        by_name[name] for name in dict.fromkeys(failure.row.name for failure in comparison.failures)
+    ][:_CHANNELS]
 
 
 _METHOD = (
@@ -373,29 +491,67 @@ _BY_PHASE = (
 )
 
 
-def _failure_tables(comparison: Comparison, caption: str = "What stands out from the noise, in words.") -> list[Table]:
+def _failure_tables(
+    comparison: Comparison, caption: str = "What stands out from the noise, in words."
+) -> list[Table]:
     """The worst failures, and the others folded away."""
     rows = tuple(
-        (f.text, f.where.error, "\u00a0to\u00a0".join(map(_short, f.where.interval)), f.where.noise_floor, f.row.unit)
+        (
+            f.text,
+            f.where.error,
+            "\u00a0to\u00a0".join(map(_short, f.where.interval)),
+            f.where.noise_floor,
+            f.row.unit,
+        )
         for f in comparison.failures
     )
     header = ("Failure, worst first", "Mean error", "95 % interval", "Noise in it", "Unit")
     tables = [Table(header, rows[:_FAILURES], caption)] if rows else []
     more = rows[_FAILURES:]
-    return [*tables, Table(header, more, f"{len(more)} more {'failures' if len(more) > 1 else 'failure'}", folded=True)] if more else tables
+    return (
+        [
+            *tables,
+            Table(
+                header,
+                more,
+                f"{len(more)} more {'failures' if len(more) > 1 else 'failure'}",
+                folded=True,
+            ),
+        ]
+        if more
+        else tables
+    )
 
 
 def _channel_table(channels: Sequence[Channel]) -> Table:
     rows = [
-        (words(c.row.name), c.rmse, c.noise_floor, c.row.unit, c.rmse / c.noise_floor, "" if np.isnan(c.nrmse) else 100 * c.nrmse)
+        (
+            words(c.row.name),
+            c.rmse,
+            c.noise_floor,
+            c.row.unit,
+            c.rmse / c.noise_floor,
+            "" if np.isnan(c.nrmse) else 100 * c.nrmse,
+        )
         for c in channels
     ]
-    header = ("Channel", "Error, RMS", "Noise, RMS", "Unit", "Error over noise", "Relative error [%]")
+    header = (
+        "Channel",
+        "Error, RMS",
+        "Noise, RMS",
+        "Unit",
+        "Error over noise",
+        "Relative error [%]",
+    )
     caption = "All channels. The relative error is that beside a model without any forces, which has 100 %."
     return Table(header, tuple(rows), caption, folded=True)
 
 
-def _why(rounds: Sequence[Sequence[Finding]], alternatives: Sequence[Finding], unexplained: Sequence[Structure]) -> list[Section]:
+def _why(
+    rounds: Sequence[Sequence[Finding]],
+    alternatives: Sequence[Finding],
+    unexplained: Sequence[Structure],
+) -> list[Section]:
     """What was found in each round, with its values and the alternatives, and what is left without an explanation."""
     chosen = [finding for found in rounds for finding in found]
     others = [finding for finding in alternatives if not finding.chosen][:_ALTERNATIVES]
@@ -404,14 +560,27 @@ def _why(rounds: Sequence[Sequence[Finding]], alternatives: Sequence[Finding], u
     if unexplained:
         rows = tuple((words(u.row), u.ratio, u.variable, 100 * u.share) for u in unexplained)
         header = ("Left over in", "Error over noise", "Follows most", "Which explains [%]")
-        tables.append(Table(header, rows, "What no effect of the library explains, and the variable that it follows."))
+        tables.append(
+            Table(
+                header,
+                rows,
+                "What no effect of the library explains, and the variable that it follows.",
+            )
+        )
     if chosen or others:
         caption = (
             "Error on held-out data of the channels that an effect moves, without it and with it, everything else being equal. "
             "The broken line is the sensors' noise. An alternative stands in the place of what was chosen."
         )
-        names = [f"{finding_name(f)}{when}" for f, when in zip(chosen + others, of_round + [""] * len(others), strict=True)]
-        blocks.append(FigureBlock("What explains the error", caption, figures.ranking([*chosen, *others], names)))
+        names = [
+            f"{finding_name(f)}{when}"
+            for f, when in zip(chosen + others, of_round + [""] * len(others), strict=True)
+        ]
+        blocks.append(
+            FigureBlock(
+                "What explains the error", caption, figures.ranking([*chosen, *others], names)
+            )
+        )
     valued = [
         (finding, f"{targets_text(finding.targets, finding.effect)}{when}")
         for finding, when in zip(chosen, of_round, strict=True)
@@ -420,7 +589,11 @@ def _why(rounds: Sequence[Sequence[Finding]], alternatives: Sequence[Finding], u
     if valued:
         caption = "With their 95 % intervals, which respect what is left of correlation in time."
         blocks.append(FigureBlock("Fitted values", caption, figures.parameters(valued)))
-    text = "" if chosen else "No effect of the library makes the error smaller on data that it was not fitted to."
+    text = (
+        ""
+        if chosen
+        else "No effect of the library makes the error smaller on data that it was not fitted to."
+    )
     return [Section("Why it fails", text, tuple(tables), tuple(blocks))] if tables or blocks else []
 
 
@@ -440,9 +613,21 @@ def _value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
             errors = (finding.held_out_before, finding.held_out_after)
             place = (targets_text(finding.targets, effect), *([str(number_of)] * several))
             rows.append((*place, *values, *errors, _either(finding.confusable_with) or "no other"))
-        units = [f"{words(name)} [{estimate.unit}]" for name, estimate in findings[0][1].parameters.items()]
-        header = ("In", *(["Round"] * several), *units, "Held-out error / noise before", "after", "Explains as much")
-        says = [f"{spaced(effect)}."] + ([known[effect].description, known[effect].signature] if effect in known else [])
+        units = [
+            f"{words(name)} [{estimate.unit}]"
+            for name, estimate in findings[0][1].parameters.items()
+        ]
+        header = (
+            "In",
+            *(["Round"] * several),
+            *units,
+            "Held-out error / noise before",
+            "after",
+            "Explains as much",
+        )
+        says = [f"{spaced(effect)}."] + (
+            [known[effect].description, known[effect].signature] if effect in known else []
+        )
         tables.append(Table(header, tuple(rows), f"{' '.join(says)} Values with 95 % intervals."))
     return tables
 
@@ -467,7 +652,13 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
         does = known[name].description if name in known else ""
         show = f"{status.experiment} ({status.command})" if status.command else status.experiment
         rows.append((spaced(name), words(status.verdict), reach, does, show))
-    header = ("Effect", "Verdict", "Smallest that would have been seen", "What it is", "What shows it")
+    header = (
+        "Effect",
+        "Verdict",
+        "Smallest that would have been seen",
+        "What it is",
+        "What shows it",
+    )
     block = FigureBlock(
         "What this log can show",
         "How small an effect could be and still be found, against what is plausible on a robot of this kind. What lies in the grey area is "
@@ -475,14 +666,23 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
         figures.detectability(statuses),
     )
     order = [words(verdict) for verdict in figures.VERDICT_COLORS]
-    table = Table(header, tuple(sorted(rows, key=lambda row: order.index(row[1]))), "All effects of the library, one by one", folded=True)
+    table = Table(
+        header,
+        tuple(sorted(rows, key=lambda row: order.index(row[1]))),
+        "All effects of the library, one by one",
+        folded=True,
+    )
     return Section("What else was looked for", _verdicts(statuses), (table,), (block,))
 
 
 def _reach(status: EffectStatus, effect: str) -> str:
     """Smallest sizes that the data would have shown, and where it would have shown none that is plausible."""
     known = library().get(effect)
-    largest = np.inf if known is None else max(abs(bound) for bound in known.parameters[status.parameter].plausible)
+    largest = (
+        np.inf
+        if known is None
+        else max(abs(bound) for bound in known.parameters[status.parameter].plausible)
+    )
     sizes = [size for size in status.smallest_detectable.values() if size <= largest]
     hidden = [target for target, size in status.smallest_detectable.items() if not size <= largest]
     low, high = (f"{bound:.2g}" for bound in (min(sizes, default=0), max(sizes, default=0)))
@@ -494,15 +694,28 @@ def _reach(status: EffectStatus, effect: str) -> str:
 _FALLING = "Root mean square of what the equation of motion leaves over, on stretches of the log that the values were not fitted to."
 
 
-def _fall(study: Study, before: tuple[Predictor, Comparison], after: tuple[Predictor, Comparison], tests: Mapping[str, Log]) -> Section:
+def _fall(
+    study: Study,
+    before: tuple[Predictor, Comparison],
+    after: tuple[Predictor, Comparison],
+    tests: Mapping[str, Log],
+) -> Section:
     """What the completed model brings: step by step, by channel, over time; and what it leaves."""
     robot, (first, last) = before[0].robot, (study.steps[index].rollout for index in (0, -1))
     rolled = first is not None and last is not None
     simulated = " Below: the model with everything added so far is simulated in the place of the robot; its joints against the log's."
     channels = zip(before[1].channels, after[1].channels, strict=True)
-    known = [(given, completed) for given, completed in channels if not np.isnan([given.rmse, completed.rmse]).any()]
+    known = [
+        (given, completed)
+        for given, completed in channels
+        if not np.isnan([given.rmse, completed.rmse]).any()
+    ]
     blocks = [
-        FigureBlock("The error, step by step", _FALLING + (simulated if rolled else ""), figures.falling_error(study.steps, _moves(robot)))
+        FigureBlock(
+            "The error, step by step",
+            _FALLING + (simulated if rolled else ""),
+            figures.falling_error(study.steps, _moves(robot)),
+        )
     ]
     if len(known) > 1:
         drawn = figures.channel_errors(*map(list, zip(*known, strict=True)))
@@ -511,17 +724,32 @@ def _fall(study: Study, before: tuple[Predictor, Comparison], after: tuple[Predi
     if rolled and len(first.sample_time) and len(last.sample_time):
         caption = "Simulated less recorded position of the joints that the model as given misses most, over the whole log."
         blocks.append(
-            FigureBlock("The simulated model, before and after", caption, figures.position_errors(first, last, robot.torque_units))
+            FigureBlock(
+                "The simulated model, before and after",
+                caption,
+                figures.position_errors(first, last, robot.torque_units),
+            )
         )
     if worst := _worst(after[1]):
         caption = "Mean error of the completed model in bins of what it may depend on."
-        blocks.append(FigureBlock("What is left, against what it may depend on", caption, figures.error_bins(worst)))
-    left = _failure_tables(after[1], "What the completed model leaves: what still stands out from the noise, in words.")
+        blocks.append(
+            FigureBlock(
+                "What is left, against what it may depend on", caption, figures.error_bins(worst)
+            )
+        )
+    left = _failure_tables(
+        after[1], "What the completed model leaves: what still stands out from the noise, in words."
+    )
     text = "" if left else "What the completed model leaves does not stand out from the noise."
     return Section(
         "How the error falls",
         text,
-        (_step_table(study.steps, robot), *_relative_errors(study), *_simulated_positions(study, robot), *left),
+        (
+            _step_table(study.steps, robot),
+            *_relative_errors(study),
+            *_simulated_positions(study, robot),
+            *left,
+        ),
         tuple(blocks),
     )
 
@@ -548,17 +776,38 @@ def _relative_errors(study: Study) -> list[Table]:
         return []
     joints = next(iter(first.values())).relative_by_joint
     rows = [
-        (words(joint), *(100 * errors[name].relative_by_joint[joint] for name in first for errors in (first, last))) for joint in joints
+        (
+            words(joint),
+            *(
+                100 * errors[name].relative_by_joint[joint]
+                for name in first
+                for errors in (first, last)
+            ),
+        )
+        for joint in joints
     ]
     if len(rows) > 1:
-        rows.append(("all joints", *(100 * errors[name].relative for name in first for errors in (first, last))))
+        rows.append(
+            (
+                "all joints",
+                *(100 * errors[name].relative for name in first for errors in (first, last)),
+            )
+        )
     header = ["Joint"]
     for name in first:
         header += [f"{_sentence(_log_name(name))[:-1]}: as given [%]", "completed [%]"]
-    return [Table(tuple(header), tuple(rows), "Relative errors |residual| / |measured torque|, 2-norms over each log.")]
+    return [
+        Table(
+            tuple(header),
+            tuple(rows),
+            "Relative errors |residual| / |measured torque|, 2-norms over each log.",
+        )
+    ]
 
 
-def _measured_torque(completed: Scenario, given: Predictor, tests: Mapping[str, Log]) -> list[FigureBlock]:
+def _measured_torque(
+    completed: Scenario, given: Predictor, tests: Mapping[str, Log]
+) -> list[FigureBlock]:
     """Measured and modelled torque of the worst joints where the model as given errs most, on a log that nothing was fitted to if any."""
     name, log = next(iter(tests.items()), ("train", given.motion.log))
     given, after = Predictor(given.scenario, log), Predictor(completed, log)
@@ -571,7 +820,9 @@ def _measured_torque(completed: Scenario, given: Predictor, tests: Mapping[str, 
         return []
     stretch = _worst_stretch(power[:, places].sum(axis=1))
     time = residual.time[stretch]
-    part = ", the part in which the model as given errs most" if len(time) < len(residual.time) else ""
+    part = (
+        ", the part in which the model as given errs most" if len(time) < len(residual.time) else ""
+    )
     caption = (
         f"What the motors gave, and what the model needs for the same motion; {number(float(time[-1] - time[0]), 2)} s of {_log_name(name)}"
         f"{part}. Right above each panel: |error| / |measured| there (2-norms)."
@@ -595,12 +846,28 @@ def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
     steps, taken = [], set()
     for explanation in diagnosis.path:
         members = {(candidate.name, candidate.targets) for candidate in explanation.candidates}
-        added = tuple(Finding(*member, np.nan, np.nan, {}, (), chosen=True) for member in sorted(members - taken))
-        shares = (sse.sum() / diagnosis.path[0].held_out_sse.sum() for sse in (explanation.held_out_sse, explanation.sse))
-        steps.append(StudyStep(added, *(diagnosis.held_out_before * float(np.sqrt(share)) for share in shares), rollout=None))
+        added = tuple(
+            Finding(*member, np.nan, np.nan, {}, (), chosen=True)
+            for member in sorted(members - taken)
+        )
+        shares = (
+            sse.sum() / diagnosis.path[0].held_out_sse.sum()
+            for sse in (explanation.held_out_sse, explanation.sse)
+        )
+        steps.append(
+            StudyStep(
+                added,
+                *(diagnosis.held_out_before * float(np.sqrt(share)) for share in shares),
+                rollout=None,
+            )
+        )
         taken = members
-    text = "Effects were added one after the other, each the one that leaves least on held-out data."
-    block = FigureBlock("The error as effects are added", _FALLING, figures.falling_error(steps, _moves(robot)))
+    text = (
+        "Effects were added one after the other, each the one that leaves least on held-out data."
+    )
+    block = FigureBlock(
+        "The error as effects are added", _FALLING, figures.falling_error(steps, _moves(robot))
+    )
     return [Section("How the error falls", text, (_step_table(steps, robot),), (block,))]
 
 
@@ -624,7 +891,16 @@ def _simulated_positions(study: Study, robot: Robot) -> list[Table]:
         )
         for joint, unit in zip(robot.joint_names, robot.torque_units, strict=True)
     ]
-    header = ("Joint", "Unit", "RMS, as given", "completed", "Mean |error|, as given", "completed", "Relative [%], as given", "completed")
+    header = (
+        "Joint",
+        "Unit",
+        "RMS, as given",
+        "completed",
+        "Mean |error|, as given",
+        "completed",
+        "Relative [%], as given",
+        "completed",
+    )
     caption = "The model simulated in the place of the robot: errors of its positions; the relative one is |error| / |position|, 2-norms."
     return [Table(header, tuple(rows), caption)]
 
@@ -632,7 +908,14 @@ def _simulated_positions(study: Study, robot: Robot) -> list[Table]:
 def _step_table(steps: Sequence[StudyStep], robot: Robot) -> Table:
     """Errors step by step, and those of the simulated model where it was simulated."""
     header = ["Added", "Held-out error / noise", "Fitted error / noise"]
-    rows = [[_sentence(_listed(s.added)) if s.added else "The model as given.", s.held_out_rmse, s.train_rmse] for s in steps]
+    rows = [
+        [
+            _sentence(_listed(s.added)) if s.added else "The model as given.",
+            s.held_out_rmse,
+            s.train_rmse,
+        ]
+        for s in steps
+    ]
     if any(step.rollout is not None for step in steps):
         header += [
             f"Simulated joints, RMS [{_moves(robot)}]",
@@ -643,8 +926,14 @@ def _step_table(steps: Sequence[StudyStep], robot: Robot) -> Table:
             if rolled is None:
                 row += [np.nan, np.nan, "none"]
             else:
-                row += [1e3 * rolled.mean_position, rolled.mean_torque_command, rolled.failure or "complete"]
-    return Table(tuple(header), tuple(map(tuple, rows)), "Errors as the model grows, over all channels.")
+                row += [
+                    1e3 * rolled.mean_position,
+                    rolled.mean_torque_command,
+                    rolled.failure or "complete",
+                ]
+    return Table(
+        tuple(header), tuple(map(tuple, rows)), "Errors as the model grows, over all channels."
+    )
 
 
 def _hygiene(predictor: Predictor, inputs: Inputs) -> Section:
@@ -657,31 +946,63 @@ def _hygiene(predictor: Predictor, inputs: Inputs) -> Section:
     rows = [
         ("Log", inputs.log),
         ("Length", length),
-        ("Samples that are missing", f"{number(100 * float(1 - motion.measured.mean()), 2)} %; nothing is said about the gaps"),
+        (
+            "Samples that are missing",
+            f"{number(100 * float(1 - motion.measured.mean()), 2)} %; nothing is said about the gaps",
+        ),
         ("Joints", ", ".join(map(words, robot.joint_names))),
-        ("Joint velocities", recording.velocity if "joint/velocity" in motion.log else "differenced from the angles"),
+        (
+            "Joint velocities",
+            recording.velocity if "joint/velocity" in motion.log else "differenced from the angles",
+        ),
         ("Low-pass without delay", f"{recording.cutoff:g} Hz" if recording.cutoff > 0 else "none"),
         ("Sensor noise that is believed", _noise_text(predictor)),
-        ("Averages over", f"{number(1e3 * motion.length * motion.period)} ms; {len(motion.time)} of them"),
+        (
+            "Averages over",
+            f"{number(1e3 * motion.length * motion.period)} ms; {len(motion.time)} of them",
+        ),
     ]
     if robot.has_floating_base:
-        share = {side: 100 * float(standing[:, k].mean()) for k, side in enumerate(robot.description.sides)}
-        rows.append(("Share of time that a foot stands", ", ".join(f"{side} {number(value, 2)} %" for side, value in share.items())))
-    found = tuple((finding.severity, _sentence(finding.text)) for finding in inputs.hygiene.findings)
-    noise = tuple((words(level.channel), level.level, level.believed, level.unit) for level in inputs.hygiene.noise)
+        share = {
+            side: 100 * float(standing[:, k].mean())
+            for k, side in enumerate(robot.description.sides)
+        }
+        rows.append(
+            (
+                "Share of time that a foot stands",
+                ", ".join(f"{side} {number(value, 2)} %" for side, value in share.items()),
+            )
+        )
+    found = tuple(
+        (finding.severity, _sentence(finding.text)) for finding in inputs.hygiene.findings
+    )
+    noise = tuple(
+        (words(level.channel), level.level, level.believed, level.unit)
+        for level in inputs.hygiene.noise
+    )
     tables = [
         Table(("", ""), tuple(rows)),
         *([Table(("Severity", "What is remarkable"), found)] if found else []),
-        *([Table(("Channel", "White noise of a sample", "Believed", "Unit"), noise)] if noise else []),
+        *(
+            [Table(("Channel", "White noise of a sample", "Believed", "Unit"), noise)]
+            if noise
+            else []
+        ),
     ]
-    text = "What was measured, and how it was read." + ("" if found else " Nothing about it is remarkable.")
+    text = "What was measured, and how it was read." + (
+        "" if found else " Nothing about it is remarkable."
+    )
     return Section("Data hygiene", text, tables=tuple(tables))
 
 
-def _reproduce(command: str, predictor: Predictor, inputs: Inputs, completed: str | None = None) -> Section:
+def _reproduce(
+    command: str, predictor: Predictor, inputs: Inputs, completed: str | None = None
+) -> Section:
     """The command that makes this report again, and what it ran on."""
     log = Path(inputs.log)
-    packages = ", ".join(f"{name} {version(name)}" for name in ("fbse_drake", "drake", "numpy", "scipy"))
+    packages = ", ".join(
+        f"{name} {version(name)}" for name in ("fbse_drake", "drake", "numpy", "scipy")
+    )
     rows = [("Software", f"Python {python_version()}, {packages}")]
     if log.is_file():
         rows.append(("SHA-256 of the log", sha256(log.read_bytes()).hexdigest()))
@@ -693,7 +1014,9 @@ def _reproduce(command: str, predictor: Predictor, inputs: Inputs, completed: st
     believed = dump_scenario(predictor.scenario, inputs.name)
     details = [
         Details("Command", " ".join(again), folded=False),
-        Details("The scenario as it was believed: sensors, and the model with its effects", believed),
+        Details(
+            "The scenario as it was believed: sensors, and the model with its effects", believed
+        ),
     ]
     if completed is not None:
         details.append(Details("The scenario with the completed model", completed))
@@ -705,8 +1028,14 @@ def _noise_text(predictor: Predictor) -> str:
     imu, rotary = sensors.imu, "Nm" in robot.torque_units
     parts = [f"joint velocity {joint_velocity_noise(sensors):.2g} {'rad/s' if rotary else 'm/s'}"]
     if robot.has_floating_base:
-        parts += [f"accelerometer {imu.acceleration_noise:g} m/s²", f"gyroscope {imu.angular_velocity_noise:g} rad/s"]
+        parts += [
+            f"accelerometer {imu.acceleration_noise:g} m/s²",
+            f"gyroscope {imu.angular_velocity_noise:g} rad/s",
+        ]
         parts += [f"foot forces {sensors.foot_force.noise:g} N"]
     unit = "Nm" if rotary else "N"
-    parts += [f"torque of {words(joint)} {value:g} {unit}" for joint, value in predictor.scenario.recording.torque_noise.items()]
+    parts += [
+        f"torque of {words(joint)} {value:g} {unit}"
+        for joint, value in predictor.scenario.recording.torque_noise.items()
+    ]
     return ", ".join(parts)

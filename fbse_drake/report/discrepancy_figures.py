@@ -23,13 +23,23 @@ from fbse_drake.discrepancy.residual import Residual, Row
 from fbse_drake.discrepancy.rollout import RolloutError
 from fbse_drake.discrepancy.study import StudyStep
 from fbse_drake.effects.effect import library
-from fbse_drake.report.figures import ESTIMATE, PLANNED, SIDE_COLORS, TRUTH, WIDTH, add_legend, decorate
+from fbse_drake.report.figures import (
+    ESTIMATE,
+    PLANNED,
+    SIDE_COLORS,
+    TRUTH,
+    WIDTH,
+    add_legend,
+    decorate,
+)
 from fbse_drake.report.html import number
 from fbse_drake.robot.plant import Robot
 
 # Ratios of error to noise: white is noise alone, the darkest red is this many times it and more.
 _DARKEST = 30.0
-_RATIO_COLORS = LinearSegmentedColormap.from_list("ratio", ["#f3f5f7", "#fbe3c8", "#f4a562", "#d65f1a", "#8f1313"])
+_RATIO_COLORS = LinearSegmentedColormap.from_list(
+    "ratio", ["#f3f5f7", "#fbe3c8", "#f4a562", "#d65f1a", "#8f1313"]
+)
 _RATIO_NORM = LogNorm(1.0, _DARKEST, clip=True)
 _NOISE = "#8a9199"
 # A model before something was added to it.
@@ -42,7 +52,12 @@ _MOST_JOINTS = 6
 _GAP = 3.0
 # Intervals are drawn up to this many times the largest value.
 _WIDEST = 4.0
-VERDICT_COLORS = {"present": TRUTH, "confusable": "#e39b16", "absent": ESTIMATE, "not_visible": "#a9b0b7"}
+VERDICT_COLORS = {
+    "present": TRUTH,
+    "confusable": "#e39b16",
+    "absent": ESTIMATE,
+    "not_visible": "#a9b0b7",
+}
 
 
 def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> Figure:
@@ -54,14 +69,27 @@ def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> F
     joints = [channel for channel in comparison.channels if channel.row.kind == "joint"]
     others = [channel for channel in comparison.channels if channel.row.kind != "joint"]
     # Of a log without torques nothing is known of the joints.
-    groups = [known for group in (joints, others) if (known := [channel for channel in group if not np.isnan(channel.rmse)])]
+    groups = [
+        known
+        for group in (joints, others)
+        if (known := [channel for channel in group if not np.isnan(channel.rmse)])
+    ]
     rows = max(len(group) for group in groups)
     figure = Figure(figsize=(WIDTH, max(4.5, 1.4 + 0.24 * rows)), layout="constrained")
-    body, *maps = figure.subplots(1, 1 + len(groups), width_ratios=[1.7, 1, 1] if len(groups) == 2 else [1.2, 1])
-    _draw_robot(body, robot, {channel.row.name: _ratio(channel.rmse, channel.noise_floor) for channel in joints}, posture)
+    body, *maps = figure.subplots(
+        1, 1 + len(groups), width_ratios=[1.7, 1, 1] if len(groups) == 2 else [1.2, 1]
+    )
+    _draw_robot(
+        body,
+        robot,
+        {channel.row.name: _ratio(channel.rmse, channel.noise_floor) for channel in joints},
+        posture,
+    )
     for axes, channels in zip(maps, groups, strict=True):
         _draw_phases(axes, channels)
-    bar = figure.colorbar(ScalarMappable(_RATIO_NORM, _RATIO_COLORS), ax=maps[-1], fraction=0.06, extend="max")
+    bar = figure.colorbar(
+        ScalarMappable(_RATIO_NORM, _RATIO_COLORS), ax=maps[-1], fraction=0.06, extend="max"
+    )
     bar.set_label("error over noise, root mean squares [1]", fontsize=9)
     bar.set_ticks([1, 2, 5, 10, 30], labels=["1", "2", "5", "10", "30"], fontsize=9)
     bar.ax.minorticks_off()
@@ -90,7 +118,14 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
         places = [seen(plant.GetJointByName(joint).frame_on_child()) for joint in leg.joints]
         line = np.array([base, *places, seen(plant.GetFrameByName(leg.sole))])
         axes.plot(*line.T, color=PLANNED, linewidth=5, solid_capstyle="round", alpha=0.35, zorder=1)
-        axes.plot([line[-1, 0] - 0.05, line[-1, 0] + 0.05], [line[-1, 1]] * 2, color=PLANNED, linewidth=6, alpha=0.5, zorder=1)
+        axes.plot(
+            [line[-1, 0] - 0.05, line[-1, 0] + 0.05],
+            [line[-1, 1]] * 2,
+            color=PLANNED,
+            linewidth=6,
+            alpha=0.5,
+            zorder=1,
+        )
         outwards = -1.0 if places[0][0] < base[0] else 1.0
         # Joints with one centre stand side by side, the first one outermost.
         shared: list[list[int]] = []
@@ -103,14 +138,55 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
             for order, k in enumerate(reversed(group)):
                 spot = places[k] + [outwards * 2.1 * size * order, 0.0]
                 ratio = ratios[leg.joints[k]]
-                axes.plot(*spot, "o", markersize=22, color=_RATIO_COLORS(_RATIO_NORM(ratio)), markeredgecolor=PLANNED, zorder=2)
-                axes.text(*spot, number(ratio, 2), ha="center", va="center", fontsize=7, color=_ink(ratio), zorder=3)
+                axes.plot(
+                    *spot,
+                    "o",
+                    markersize=22,
+                    color=_RATIO_COLORS(_RATIO_NORM(ratio)),
+                    markeredgecolor=PLANNED,
+                    zorder=2,
+                )
+                axes.text(
+                    *spot,
+                    number(ratio, 2),
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    color=_ink(ratio),
+                    zorder=3,
+                )
                 label = robot.description.leg_joints[k].replace("_", "\n")
                 plain = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}
-                axes.text(*(spot - [0, 0.05]), label, ha="center", va="top", fontsize=6.5, color=PLANNED, bbox=plain, zorder=3)
+                axes.text(
+                    *(spot - [0, 0.05]),
+                    label,
+                    ha="center",
+                    va="top",
+                    fontsize=6.5,
+                    color=PLANNED,
+                    bbox=plain,
+                    zorder=3,
+                )
     corner = base - [0.11, 0.0]
-    axes.add_patch(FancyBboxPatch(corner, 0.22, 0.3, boxstyle="round,pad=0.02", facecolor="#e6e9ec", edgecolor=PLANNED, zorder=0))
-    axes.text(*(base + [0, 0.15]), robot.description.base.replace("_", " "), ha="center", va="center", fontsize=8, color=PLANNED)
+    axes.add_patch(
+        FancyBboxPatch(
+            corner,
+            0.22,
+            0.3,
+            boxstyle="round,pad=0.02",
+            facecolor="#e6e9ec",
+            edgecolor=PLANNED,
+            zorder=0,
+        )
+    )
+    axes.text(
+        *(base + [0, 0.15]),
+        robot.description.base.replace("_", " "),
+        ha="center",
+        va="center",
+        fontsize=8,
+        color=PLANNED,
+    )
     axes.set_aspect("equal")
     axes.margins(0.09, 0.04)
     axes.set_axis_off()
@@ -124,14 +200,30 @@ def _ink(ratio: float) -> str:
 
 def _draw_phases(axes: Axes, channels: Sequence[Channel]) -> None:
     """Ratio of error to noise by channel and phase."""
-    phases = list(dict.fromkeys(phase for c in channels for phase, (error, _) in c.by_phase.items() if not np.isnan(error)))
-    ratios = np.array([[_ratio(*channel.by_phase.get(phase, (np.nan, np.nan))) for phase in phases] for channel in channels])
+    phases = list(
+        dict.fromkeys(
+            phase
+            for c in channels
+            for phase, (error, _) in c.by_phase.items()
+            if not np.isnan(error)
+        )
+    )
+    ratios = np.array(
+        [
+            [_ratio(*channel.by_phase.get(phase, (np.nan, np.nan))) for phase in phases]
+            for channel in channels
+        ]
+    )
     axes.imshow(ratios, cmap=_RATIO_COLORS, norm=_RATIO_NORM, aspect="auto")
     for (row, column), ratio in np.ndenumerate(ratios):
         text = "-" if np.isnan(ratio) else number(float(ratio), 2)
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=_ink(ratio))
-    axes.set_xticks(range(len(phases)), [words(phase).replace(" ", "\n") for phase in phases], fontsize=8)
-    axes.set_yticks(range(len(channels)), [words(channel.row.name) for channel in channels], fontsize=8)
+    axes.set_xticks(
+        range(len(phases)), [words(phase).replace(" ", "\n") for phase in phases], fontsize=8
+    )
+    axes.set_yticks(
+        range(len(channels)), [words(channel.row.name) for channel in channels], fontsize=8
+    )
     axes.tick_params(length=0)
     axes.xaxis.tick_top()
     axes.spines[:].set_visible(False)
@@ -141,9 +233,17 @@ def channel_errors(before: Sequence[Channel], after: Sequence[Channel] = ()) -> 
     """Error over noise of every channel that is known; with `after`, of the same channels, also what is left of it."""
     figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(before)), layout="constrained")
     axes = figure.subplots()
-    ratios = [[_ratio(channel.rmse, channel.noise_floor) for channel in channels] for channels in (before, after or before)]
+    ratios = [
+        [_ratio(channel.rmse, channel.noise_floor) for channel in channels]
+        for channels in (before, after or before)
+    ]
     label = "the model as given"
-    _draw_falls(axes, [words(channel.row.name) for channel in before], *ratios, (label, "the completed model" if after else label))
+    _draw_falls(
+        axes,
+        [words(channel.row.name) for channel in before],
+        *ratios,
+        (label, "the completed model" if after else label),
+    )
     axes.set_xlabel("error over the sensors' noise, root mean squares [1]")
     add_legend(figure)
     return figure
@@ -166,7 +266,9 @@ def _draw_falls(
     places = range(len(names))
     labels_after = [labels[1]] * len(names) if isinstance(labels[1], str) else labels[1]
     colors = [colors] * len(names) if isinstance(colors, str) else colors
-    for place, first, last, label, color in zip(places, before, after, labels_after, colors, strict=True):
+    for place, first, last, label, color in zip(
+        places, before, after, labels_after, colors, strict=True
+    ):
         text = number(last)
         if first != last:
             axes.hlines(place, *sorted((first, last)), color=color, linewidth=1.5, alpha=0.4)
@@ -218,7 +320,10 @@ def _label(variable: str, row: Row) -> str:
 
 def error_bins(channels: Sequence[Channel]) -> Figure:
     """Mean error of channels against each variable, with its 95 % interval and the noise of the mean; a row for each channel."""
-    columns = [[name for name in channel.bins if name != "none" and channel.bins[name]] for channel in channels]
+    columns = [
+        [name for name in channel.bins if name != "none" and channel.bins[name]]
+        for channel in channels
+    ]
     width = max(map(len, columns))
     figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * len(channels)), layout="constrained")
     grid = figure.subplots(len(channels), width, sharey="row", squeeze=False)
@@ -229,7 +334,10 @@ def error_bins(channels: Sequence[Channel]) -> Figure:
             decorate(axes)
             _draw_bins(axes, channel.bins[name])
             axes.set_xlabel(_label(name, channel.row), fontsize=9)
-        panels[0].set_ylabel(f"{words(channel.row.name).replace(' ', chr(10), 1)}\nerror [{channel.row.unit}]", fontsize=9)
+        panels[0].set_ylabel(
+            f"{words(channel.row.name).replace(' ', chr(10), 1)}\nerror [{channel.row.unit}]",
+            fontsize=9,
+        )
     add_legend(figure)
     return figure
 
@@ -239,12 +347,26 @@ def _draw_bins(axes: Axes, bins: Sequence[Bin]) -> None:
     low, high = np.array([b.interval for b in bins]).T
     noise = 2 * np.array([b.noise_floor for b in bins])
     axes.axhline(0, color=PLANNED, linewidth=0.8)
-    axes.fill_between(centre, -noise, noise, color=_NOISE, alpha=0.45, linewidth=0, label="± 2 standard deviations of the noise")
-    axes.fill_between(centre, low, high, color=TRUTH, alpha=0.18, linewidth=0, label="95 % interval")
-    axes.plot(centre, error, color=TRUTH, marker="o", markersize=3.5, linewidth=1.2, label="mean error")
+    axes.fill_between(
+        centre,
+        -noise,
+        noise,
+        color=_NOISE,
+        alpha=0.45,
+        linewidth=0,
+        label="± 2 standard deviations of the noise",
+    )
+    axes.fill_between(
+        centre, low, high, color=TRUTH, alpha=0.18, linewidth=0, label="95 % interval"
+    )
+    axes.plot(
+        centre, error, color=TRUTH, marker="o", markersize=3.5, linewidth=1.2, label="mean error"
+    )
 
 
-def errors_over_time(residual: Residual, sides: Sequence[str], channels: Sequence[Channel]) -> Figure:
+def errors_over_time(
+    residual: Residual, sides: Sequence[str], channels: Sequence[Channel]
+) -> Figure:
     """Residual of channels over time, with the noise of the sensors; single supports are shaded."""
     figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(channels)), layout="constrained")
     grid = figure.subplots(len(channels), 1, sharex=True, squeeze=False)
@@ -255,17 +377,29 @@ def errors_over_time(residual: Residual, sides: Sequence[str], channels: Sequenc
         known = residual.known[:, row]
         value = np.where(known, residual.value[:, row], np.nan)
         noise = 2 * np.where(known, np.sqrt(residual.variance[:, row]), np.nan)
-        axes.fill_between(residual.time, -noise, noise, color=_NOISE, alpha=0.45, linewidth=0, label="± 2 standard deviations of the noise")
+        axes.fill_between(
+            residual.time,
+            -noise,
+            noise,
+            color=_NOISE,
+            alpha=0.45,
+            linewidth=0,
+            label="± 2 standard deviations of the noise",
+        )
         axes.plot(residual.time, value, color=TRUTH, linewidth=0.9, label="error")
         _shade_supports(axes, residual, sides)
-        axes.set_ylabel(f"{words(channel.row.name).replace(' ', chr(10), 1)}\n[{channel.row.unit}]", fontsize=9)
+        axes.set_ylabel(
+            f"{words(channel.row.name).replace(' ', chr(10), 1)}\n[{channel.row.unit}]", fontsize=9
+        )
     grid[-1, 0].set_xlabel("time [s]")
     figure.align_ylabels()
     add_legend(figure)
     return figure
 
 
-def torques_over_time(before: Residual, after: Residual, joints: Sequence[int], stretch: slice) -> Figure:
+def torques_over_time(
+    before: Residual, after: Residual, joints: Sequence[int], stretch: slice
+) -> Figure:
     """Torque of joints as measured and by the model before and after something was added to it; below each the two models' errors.
 
     Args:
@@ -276,7 +410,9 @@ def torques_over_time(before: Residual, after: Residual, joints: Sequence[int], 
     columns = min(2, len(joints))
     rows = -(-len(joints) // columns)
     figure = Figure(figsize=(WIDTH, 0.7 + 2.7 * rows), layout="constrained")
-    grid = figure.subplots(2 * rows, columns, sharex=True, squeeze=False, height_ratios=[1.5, 1.0] * rows)
+    grid = figure.subplots(
+        2 * rows, columns, sharex=True, squeeze=False, height_ratios=[1.5, 1.0] * rows
+    )
     for axes in grid[-2:, len(joints) - columns * (rows - 1) :].flat:
         axes.set_axis_off()
     time = before.time[stretch]
@@ -285,21 +421,43 @@ def torques_over_time(before: Residual, after: Residual, joints: Sequence[int], 
         row, known = before.rows[joint], before.known[stretch, joint]
         measured, left, rest, noise = (
             np.where(known, values[stretch, joint], np.nan)
-            for values in (before.signals.torque_command, before.value, after.value, 2 * np.sqrt(before.variance))
+            for values in (
+                before.signals.torque_command,
+                before.value,
+                after.value,
+                2 * np.sqrt(before.variance),
+            )
         )
         for axes in (torques, errors):
             decorate(axes)
             axes.margins(x=0)
         torques.plot(time, measured, color="#15181b", linewidth=1.8, alpha=0.35, label="measured")
-        torques.plot(time, measured - left, color=_BEFORE, linewidth=0.9, label="the model as given")
-        torques.plot(time, measured - rest, color=ESTIMATE, linewidth=0.9, label="the completed model")
-        errors.fill_between(time, -noise, noise, color=_NOISE, alpha=0.45, linewidth=0, label="± 2 standard deviations of the noise")
+        torques.plot(
+            time, measured - left, color=_BEFORE, linewidth=0.9, label="the model as given"
+        )
+        torques.plot(
+            time, measured - rest, color=ESTIMATE, linewidth=0.9, label="the completed model"
+        )
+        errors.fill_between(
+            time,
+            -noise,
+            noise,
+            color=_NOISE,
+            alpha=0.45,
+            linewidth=0,
+            label="± 2 standard deviations of the noise",
+        )
         errors.plot(time, left, color=_BEFORE, linewidth=0.9)
         errors.plot(time, rest, color=ESTIMATE, linewidth=0.9)
         size = np.linalg.norm(measured[known])
-        shares = [number(100 * float(np.linalg.norm(values[known]) / size), 2) if size > 0 else "n/a" for values in (left, rest)]
+        shares = [
+            number(100 * float(np.linalg.norm(values[known]) / size), 2) if size > 0 else "n/a"
+            for values in (left, rest)
+        ]
         torques.set_title(words(row.name), loc="left", fontsize=10)
-        torques.set_title(f"relative error {shares[0]} % → {shares[1]} %", loc="right", fontsize=9, color=PLANNED)
+        torques.set_title(
+            f"relative error {shares[0]} % → {shares[1]} %", loc="right", fontsize=9, color=PLANNED
+        )
         torques.set_ylabel(f"{'torque' if row.unit == 'Nm' else 'force'} [{row.unit}]", fontsize=9)
         errors.set_ylabel(f"error [{row.unit}]", fontsize=9)
     for axes in grid[-1]:
@@ -324,12 +482,17 @@ def position_errors(before: RolloutError, after: RolloutError, units: Sequence[s
     for joint, axes in zip(worst, grid.flat, strict=False):
         decorate(axes)
         axes.margins(x=0)
-        for error, color, label in ((before, _BEFORE, "the model as given"), (after, ESTIMATE, "the completed model")):
+        for error, color, label in (
+            (before, _BEFORE, "the model as given"),
+            (after, ESTIMATE, "the completed model"),
+        ):
             time = error.sample_time
             # Recordings that were joined, or gaps: nothing is drawn between them.
             apart = 1 + np.flatnonzero(np.diff(time) > _GAP * np.median(np.diff(time)))
             values = np.insert(1e3 * error.position_error[:, joint], apart, np.nan)
-            axes.plot(np.insert(time, apart, np.nan), values, color=color, linewidth=0.9, label=label)
+            axes.plot(
+                np.insert(time, apart, np.nan), values, color=color, linewidth=0.9, label=label
+            )
         axes.axhline(0, color=PLANNED, linewidth=0.8)
         axes.set_title(words(list(before.position)[joint]), loc="left", fontsize=10)
         axes.set_ylabel(f"error [{'mrad' if units[joint] == 'Nm' else 'mm'}]", fontsize=9)
@@ -347,7 +510,9 @@ def _shade_supports(axes: Axes, residual: Residual, sides: Sequence[str]) -> Non
         for start, end in np.flatnonzero(np.diff(alone)).reshape(-1, 2):
             first, last = residual.time[start], residual.time[end - 1]
             color = SIDE_COLORS[foot % len(SIDE_COLORS)]
-            axes.axvspan(first, last, facecolor=color, alpha=0.12, linewidth=0, label=f"{side} leg supports")
+            axes.axvspan(
+                first, last, facecolor=color, alpha=0.12, linewidth=0, label=f"{side} leg supports"
+            )
 
 
 def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
@@ -358,11 +523,27 @@ def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
     """
     figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(findings)), layout="constrained")
     axes = figure.subplots()
-    errors = [[getattr(finding, name) for finding in findings] for name in ("held_out_before", "held_out_after")]
-    labels = ["with the effect: part of the explanation" if f.chosen else "with the effect: an alternative" for f in findings]
+    errors = [
+        [getattr(finding, name) for finding in findings]
+        for name in ("held_out_before", "held_out_after")
+    ]
+    labels = [
+        "with the effect: part of the explanation"
+        if f.chosen
+        else "with the effect: an alternative"
+        for f in findings
+    ]
     colors = [ESTIMATE if finding.chosen else VERDICT_COLORS["confusable"] for finding in findings]
-    _draw_falls(axes, names or [finding_name(finding) for finding in findings], *errors, ("without the effect", labels), colors)
-    axes.set_xlabel("held-out error of the channels that the effect moves, in multiples of the sensors' noise [1]")
+    _draw_falls(
+        axes,
+        names or [finding_name(finding) for finding in findings],
+        *errors,
+        ("without the effect", labels),
+        colors,
+    )
+    axes.set_xlabel(
+        "held-out error of the channels that the effect moves, in multiples of the sensors' noise [1]"
+    )
     add_legend(figure)
     return figure
 
@@ -396,7 +577,9 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
     decorate(axes)
     sizes = {}
     for name in names:
-        plausible = max(abs(bound) for bound in known[name].parameters[statuses[name].parameter].plausible)
+        plausible = max(
+            abs(bound) for bound in known[name].parameters[statuses[name].parameter].plausible
+        )
         sizes[name] = np.array(list(statuses[name].smallest_detectable.values())) / plausible
     highest = 30.0
     for place, name in enumerate(names):
@@ -404,16 +587,34 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
         status = statuses[name]
         color = VERDICT_COLORS[status.verdict]
         if len(shown):
-            axes.plot([shown.min(), shown.max()], [place, place], color=color, linewidth=1.2, alpha=0.5)
+            axes.plot(
+                [shown.min(), shown.max()], [place, place], color=color, linewidth=1.2, alpha=0.5
+            )
         axes.plot(
-            shown, np.full(len(shown), place), "o", color=color, markersize=5.5, alpha=0.8, markeredgewidth=0, label=words(status.verdict)
+            shown,
+            np.full(len(shown), place),
+            "o",
+            color=color,
+            markersize=5.5,
+            alpha=0.8,
+            markeredgewidth=0,
+            label=words(status.verdict),
         )
-    axes.axvspan(1.0, 1.3 * highest, facecolor=_NOISE, alpha=0.2, linewidth=0, label="larger than plausible: could not be seen")
+    axes.axvspan(
+        1.0,
+        1.3 * highest,
+        facecolor=_NOISE,
+        alpha=0.2,
+        linewidth=0,
+        label="larger than plausible: could not be seen",
+    )
     axes.set_yticks(range(len(names)), [spaced(name) for name in names], fontsize=9)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xscale("log")
     axes.set_xlim(right=1.3 * highest)
-    axes.set_xlabel("smallest detectable size over largest plausible size; a dot for each joint, foot or body [1]")
+    axes.set_xlabel(
+        "smallest detectable size over largest plausible size; a dot for each joint, foot or body [1]"
+    )
     add_legend(figure)
     return figure
 
@@ -432,7 +633,9 @@ def parameters(findings: Sequence[tuple[Finding, str]]) -> Figure:
         by_name.setdefault(finding.effect, []).append((finding, place))
     for effect, found in by_name.items():
         names = list(found[0][0].parameters)
-        rows += [(effect, names[start : start + _PANELS]) for start in range(0, len(names), _PANELS)]
+        rows += [
+            (effect, names[start : start + _PANELS]) for start in range(0, len(names), _PANELS)
+        ]
     heights = [0.85 + 0.23 * len(by_name[effect]) for effect, _ in rows]
     figure = Figure(figsize=(WIDTH, 0.4 + sum(heights)), layout="constrained")
     columns = max(len(names) for _, names in rows)
@@ -454,13 +657,32 @@ def parameters(findings: Sequence[tuple[Finding, str]]) -> Figure:
 def _draw_estimates(axes: Axes, estimates: Sequence[Estimate]) -> None:
     decorate(axes)
     places = np.arange(len(estimates))
-    value, (low, high) = np.array([e.value for e in estimates]), np.array([e.interval for e in estimates]).T
+    value, (low, high) = (
+        np.array([e.value for e in estimates]),
+        np.array([e.interval for e in estimates]).T,
+    )
     limit = _WIDEST * np.abs(value).max() or np.abs([low, high]).max()
-    axes.hlines(places, low.clip(-limit, limit), high.clip(-limit, limit), color=ESTIMATE, linewidth=3, alpha=0.5, label="95 % interval")
+    axes.hlines(
+        places,
+        low.clip(-limit, limit),
+        high.clip(-limit, limit),
+        color=ESTIMATE,
+        linewidth=3,
+        alpha=0.5,
+        label="95 % interval",
+    )
     axes.plot(value, places, "o", color=ESTIMATE, markersize=5, label="value")
     for cut, edge, marker in ((low < -limit, -limit, "<"), (high > limit, limit, ">")):
         if cut.any():
-            axes.plot(np.full(cut.sum(), edge), places[cut], marker, color=ESTIMATE, markersize=6, alpha=0.7, label="interval goes on")
+            axes.plot(
+                np.full(cut.sum(), edge),
+                places[cut],
+                marker,
+                color=ESTIMATE,
+                markersize=6,
+                alpha=0.7,
+                label="interval goes on",
+            )
     axes.axvline(0, color=PLANNED, linewidth=0.8)
     axes.locator_params(axis="x", nbins=5)
 
@@ -477,12 +699,29 @@ def falling_error(steps: Sequence[StudyStep], unit: str) -> Figure:
     places = np.arange(len(steps))
     labels = ["as given", *("+ " + "\n+ ".join(_added(step.added)) for step in steps[1:])]
     axes = panels[0]
-    held_out, train = ([getattr(step, name) for step in steps] for name in ("held_out_rmse", "train_rmse"))
+    held_out, train = (
+        [getattr(step, name) for step in steps] for name in ("held_out_rmse", "train_rmse")
+    )
     decorate(axes)
     axes.plot(places, held_out, "o-", color=TRUTH, linewidth=2, label="held-out data")
-    axes.plot(places, train, "o--", color=ESTIMATE, linewidth=1.2, markersize=4, label="data that it was fitted to")
+    axes.plot(
+        places,
+        train,
+        "o--",
+        color=ESTIMATE,
+        linewidth=1.2,
+        markersize=4,
+        label="data that it was fitted to",
+    )
     for place, value in zip(places, held_out, strict=True):
-        axes.annotate(number(value, 3), (place, value), (0, 8), textcoords="offset points", ha="center", fontsize=9)
+        axes.annotate(
+            number(value, 3),
+            (place, value),
+            (0, 8),
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+        )
     axes.axhline(1.0, color=PLANNED, linestyle="--", linewidth=1.0, label="sensors' noise")
     axes.set_yscale("log")
     axes.set_ylim(0.8 * min(1.0, *held_out), 1.6 * max(held_out))
@@ -490,10 +729,26 @@ def falling_error(steps: Sequence[StudyStep], unit: str) -> Figure:
     axes.set_ylabel("error of the residual\nover noise [1]")
     if rolled:
         decorate(panels[1])
-        values = [np.nan if step.rollout is None else 1e3 * step.rollout.mean_position for step in steps]
-        panels[1].plot(places, values, "o-", color="#7a4fa3", linewidth=2, label="simulated model, joint positions")
+        values = [
+            np.nan if step.rollout is None else 1e3 * step.rollout.mean_position for step in steps
+        ]
+        panels[1].plot(
+            places,
+            values,
+            "o-",
+            color="#7a4fa3",
+            linewidth=2,
+            label="simulated model, joint positions",
+        )
         for place, value in zip(places, values, strict=True):
-            panels[1].annotate(number(value, 3), (place, value), (0, 8), textcoords="offset points", ha="center", fontsize=9)
+            panels[1].annotate(
+                number(value, 3),
+                (place, value),
+                (0, 8),
+                textcoords="offset points",
+                ha="center",
+                fontsize=9,
+            )
         panels[1].set_ylim(0, 1.25 * max(1e-6, np.nanmax(values)))
         panels[1].set_ylabel(f"error of simulated\njoints, RMS [{unit}]")
     panels[-1].set_xticks(places, labels, fontsize=8)
@@ -505,8 +760,15 @@ def falling_error(steps: Sequence[StudyStep], unit: str) -> Figure:
 
 def _added(findings: Sequence[Finding]) -> list[str]:
     """Effects and where they are, wrapped to fit below a tick; of many the first ones."""
-    named = [f"{spaced(effect)}\n({textwrap.fill(targets_text(targets, effect), 22)})" for effect, targets in by_effect(findings).items()]
-    return named if len(named) <= _MOST_NAMED else [*named[: _MOST_NAMED - 1], f"{len(named) - _MOST_NAMED + 1} others"]
+    named = [
+        f"{spaced(effect)}\n({textwrap.fill(targets_text(targets, effect), 22)})"
+        for effect, targets in by_effect(findings).items()
+    ]
+    return (
+        named
+        if len(named) <= _MOST_NAMED
+        else [*named[: _MOST_NAMED - 1], f"{len(named) - _MOST_NAMED + 1} others"]
+    )
 
 
 def by_effect(findings: Sequence[Finding]) -> dict[str, list[str]]:

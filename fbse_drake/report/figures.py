@@ -59,7 +59,12 @@ _PART_COLORS = (ESTIMATE, "#d65f1a", _COM, "#8a8f14", "#7b3fa0", "#5c5c5c", "#b8
 # Estimate and truth mostly agree: a broad pale line shows beside a thin one on top of it.
 _BROAD = {"linewidth": 1.9, "alpha": 0.55}
 _THIN = {"color": TRUTH, "linestyle": (0, (4, 1.5)), "linewidth": 0.8}
-_STATUS_COLORS = {Status.OK: "#cfe3d6", Status.NOT_FINITE: "#c81e1e", Status.STUCK: "#e39b16", Status.LOST: "#7a4fa3"}
+_STATUS_COLORS = {
+    Status.OK: "#cfe3d6",
+    Status.NOT_FINITE: "#c81e1e",
+    Status.STUCK: "#e39b16",
+    Status.LOST: "#7a4fa3",
+}
 
 WIDTH = 10.0
 # Points drawn of one line, about two per pixel of a wide panel.
@@ -89,27 +94,38 @@ def support_phases(log: Log) -> list[Phase]:
     starts = np.flatnonzero(np.concatenate([[True], (support[1:] != support[:-1]).any(axis=1)]))
     ends = [*log.time[starts[1:]], log.time[-1]]
     return [
-        Phase(float(log.time[row]), float(end), tuple(side for side, stands in zip(log.sides, support[row], strict=True) if stands))
+        Phase(
+            float(log.time[row]),
+            float(end),
+            tuple(side for side, stands in zip(log.sides, support[row], strict=True) if stands),
+        )
         for row, end in zip(starts, ends, strict=True)
     ]
 
 
 def run_figures(
-    log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pads: Mapping[str, np.ndarray] | None = None
+    log: Log,
+    *,
+    outlines: Mapping[str, np.ndarray] | None = None,
+    pads: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, list[FigureBlock]]:
     """The figures that this log has the channels for, in order, by topic: walk, joints, forces, friction, base, consistency, sensors.
 
     Args:
         outlines, pads: see `footprints`.
     """
-    planned_feet = has_feet(log, "reference/foot/{}/support") and has_feet(log, "reference/foot/{}/position")
+    planned_feet = has_feet(log, "reference/foot/{}/support") and has_feet(
+        log, "reference/foot/{}/position"
+    )
     loaded_feet = _feels_feet(log) and not _hangs(log)
     friction_known = "truth/joint/friction_torque" in log
     friction_estimated = "estimate/joint/friction_torque" in log
     com_known = "reference/com/position" in log and "truth/com/position" in log
     com_estimated = "estimate/com/position" in log
     innovations = normalised_innovations(log)
-    supports = ", ".join(f"{Phase(0, 0, (side,)).label} support by the {side} leg alone" for side in log.sides)
+    supports = ", ".join(
+        f"{Phase(0, 0, (side,)).label} support by the {side} leg alone" for side in log.sides
+    )
     catalogue: list[tuple[str, str, str, bool, Callable[[], Figure]]] = [
         (
             "walk",
@@ -123,7 +139,11 @@ def run_figures(
             "walk",
             "Centre of mass",
             "Desired and true CoM, and their root square error (RSE)."
-            + (" Where the CoM is estimated: the estimate, and its own error." if com_estimated else ""),
+            + (
+                " Where the CoM is estimated: the estimate, and its own error."
+                if com_estimated
+                else ""
+            ),
             com_known or com_estimated,
             lambda: com(log),
         ),
@@ -196,7 +216,8 @@ def run_figures(
             "The same torque against joint velocity: a step at zero is dry friction, a slope viscous friction, "
             "and a spread at one velocity means that friction depends on more than velocity"
             + (" (or that the estimate is noisy)." if friction_estimated else "."),
-            (friction_known or friction_estimated) and ("truth/joint/velocity" in log or "joint/velocity" in log),
+            (friction_known or friction_estimated)
+            and ("truth/joint/velocity" in log or "joint/velocity" in log),
             lambda: friction_over_velocity(log),
         ),
         (
@@ -219,7 +240,8 @@ def run_figures(
         (
             "base",
             "Base velocity",
-            "Velocity of the base in the world" + (", and the estimate's error." if "truth/base/velocity" in log else "."),
+            "Velocity of the base in the world"
+            + (", and the estimate's error." if "truth/base/velocity" in log else "."),
             "estimate/base/velocity" in log,
             lambda: base_velocity(log),
         ),
@@ -238,7 +260,9 @@ def run_figures(
             "95 % of white innovations; those that last, as of a trunk that accelerates, leave it. Feet are far below: what they do in "
             "spite of all lasts, and the filter takes it for white noise that leaves as much over many ticks.",
             bool(innovations.keys() - {"friction"})
-            and any(_has_updates(parts) for name, parts in innovations.items() if name != "friction"),
+            and any(
+                _has_updates(parts) for name, parts in innovations.items() if name != "friction"
+            ),
             lambda: filter_consistency(log),
         ),
         (
@@ -274,7 +298,12 @@ def run_figures(
     return topics
 
 
-def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pads: Mapping[str, np.ndarray] | None = None) -> Figure:
+def footprints(
+    log: Log,
+    *,
+    outlines: Mapping[str, np.ndarray] | None = None,
+    pads: Mapping[str, np.ndarray] | None = None,
+) -> Figure:
     """Footholds, ZMP and CoM seen from above; the soles are taken to be parallel to the world's axes.
 
     Args:
@@ -289,20 +318,46 @@ def footprints(log: Log, *, outlines: Mapping[str, np.ndarray] | None = None, pa
             color = _side_color(log, side) if source == "truth" else PLANNED
             for place in _footholds(log, side, f"{source}/foot/{side}/position"):
                 if outlines is None:
-                    axes.plot(*place, "x" if source == "truth" else "+", color=color, markersize=10, label=label.format(side))
+                    axes.plot(
+                        *place,
+                        "x" if source == "truth" else "+",
+                        color=color,
+                        markersize=10,
+                        label=label.format(side),
+                    )
                 else:
-                    patch = Polygon(place + outlines[side], edgecolor=color, label=label.format(side))
-                    patch.set(**({"facecolor": f"{color}38"} if source == "truth" else {"fill": False, "linestyle": "--"}))
+                    patch = Polygon(
+                        place + outlines[side], edgecolor=color, label=label.format(side)
+                    )
+                    patch.set(
+                        **(
+                            {"facecolor": f"{color}38"}
+                            if source == "truth"
+                            else {"fill": False, "linestyle": "--"}
+                        )
+                    )
                     axes.add_patch(patch)
     if pads is not None and _feels_feet(log) and has_feet(log, "truth/foot/{}/position"):
-        axes.plot(*_measured_zmp(log, pads)[_stride(log)].T, color=_ZMP, linewidth=0.7, alpha=0.7, label="measured ZMP")
+        axes.plot(
+            *_measured_zmp(log, pads)[_stride(log)].T,
+            color=_ZMP,
+            linewidth=0.7,
+            alpha=0.7,
+            label="measured ZMP",
+        )
     for channel, color, line, width, label in (
         ("reference/zmp", _ZMP, "--", 1.4, "planned ZMP"),
         ("truth/com/position", _COM, "-", 2.0, "true CoM"),
         ("reference/com/position", _TRUE, "--", 1.0, "planned CoM"),
     ):
         if channel in log:
-            axes.plot(*log[channel][_stride(log), :2].T, color=color, linestyle=line, linewidth=width, label=label)
+            axes.plot(
+                *log[channel][_stride(log), :2].T,
+                color=color,
+                linestyle=line,
+                linewidth=width,
+                label=label,
+            )
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x, forward [m]")
     axes.set_ylabel("y, to the left [m]")
@@ -317,7 +372,13 @@ def com(log: Log) -> Figure:
     if known and "reference/com/position" in log:
         errors.append(("RSE", _COM, com_rse(log)))
     if known and estimated:
-        errors.append(("RSE of estimate", ESTIMATE, np.abs(log["estimate/com/position"] - log["truth/com/position"])[:, :2]))
+        errors.append(
+            (
+                "RSE of estimate",
+                ESTIMATE,
+                np.abs(log["estimate/com/position"] - log["truth/com/position"])[:, :2],
+            )
+        )
     figure, grid = _time_grid(log, 2, 1 + len(errors), height=5.6)
     for letter, axes in zip("abcdef", grid.flat, strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=10)
@@ -347,7 +408,14 @@ def feet(log: Log) -> Figure:
         # Thinner lines on thicker ones: where the feet agree, both can be seen.
         for side, width in zip(log.sides, np.linspace(3, 2, len(log.sides)), strict=True):
             values = log[f"truth/foot/{side}/position"][:, column]
-            _plot(axes, log, values, color=_side_color(log, side), linewidth=width, label=f"{side} foot")
+            _plot(
+                axes,
+                log,
+                values,
+                color=_side_color(log, side),
+                linewidth=width,
+                label=f"{side} foot",
+            )
         for side in log.sides if has_feet(log, "reference/foot/{}/position") else ():
             values = log[f"reference/foot/{side}/position"][:, column]
             _plot(axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="planned")
@@ -387,10 +455,17 @@ def torques(log: Log) -> Figure:
     """Commanded and, where planned, feed-forward torque, a panel for each joint."""
     figure, panels = _joint_grid(log, "torque [Nm]")
     for joint, axes in panels.items():
-        _plot(axes, log, log["joint/torque_command"][:, joint], **_joint_style(log, joint, "commanded"))
+        _plot(
+            axes,
+            log,
+            log["joint/torque_command"][:, joint],
+            **_joint_style(log, joint, "commanded"),
+        )
         if "reference/joint/feedforward_torque" in log:
             values = log["reference/joint/feedforward_torque"][:, joint]
-            _plot(axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="feed-forward")
+            _plot(
+                axes, log, values, color=_TRUE, linewidth=0.9, linestyle="--", label="feed-forward"
+            )
     add_legend(figure)
     return figure
 
@@ -404,7 +479,14 @@ def foot_forces(log: Log) -> Figure:
     weight = total.mean()
     _plot(vertical, log, total, color=_TRUE, linewidth=0.8, alpha=0.6, label="all feet")
     for side, width in zip(log.sides, np.linspace(1.8, 1, len(log.sides)), strict=True):
-        _plot(vertical, log, force[side][:, 2], color=_side_color(log, side), linewidth=width, label=f"{side} foot")
+        _plot(
+            vertical,
+            log,
+            force[side][:, 2],
+            color=_side_color(log, side),
+            linewidth=width,
+            label=f"{side} foot",
+        )
         loaded = force[side][:, 2] > _LOADED_SHARE * weight
         used = np.full(len(total), np.nan)
         used[loaded] = np.linalg.norm(force[side][loaded, :2], axis=1) / force[side][loaded, 2]
@@ -415,17 +497,41 @@ def foot_forces(log: Log) -> Figure:
     ratio.set_ylim(0, max(0.1, ratio.get_ylim()[1]))
     for side, axes in zip(log.sides, pad_axes, strict=True):
         if f"foot/{side}/pad_force" not in log:
-            pressure = np.where(force[side][:, 2:] > _LOADED_SHARE * weight, _centre_of_pressure(log, side), np.nan)
-            for values, name, shade in zip(pressure.T, ("ahead", "to the left"), (1, 0.5), strict=True):
-                _plot(axes, log, 1e3 * values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=name)
+            pressure = np.where(
+                force[side][:, 2:] > _LOADED_SHARE * weight, _centre_of_pressure(log, side), np.nan
+            )
+            for values, name, shade in zip(
+                pressure.T, ("ahead", "to the left"), (1, 0.5), strict=True
+            ):
+                _plot(
+                    axes,
+                    log,
+                    1e3 * values,
+                    color=_side_color(log, side),
+                    alpha=shade,
+                    linewidth=1.0,
+                    label=name,
+                )
             axes.set_ylabel(f"{side} pressure, centre [mm]")
             continue
         pads = log[f"foot/{side}/pad_force"][:, :, 2].T
-        for pad, (values, shade) in enumerate(zip(pads, np.linspace(1, 0.3, len(pads)), strict=True), start=1):
-            _plot(axes, log, values, color=_side_color(log, side), alpha=shade, linewidth=1.0, label=f"pad {pad}")
+        for pad, (values, shade) in enumerate(
+            zip(pads, np.linspace(1, 0.3, len(pads)), strict=True), start=1
+        ):
+            _plot(
+                axes,
+                log,
+                values,
+                color=_side_color(log, side),
+                alpha=shade,
+                linewidth=1.0,
+                label=f"pad {pad}",
+            )
         axes.set_ylabel(f"{side} pads, vertical [N]")
     for axes in (vertical, *pad_axes):
-        axes.legend(handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+        axes.legend(
+            handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
+        )
     _name_phases(vertical, log)
     return figure
 
@@ -455,14 +561,28 @@ def estimated_friction(log: Log) -> Figure:
     A band is twice the estimate's standard deviation.
     """
     figure, panels = _joint_grid(log, "friction torque [Nm]", own_swing=True)
-    estimate, deviation = log["estimate/joint/friction_torque"], log.get("estimate/joint/friction_torque_std")
-    truth = ended_step(log["truth/joint/friction_torque"]) if "truth/joint/friction_torque" in log else None
+    estimate, deviation = (
+        log["estimate/joint/friction_torque"],
+        log.get("estimate/joint/friction_torque_std"),
+    )
+    truth = (
+        ended_step(log["truth/joint/friction_torque"])
+        if "truth/joint/friction_torque" in log
+        else None
+    )
     for joint, axes in panels.items():
         _plot(axes, log, estimate[:, joint], **_joint_style(log, joint, "estimated"), **_BROAD)
         if deviation is not None:
             thin = _stride(log)
             edges = (estimate[thin, joint] + sign * deviation[thin, joint] for sign in (-2, 2))
-            axes.fill_between(log.time[thin], *edges, color=_joint_color(log, joint), alpha=0.2, linewidth=0, label="± 2 std")
+            axes.fill_between(
+                log.time[thin],
+                *edges,
+                color=_joint_color(log, joint),
+                alpha=0.2,
+                linewidth=0,
+                label="± 2 std",
+            )
         if truth is not None:
             _plot(axes, log, truth[:, joint], **_THIN, label="true friction")
     _limit(log, panels, estimate, whole=truth, span=_FRICTION_SPAN)
@@ -474,14 +594,32 @@ def friction_errors(log: Log) -> Figure:
     """Estimated minus true friction torque with its root mean square, a panel for each joint."""
     figure, panels = _joint_grid(log, "estimated minus true friction [Nm]", own_swing=True)
     error = friction_error(log)
-    rms = np.sqrt(np.mean(error[settled(log)] ** 2, axis=0)) if settled(log).any() else np.full(len(log.joints), np.nan)
+    rms = (
+        np.sqrt(np.mean(error[settled(log)] ** 2, axis=0))
+        if settled(log).any()
+        else np.full(len(log.joints), np.nan)
+    )
     for joint, axes in panels.items():
         _plot(axes, log, error[:, joint], color=_joint_color(log, joint), linewidth=0.9)
         if np.isfinite(rms[joint]):
-            axes.axhspan(-rms[joint], rms[joint], facecolor=TRUTH, alpha=0.15, linewidth=0, zorder=3, label="± RMS")
+            axes.axhspan(
+                -rms[joint],
+                rms[joint],
+                facecolor=TRUTH,
+                alpha=0.15,
+                linewidth=0,
+                zorder=3,
+                label="± RMS",
+            )
             for edge in (-rms[joint], rms[joint]):
                 axes.axhline(edge, color=TRUTH, linewidth=0.9, linestyle="--", zorder=4)
-            axes.set_title(f"RMS {number(float(rms[joint]), 2)} Nm", loc="right", fontsize=9, pad=3, color=PLANNED)
+            axes.set_title(
+                f"RMS {number(float(rms[joint]), 2)} Nm",
+                loc="right",
+                fontsize=9,
+                pad=3,
+                color=PLANNED,
+            )
     _limit(log, panels, error, span=_FRICTION_SPAN)
     add_legend(figure)
     return figure
@@ -510,17 +648,39 @@ def friction_over_velocity(log: Log) -> Figure:
         axes.set_title(role.replace("_", " "), loc="left", fontsize=10)
         shown = estimate if estimate is not None else truth
         # Smaller dots on larger ones: where the sides agree, both can be seen.
-        for (side, joint), size in zip(joints.items(), np.linspace(4.5, 2, max(2, len(joints))), strict=False):
+        for (side, joint), size in zip(
+            joints.items(), np.linspace(4.5, 2, max(2, len(joints))), strict=False
+        ):
             label = f"{'estimated, ' if estimate is not None else ''}{side} leg" if side else None
-            _dots(axes, velocity[_stride(log), joint], shown[_stride(log), joint], _joint_color(log, joint), size, label)
+            _dots(
+                axes,
+                velocity[_stride(log), joint],
+                shown[_stride(log), joint],
+                _joint_color(log, joint),
+                size,
+                label,
+            )
         if estimate is not None and truth is not None:
             for joint in joints.values():
-                _dots(axes, velocity[_stride(log), joint], truth[_stride(log), joint], TRUTH, 1.8, "true friction")
+                _dots(
+                    axes,
+                    velocity[_stride(log), joint],
+                    truth[_stride(log), joint],
+                    TRUTH,
+                    1.8,
+                    "true friction",
+                )
         axes.set_xlim(_at_least(axes.get_xlim(), _VELOCITY_SPAN))
         if estimate is None:
             axes.set_ylim(_at_least(axes.get_ylim(), _FRICTION_SPAN))
         else:
-            _limit(log, dict.fromkeys(joints.values(), axes), estimate, whole=truth, span=_FRICTION_SPAN)
+            _limit(
+                log,
+                dict.fromkeys(joints.values(), axes),
+                estimate,
+                whole=truth,
+                span=_FRICTION_SPAN,
+            )
     figure.supxlabel("joint velocity [rad/s]", fontsize=10)
     figure.supylabel("friction torque [Nm]", fontsize=10)
     add_legend(figure, marker_size=9)
@@ -531,7 +691,15 @@ def friction_parameters(log: Log) -> Figure:
     """Identified parameters of the friction model, a column for each parameter and a row for the joints that the sides have in common."""
     values = log["estimate/friction/parameters"]
     config = _friction_config(log)
-    linear = {} if config is None else {name: parameter for name, parameter in config.model.parameters.items() if parameter.linear}
+    linear = (
+        {}
+        if config is None
+        else {
+            name: parameter
+            for name, parameter in config.model.parameters.items()
+            if parameter.linear
+        }
+    )
     titles = [f"{name} [{parameter.unit}]" for name, parameter in linear.items()]
     if len(titles) != values.shape[2]:
         titles = [f"parameter {place}" for place in range(1, values.shape[2] + 1)]
@@ -540,7 +708,9 @@ def friction_parameters(log: Log) -> Figure:
     if isinstance(config, ModelAided) and "estimate/friction/parameter_variance" in log:
         deviation = np.sqrt(np.maximum(0.0, log["estimate/friction/parameter_variance"]))
     rows = _joint_rows(log)
-    figure, grid = _time_grid(log, len(rows), len(titles), height=0.8 + 1.55 * len(rows), phases=False)
+    figure, grid = _time_grid(
+        log, len(rows), len(titles), height=0.8 + 1.55 * len(rows), phases=False
+    )
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, loc="left", fontsize=10)
     for (role, joints), row in zip(rows.items(), grid, strict=True):
@@ -570,32 +740,63 @@ def friction_parameters(log: Log) -> Figure:
 def base_attitude(log: Log) -> Figure:
     """Roll and pitch of the base, estimated and true, and the error."""
     channels = ("estimate/base/orientation", "truth/base/orientation")
-    estimate, truth = (roll_and_pitch_deg(log[channel]) if channel in log else None for channel in channels)
+    estimate, truth = (
+        roll_and_pitch_deg(log[channel]) if channel in log else None for channel in channels
+    )
     error = attitude_error_deg(log) if truth is not None else None
-    return _estimate_and_error(log, ("roll", "pitch"), ("deg", "deg"), (estimate, truth, error), (_ANGLE_SPAN, _ANGLE_ERROR_SPAN))
+    return _estimate_and_error(
+        log,
+        ("roll", "pitch"),
+        ("deg", "deg"),
+        (estimate, truth, error),
+        (_ANGLE_SPAN, _ANGLE_ERROR_SPAN),
+    )
 
 
 def base_velocity(log: Log) -> Figure:
     """Velocity of the base in the world, estimated and true, and the error."""
     error = 1e3 * base_velocity_error(log) if "truth/base/velocity" in log else None
     curves = (log["estimate/base/velocity"], log.get("truth/base/velocity"), error)
-    return _estimate_and_error(log, "xyz", ("m/s", "mm/s"), curves, (_BASE_VELOCITY_SPAN, _BASE_VELOCITY_ERROR_SPAN))
+    return _estimate_and_error(
+        log, "xyz", ("m/s", "mm/s"), curves, (_BASE_VELOCITY_SPAN, _BASE_VELOCITY_ERROR_SPAN)
+    )
 
 
 def support(log: Log) -> Figure:
     """Planned and estimated stance and measured load of each foot."""
-    figure, grid = _time_grid(log, len(log.sides), 1, height=1.0 + 1.9 * len(log.sides), phases=False)
+    figure, grid = _time_grid(
+        log, len(log.sides), 1, height=1.0 + 1.9 * len(log.sides), phases=False
+    )
     forces = {side: _force(log, side)[:, 2] for side in log.sides} if _feels_feet(log) else {}
     weight = np.mean(sum(forces.values())) if forces else 0.0
     strips = [("estimated stance", log["estimate/support"].T > 0, 1.0)]
     if has_feet(log, "reference/foot/{}/support"):
-        strips.insert(0, ("planned stance", [log[f"reference/foot/{side}/support"] > 0 for side in log.sides], 0.45))
+        strips.insert(
+            0,
+            (
+                "planned stance",
+                [log[f"reference/foot/{side}/support"] > 0 for side in log.sides],
+                0.45,
+            ),
+        )
     for foot, (side, axes) in enumerate(zip(log.sides, grid.flat, strict=True)):
         for place, (label, stands, strength) in enumerate(strips, start=1):
-            style = {"facecolor": _side_color(log, side), "alpha": strength, "linewidth": 0, "label": label}
+            style = {
+                "facecolor": _side_color(log, side),
+                "alpha": strength,
+                "linewidth": 0,
+                "label": label,
+            }
             axes.broken_barh(_stretches(log, stands[foot]), (-0.22 * place, 0.16), **style)
         if weight > 0:
-            _plot(axes, log, forces[side] / weight, color=_TRUE, linewidth=0.8, label="load / mean load of all feet")
+            _plot(
+                axes,
+                log,
+                forces[side] / weight,
+                color=_TRUE,
+                linewidth=0.8,
+                label="load / mean load of all feet",
+            )
         axes.set_ylabel(f"{side} foot [1]")
         axes.set_ylim(-0.22 * len(strips) - 0.06, 1.4)
         axes.set_yticks([0, 0.5, 1])
@@ -606,14 +807,24 @@ def support(log: Log) -> Figure:
 
 def filter_consistency(log: Log) -> Figure:
     """NIS of the filters but those of the friction, a panel for each filter."""
-    filters = {name: parts for name, parts in normalised_innovations(log).items() if name != "friction" and _has_updates(parts)}
+    filters = {
+        name: parts
+        for name, parts in normalised_innovations(log).items()
+        if name != "friction" and _has_updates(parts)
+    }
     figure, grid = _time_grid(log, len(filters), 1, height=0.8 + 2.0 * len(filters))
     for (name, parts), axes in zip(filters.items(), grid.flat, strict=True):
         curves = {part: squares for part, squares in parts.items() if np.isfinite(squares).any()}
         _plot_nis(axes, log, curves, dict(zip(curves, itertools.cycle(_PART_COLORS), strict=False)))
         axes.set_title(name.replace("_", " "), loc="left", fontsize=10)
         axes.set_ylabel("NIS [1]")
-        axes.legend(handles=axes.get_lines(), loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=9)
+        axes.legend(
+            handles=axes.get_lines(),
+            loc="center left",
+            bbox_to_anchor=(1, 0.5),
+            frameon=False,
+            fontsize=9,
+        )
     add_legend(figure, without={part for parts in filters.values() for part in parts})
     return figure
 
@@ -640,19 +851,35 @@ def statuses(log: Log) -> Figure:
     seen = sorted({int(value) for values in rows.values() for value in np.unique(values)})
     for place, values in enumerate(rows.values()):
         for status in seen:
-            axes.broken_barh(_stretches(log, values == status), (place - 0.36, 0.72), facecolor=_STATUS_COLORS[Status(status)], linewidth=0)
+            axes.broken_barh(
+                _stretches(log, values == status),
+                (place - 0.36, 0.72),
+                facecolor=_STATUS_COLORS[Status(status)],
+                linewidth=0,
+            )
     axes.set_yticks(range(len(rows)), list(rows))
     axes.invert_yaxis()
     axes.set_xlabel("time [s]")
-    handles = [Patch(facecolor=_STATUS_COLORS[Status(status)], label=Status(status).name.lower().replace("_", " ")) for status in seen]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(seen), frameon=False, fontsize=10)
+    handles = [
+        Patch(
+            facecolor=_STATUS_COLORS[Status(status)],
+            label=Status(status).name.lower().replace("_", " "),
+        )
+        for status in seen
+    ]
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=len(seen), frameon=False, fontsize=10
+    )
     return figure
 
 
 def imu(log: Log) -> Figure:
     """Measured specific force and angular velocity in the IMU frame."""
     figure, grid = _time_grid(log, 3, 2, height=6.2)
-    columns = (("imu/linear_acceleration", "specific force", "m/s²"), ("imu/angular_velocity", "angular velocity", "rad/s"))
+    columns = (
+        ("imu/linear_acceleration", "specific force", "m/s²"),
+        ("imu/angular_velocity", "angular velocity", "rad/s"),
+    )
     for (channel, title, unit), column in zip(columns, grid.T, strict=True):
         column[0].set_title(title, loc="left", fontsize=10)
         for axes, values, name in zip(column, log[channel].T, "xyz", strict=True):
@@ -664,7 +891,9 @@ def imu(log: Log) -> Figure:
 
 def _hangs(log: Log) -> bool:
     """Whether no foot ever touches the ground; known only from truth."""
-    return has_feet(log, "truth/foot/{}/pad_force") and not any(log[f"truth/foot/{side}/pad_force"].any() for side in log.sides)
+    return has_feet(log, "truth/foot/{}/pad_force") and not any(
+        log[f"truth/foot/{side}/pad_force"].any() for side in log.sides
+    )
 
 
 def _source(channel: str) -> str:
@@ -682,14 +911,19 @@ def _joint_color(log: Log, joint: int) -> str:
 
 def _joint_style(log: Log, joint: int, label: str) -> dict[str, str]:
     side = joint_sides(log)[joint]
-    return {"color": _joint_color(log, joint), "label": label if side is None else f"{label}, {side}"}
+    return {
+        "color": _joint_color(log, joint),
+        "label": label if side is None else f"{label}, {side}",
+    }
 
 
 def _joint_rows(log: Log) -> dict[str, dict[str, int]]:
     """Columns of the joints in the log by what they are called without their side, and by side."""
     rows: dict[str, dict[str, int]] = {}
     for column, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
-        rows.setdefault(name if side is None else name.removeprefix(f"{side}_"), {})[side or ""] = column
+        rows.setdefault(name if side is None else name.removeprefix(f"{side}_"), {})[side or ""] = (
+            column
+        )
     return rows
 
 
@@ -718,10 +952,21 @@ def _statuses(log: Log) -> dict[str, np.ndarray]:
     if "estimate/sensors/status" in log:
         values = log["estimate/sensors/status"].T
         names = ["joints", "IMU", *(f"{side} foot" for side in log.sides)]
-        found |= dict(zip(names if len(names) == len(values) else map(str, range(1, len(values) + 1)), values, strict=True))
+        found |= dict(
+            zip(
+                names if len(names) == len(values) else map(str, range(1, len(values) + 1)),
+                values,
+                strict=True,
+            )
+        )
     suffix = "/status"
-    estimators = [name for name in log if name.endswith(suffix) and name != "estimate/sensors/status"]
-    return found | {name.removeprefix("estimate/").removesuffix(suffix).replace("_", " "): log[name] for name in estimators}
+    estimators = [
+        name for name in log if name.endswith(suffix) and name != "estimate/sensors/status"
+    ]
+    return found | {
+        name.removeprefix("estimate/").removesuffix(suffix).replace("_", " "): log[name]
+        for name in estimators
+    }
 
 
 def _has_updates(parts: Mapping[str, np.ndarray]) -> bool:
@@ -730,7 +975,9 @@ def _has_updates(parts: Mapping[str, np.ndarray]) -> bool:
 
 def _stretches(log: Log, holds: np.ndarray) -> list[tuple[float, float]]:
     """Start and length [s] of the stretches of time in which something holds, (N,) bool."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(
+        -1, 2
+    )
     ends = np.append(log.time, log.time[-1])
     return [(float(log.time[start]), float(ends[end] - log.time[start])) for start, end in edges]
 
@@ -758,7 +1005,9 @@ def _measured_zmp(log: Log, pads: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _feels_feet(log: Log) -> bool:
     """Whether the forces on all feet were measured, by pads or by six-axis sensors."""
-    return bool(log.sides) and all(f"foot/{side}/pad_force" in log or f"foot/{side}/wrench" in log for side in log.sides)
+    return bool(log.sides) and all(
+        f"foot/{side}/pad_force" in log or f"foot/{side}/wrench" in log for side in log.sides
+    )
 
 
 def _force(log: Log, side: str) -> np.ndarray:
@@ -784,16 +1033,23 @@ def _plot(axes: Axes, log: Log, values: np.ndarray, **style: Any) -> None:
     if stretch > 2:
         whole = len(values) // stretch * stretch
         blocks = np.nan_to_num(values[:whole]).reshape(-1, stretch)
-        extremes = np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)], axis=1) + np.arange(0, whole, stretch)[:, None]
+        extremes = (
+            np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)], axis=1)
+            + np.arange(0, whole, stretch)[:, None]
+        )
         rows = np.concatenate([np.sort(extremes, axis=1).ravel(), rows[whole:]])
     axes.plot(log.time[rows], values[rows], **{"linewidth": 1.2, **style})
 
 
-def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, size: float, label: str | None) -> None:
+def _dots(
+    axes: Axes, x: np.ndarray, y: np.ndarray, color: str, size: float, label: str | None
+) -> None:
     axes.plot(x, y, ".", color=color, markersize=size, markeredgewidth=0, label=label)
 
 
-def _plot_nis(axes: Axes, log: Log, curves: Mapping[str, np.ndarray], colors: Mapping[str, str]) -> None:
+def _plot_nis(
+    axes: Axes, log: Log, curves: Mapping[str, np.ndarray], colors: Mapping[str, str]
+) -> None:
     """Draws NIS, averaged over a sliding window, with its 95 % band on a logarithmic scale; curves (N, components) have equal shapes."""
     start = np.searchsorted(log.time, log.time - _NIS_WINDOW / 2, side="left")
     end = np.searchsorted(log.time, log.time + _NIS_WINDOW / 2, side="right")
@@ -809,15 +1065,22 @@ def _plot_nis(axes: Axes, log: Log, curves: Mapping[str, np.ndarray], colors: Ma
         mean = np.full(len(log.time), np.nan)
         mean[enough] = np.maximum(total[enough] / count[enough], 1e-12)
         if enough.any():
-            highest, lowest = max(highest, float(np.nanmax(mean))), min(lowest, float(np.nanmin(mean)))
+            highest, lowest = (
+                max(highest, float(np.nanmax(mean))),
+                min(lowest, float(np.nanmin(mean))),
+            )
         thin = _stride(log)
         axes.plot(log.time[thin], mean[thin], color=colors[label], linewidth=1.1, label=label)
     window = float(np.median(end - start)) * next(iter(curves.values())).shape[1]
     lower, upper = nis_bounds(np.array(window)).tolist()
-    axes.axhspan(lower, upper, facecolor=_TRUE, alpha=0.25, linewidth=0, label="95 % of white innovations")
+    axes.axhspan(
+        lower, upper, facecolor=_TRUE, alpha=0.25, linewidth=0, label="95 % of white innovations"
+    )
     axes.set_yscale("log")
     axes.set_ylim(max(1e-4, 0.7 * lowest), min(1e4, 1.4 * highest))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if highest > 100 * lowest else (1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1.0,) if highest > 100 * lowest else (1.0, 2.0, 5.0))
+    )
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
     if len(log.time) > 1:
@@ -839,13 +1102,22 @@ def _estimate_and_error(
         spans: the least that panels of quantity and error show.
     """
     estimate, truth, error = curves
-    figure, grid = _time_grid(log, len(names), 1 if error is None else 2, height=0.9 + 1.75 * len(names))
+    figure, grid = _time_grid(
+        log, len(names), 1 if error is None else 2, height=0.9 + 1.75 * len(names)
+    )
     for column, (name, row) in enumerate(zip(names, grid, strict=True)):
         _plot(row[0], log, estimate[:, column], color=ESTIMATE, label="estimated", **_BROAD)
         if truth is not None:
             _plot(row[0], log, truth[:, column], **_THIN, label="true")
         row[0].set_ylabel(f"{name} [{units[0]}]")
-        row[0].set_ylim(_readable(log, estimate[:, column], whole=None if truth is None else truth[:, column], span=spans[0]))
+        row[0].set_ylim(
+            _readable(
+                log,
+                estimate[:, column],
+                whole=None if truth is None else truth[:, column],
+                span=spans[0],
+            )
+        )
         if error is not None:
             _plot(row[1], log, error[:, column], color=ESTIMATE, linewidth=0.9)
             row[1].set_ylabel(f"error of {name} [{units[1]}]")
@@ -854,7 +1126,9 @@ def _estimate_and_error(
     return figure
 
 
-def _readable(log: Log, estimate: np.ndarray, *, whole: np.ndarray | None = None, span: float) -> tuple[float, float]:
+def _readable(
+    log: Log, estimate: np.ndarray, *, whole: np.ndarray | None = None, span: float
+) -> tuple[float, float]:
     """Limits that show an estimate without its shortest spikes and without the filters' settling, and all of `whole`; (N, ...) each."""
     curves = estimate.reshape(len(log.time), -1)
     known = np.isfinite(curves).all(axis=1)
@@ -866,16 +1140,30 @@ def _readable(log: Log, estimate: np.ndarray, *, whole: np.ndarray | None = None
     return _at_least((float(values.min() - margin), float(values.max() + margin)), span)
 
 
-def _limit(log: Log, panels: Mapping[int, Axes], estimate: np.ndarray, *, whole: np.ndarray | None = None, span: float) -> None:
+def _limit(
+    log: Log,
+    panels: Mapping[int, Axes],
+    estimate: np.ndarray,
+    *,
+    whole: np.ndarray | None = None,
+    span: float,
+) -> None:
     """Gives panels of joints, which share limits along a row, limits as by `_readable`."""
     for joints in _joint_rows(log).values():
         columns = [joint for joint in joints.values() if joint in panels]
         if columns:
-            limits = _readable(log, estimate[:, columns], whole=None if whole is None else whole[:, columns], span=span)
+            limits = _readable(
+                log,
+                estimate[:, columns],
+                whole=None if whole is None else whole[:, columns],
+                span=span,
+            )
             panels[columns[0]].set_ylim(limits)
 
 
-def _time_grid(log: Log, rows: int, columns: int, *, height: float, phases: bool = True) -> tuple[Figure, np.ndarray]:
+def _time_grid(
+    log: Log, rows: int, columns: int, *, height: float, phases: bool = True
+) -> tuple[Figure, np.ndarray]:
     """A figure with panels over time that show the phases, if so wished; panels have shape (rows, columns)."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
@@ -891,7 +1179,9 @@ def _time_grid(log: Log, rows: int, columns: int, *, height: float, phases: bool
     return figure, grid
 
 
-def _joint_grid(log: Log, quantity: str, *, own_swing: bool = False) -> tuple[Figure, dict[int, Axes]]:
+def _joint_grid(
+    log: Log, quantity: str, *, own_swing: bool = False
+) -> tuple[Figure, dict[int, Axes]]:
     """A figure with a panel over time for each joint, by its column in the log: a row for each role, a column for each side.
 
     Args:
@@ -931,10 +1221,24 @@ def _decorate_time(axes: Axes, log: Log, *, swing_of: str | None = None) -> None
     for phase in support_phases(log):
         if swing_of is not None:
             if swing_of not in phase.support:
-                axes.axvspan(phase.start, phase.end, facecolor=_SWING, alpha=0.22, linewidth=0, label="the joint's leg swings")
+                axes.axvspan(
+                    phase.start,
+                    phase.end,
+                    facecolor=_SWING,
+                    alpha=0.22,
+                    linewidth=0,
+                    label="the joint's leg swings",
+                )
         elif phase.is_single:
             side = phase.support[0]
-            axes.axvspan(phase.start, phase.end, facecolor=_side_color(log, side), alpha=0.12, linewidth=0, label=f"{side} leg supports")
+            axes.axvspan(
+                phase.start,
+                phase.end,
+                facecolor=_side_color(log, side),
+                alpha=0.12,
+                linewidth=0,
+                label=f"{side} leg supports",
+            )
 
 
 def _at_least(limits: tuple[float, float], span: float) -> tuple[float, float]:
@@ -955,10 +1259,21 @@ def _name_phases(axes: Axes, log: Log) -> None:
     for phase in support_phases(log):
         if phase.end - phase.start > 0.03 * duration:
             middle = (phase.start + phase.end) / 2
-            axes.text(middle, 1.02, phase.label, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, color=PLANNED)
+            axes.text(
+                middle,
+                1.02,
+                phase.label,
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                fontsize=8,
+                color=PLANNED,
+            )
 
 
-def add_legend(figure: Figure, *, marker_size: float | None = None, without: Collection[str] = ()) -> None:
+def add_legend(
+    figure: Figure, *, marker_size: float | None = None, without: Collection[str] = ()
+) -> None:
     """One legend above all panels: every label once but for those `without`, solid lines before dashed ones before areas.
 
     Args:
@@ -979,6 +1294,8 @@ def add_legend(figure: Figure, *, marker_size: float | None = None, without: Col
     labels = sorted(found, key=rank)
     columns = len(labels) if len(labels) < 6 else -(-len(labels) // 2)
     handles = [found[label] for label in labels]
-    legend = figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=10)
+    legend = figure.legend(
+        handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=10
+    )
     for handle in legend.legend_handles if marker_size is not None else ():
         handle.set(markersize=marker_size)

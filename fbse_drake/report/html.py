@@ -86,9 +86,15 @@ def percent(share: float) -> str:
     return "n/a" if math.isnan(share) else f"{100 * share:.1f} %"
 
 
-def numeric_table(header: Sequence[str], rows: Sequence[tuple[str | float, ...]]) -> tuple[Table, ...]:
+def numeric_table(
+    header: Sequence[str], rows: Sequence[tuple[str | float, ...]]
+) -> tuple[Table, ...]:
     """The table of these rows without those whose numbers are all NaN; no table at all if none is left."""
-    kept = tuple(row for row in rows if not all(math.isnan(cell) for cell in row if not isinstance(cell, str)))
+    kept = tuple(
+        row
+        for row in rows
+        if not all(math.isnan(cell) for cell in row if not isinstance(cell, str))
+    )
     return (Table(tuple(header), kept),) if kept else ()
 
 

@@ -27,7 +27,14 @@ def base_row(base: BaseParameter) -> tuple[str, ...]:
     """A combination under `BASE_HEADER`."""
     low, high = base.interval
     share = f"{100 * base.uncertainty:.2g} %"
-    return (base.text, base.unit, number(base.model), number(base.value), f"{number(low)} to {number(high)}", share)
+    return (
+        base.text,
+        base.unit,
+        number(base.model),
+        number(base.value),
+        f"{number(low)} to {number(high)}",
+        share,
+    )
 
 
 def error_rows(result: Identification) -> list[tuple[str, ...]]:
@@ -37,7 +44,13 @@ def error_rows(result: Identification) -> list[tuple[str, ...]]:
         before = result.before[name]
         rows.append((name, f"{100 * before.relative:.2f} %", f"{100 * after.relative:.2f} %"))
         for joint, share in after.relative_by_joint.items():
-            rows.append((f"{name}: {joint}", f"{100 * before.relative_by_joint[joint]:.2f} %", f"{100 * share:.2f} %"))
+            rows.append(
+                (
+                    f"{name}: {joint}",
+                    f"{100 * before.relative_by_joint[joint]:.2f} %",
+                    f"{100 * share:.2f} %",
+                )
+            )
     return rows
 
 
@@ -57,18 +70,43 @@ def write_identification_report(path: str | Path, result: Identification, name: 
     bodies = []
     for k, body in enumerate(inertia.bodies):
         for j, parameter in enumerate(PARAMETERS):
-            model, value, width = inertia.model[k, j], inertia.model[k, j] + inertia.change[k, j], inertia.half_width[k, j]
-            between, share = f"{number(value - width)} to {number(value + width)}", f"{100 * inertia.uncertainty[k, j]:.2g} %"
+            model, value, width = (
+                inertia.model[k, j],
+                inertia.model[k, j] + inertia.change[k, j],
+                inertia.half_width[k, j],
+            )
+            between, share = (
+                f"{number(value - width)} to {number(value + width)}",
+                f"{100 * inertia.uncertainty[k, j]:.2g} %",
+            )
             unit = InertialParameters.parameters[parameter].unit
-            bodies.append((f"{body} {parameter}", unit, number(model), number(value), between, share))
+            bodies.append(
+                (f"{body} {parameter}", unit, number(model), number(value), between, share)
+            )
     plain = [f for f in result.findings if f.effect != InertialParameters.__name__]
-    friction = Table(("effect", "in", "values"), tuple((spaced(f.effect), targets_text(f.targets), parameters_text(f)) for f in plain))
+    friction = Table(
+        ("effect", "in", "values"),
+        tuple((spaced(f.effect), targets_text(f.targets), parameters_text(f)) for f in plain),
+    )
     sections = (
         Section("What can be known", identifiability_text(inertia)),
-        Section("Combinations", _BASE_TEXT, (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),)),
+        Section(
+            "Combinations",
+            _BASE_TEXT,
+            (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),),
+        ),
         Section("Friction", tables=(friction,)),
-        Section("Errors", "|residual| / |torque|, 2-norms.", (Table(ERROR_HEADER, tuple(error_rows(result))),)),
+        Section(
+            "Errors",
+            "|residual| / |torque|, 2-norms.",
+            (Table(ERROR_HEADER, tuple(error_rows(result))),),
+        ),
         Section("Bodies", _BODIES_TEXT, (Table(("parameter", *BASE_HEADER[1:]), tuple(bodies)),)),
-        Section("Scenario", details=(Details("With all this in its model", dump_scenario(result.scenario, name)),)),
+        Section(
+            "Scenario",
+            details=(Details("With all this in its model", dump_scenario(result.scenario, name)),),
+        ),
     )
-    write_report(path, Report(f"{name}: inertial parameters", True, identification_outcome(result), sections))
+    write_report(
+        path, Report(f"{name}: inertial parameters", True, identification_outcome(result), sections)
+    )

@@ -56,7 +56,9 @@ def run_metrics(log: Log, wall_time: float, tick_time: np.ndarray | None = None)
         "real_time_factor": simulated / wall_time,
         "joint_tracking_rms": dict(zip(joints, joint_tracking_rms(log).tolist(), strict=True)),
         "com_rse_mean": com_rse_mean(log),
-        "stance_creep_max": {side: max(creep, default=math.nan) for side, creep in stance_creep(log).items()},
+        "stance_creep_max": {
+            side: max(creep, default=math.nan) for side, creep in stance_creep(log).items()
+        },
         "friction_law_error": friction_law_error(log),
         "friction_rmse": friction_rmse(log),
         "friction_nrmse": friction_nrmse(log),
@@ -135,10 +137,18 @@ def joint_sides(log: Log) -> list[str | None]:
     Legs follow one another in the order of the sides, with equally many joints.
     """
     if "legs" in log.meta:
-        return [next((side for side, joints in log.meta["legs"].items() if joint in joints), None) for joint in log.joints]
-    named = [next((side for side in log.sides if joint.startswith(f"{side}_")), None) for joint in log.joints]
+        return [
+            next((side for side, joints in log.meta["legs"].items() if joint in joints), None)
+            for joint in log.joints
+        ]
+    named = [
+        next((side for side in log.sides if joint.startswith(f"{side}_")), None)
+        for joint in log.joints
+    ]
     if log.sides and not any(named):
-        return [log.sides[joint * len(log.sides) // len(log.joints)] for joint in range(len(log.joints))]
+        return [
+            log.sides[joint * len(log.sides) // len(log.joints)] for joint in range(len(log.joints))
+        ]
     return named
 
 
@@ -199,7 +209,9 @@ def friction_nrmse(log: Log) -> dict[str, dict[str, float]]:
 
 def attitude_error_deg(log: Log) -> np.ndarray:
     """Estimated minus true roll and pitch of the base, shape (N, 2) [deg]."""
-    error = roll_and_pitch_deg(log["estimate/base/orientation"]) - roll_and_pitch_deg(log["truth/base/orientation"])
+    error = roll_and_pitch_deg(log["estimate/base/orientation"]) - roll_and_pitch_deg(
+        log["truth/base/orientation"]
+    )
     return (error + 180.0) % 360.0 - 180.0
 
 
@@ -207,7 +219,10 @@ def roll_and_pitch_deg(orientation: np.ndarray) -> np.ndarray:
     """x- and y-Euler angles (z-y-x order) of quaternions [w, x, y, z] (N, 4), shape (N, 2) [deg]."""
     w, x, y, z = orientation.T
     to_the_left, up = 2 * (w * x + y * z), w * w - x * x - y * y + z * z
-    roll, pitch = np.arctan2(to_the_left, up), np.arctan2(2 * (w * y - x * z), np.hypot(to_the_left, up))
+    roll, pitch = (
+        np.arctan2(to_the_left, up),
+        np.arctan2(2 * (w * y - x * z), np.hypot(to_the_left, up)),
+    )
     return np.rad2deg(np.stack([roll, pitch], axis=1))
 
 
@@ -215,7 +230,9 @@ def attitude_rmse_deg(log: Log) -> dict[str, float]:
     """Root mean square of `attitude_error_deg` [deg]; NaN without estimate or truth."""
     if "estimate/base/orientation" not in log or "truth/base/orientation" not in log:
         return dict.fromkeys(("roll", "pitch"), math.nan)
-    return dict(zip(("roll", "pitch"), _rms(attitude_error_deg(log)[settled(log)]).tolist(), strict=True))
+    return dict(
+        zip(("roll", "pitch"), _rms(attitude_error_deg(log)[settled(log)]).tolist(), strict=True)
+    )
 
 
 def base_velocity_error(log: Log) -> np.ndarray:
@@ -238,7 +255,9 @@ def tick_us(tick_time: np.ndarray | None) -> dict[str, float]:
     """
     if tick_time is None:
         return dict.fromkeys(("median", "p99"), math.nan)
-    return dict(zip(("median", "p99"), (1e6 * np.percentile(tick_time, (50, 99))).tolist(), strict=True))
+    return dict(
+        zip(("median", "p99"), (1e6 * np.percentile(tick_time, (50, 99))).tolist(), strict=True)
+    )
 
 
 def normalised_innovations(log: Log) -> dict[str, dict[str, np.ndarray]]:
@@ -280,7 +299,9 @@ def consistency(log: Log) -> dict[str, dict[str, Consistency]]:
             values = values[np.isfinite(values)]
             if len(values):
                 lower, upper = nis_bounds(np.array(len(values))).tolist()
-                result.setdefault(name, {})[part] = Consistency(float(values.mean()), lower, upper, len(values))
+                result.setdefault(name, {})[part] = Consistency(
+                    float(values.mean()), lower, upper, len(values)
+                )
     return result
 
 
@@ -294,10 +315,16 @@ def _measurement_parts(log: Log, name: str, components: int) -> list[str]:
     parts = {
         "attitude": ["gravity", "attitude by gravity", "attitude by level feet"],
         "base_state": _base_state_parts(log, components),
-        "joint_acceleration": [f"{side} foot, {kind}" for side in log.sides for kind in ("angular", "linear")],
+        "joint_acceleration": [
+            f"{side} foot, {kind}" for side in log.sides for kind in ("angular", "linear")
+        ],
         "friction": log.joints,
     }[name]
-    return parts if parts and components % len(parts) == 0 else [str(number) for number in range(1, components + 1)]
+    return (
+        parts
+        if parts and components % len(parts) == 0
+        else [str(number) for number in range(1, components + 1)]
+    )
 
 
 def _base_state_parts(log: Log, components: int) -> list[str]:
@@ -317,7 +344,9 @@ def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, floa
     for joint, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
         if side not in stands:
             continue
-        for phase, counted in zip(_PHASES, (rows & stands[side], rows & ~stands[side]), strict=True):
+        for phase, counted in zip(
+            _PHASES, (rows & stands[side], rows & ~stands[side]), strict=True
+        ):
             rmse = float(_rms(error[counted, joint]))
             size = float(_rms(truth[counted, joint])) if normalised else 1.0
             figures[phase][name] = rmse / size if size > 0 else math.nan
@@ -326,7 +355,9 @@ def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, floa
 
 def _rms(values: np.ndarray) -> np.ndarray:
     """Root mean square over the first axis; NaN of no values."""
-    return np.sqrt(np.mean(values**2, axis=0)) if len(values) else np.full(values.shape[1:], math.nan)
+    return (
+        np.sqrt(np.mean(values**2, axis=0)) if len(values) else np.full(values.shape[1:], math.nan)
+    )
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:

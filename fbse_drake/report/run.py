@@ -37,8 +37,13 @@ def write_run_report(
     """
     pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items()}
     # A sole reaches at least as far as its pads.
-    outlines = {side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()}
-    figures = {topic: tuple(blocks) for topic, blocks in run_figures(log, outlines=outlines or None, pads=pads or None).items()}
+    outlines = {
+        side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()
+    }
+    figures = {
+        topic: tuple(blocks)
+        for topic, blocks in run_figures(log, outlines=outlines or None, pads=pads or None).items()
+    }
     sections = [
         Section("Summary", log.meta.get("title", ""), tables=_key_figures(metrics)),
         Section("Motion", figures=figures["walk"]),
@@ -51,11 +56,22 @@ def write_run_report(
             figures=figures["friction"],
         ),
         Section("Base state", figures=figures["base"]),
-        Section("Consistency", _CONSISTENCY, tables=_consistency_table(log), figures=figures["consistency"]),
+        Section(
+            "Consistency",
+            _CONSISTENCY,
+            tables=_consistency_table(log),
+            figures=figures["consistency"],
+        ),
         Section("Sensors", figures=figures["sensors"]),
-        Section("Scenario", "The scenario as it was run, with all its defaults.", details=_scenarios(log)),
+        Section(
+            "Scenario",
+            "The scenario as it was run, with all its defaults.",
+            details=_scenarios(log),
+        ),
     ]
-    shown = tuple(section for section in sections if section.tables or section.figures or section.details)
+    shown = tuple(
+        section for section in sections if section.tables or section.figures or section.details
+    )
     write_report(path, Report(name, not metrics["fell"], _outcome(metrics), shown))
 
 
@@ -97,18 +113,41 @@ def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
         ("Length of the run", metrics["simulated_time"], "s"),
         ("Wall time", metrics["wall_time"], "s"),
         ("Length per wall time", metrics["real_time_factor"], "1"),
-        ("Joint tracking error, RMS, mean of the joints", 1e3 * float(np.mean(list(tracking.values()))), "mrad"),
-        (f"Joint tracking error, RMS, worst joint ({_words(worst)})", 1e3 * tracking[worst], "mrad"),
+        (
+            "Joint tracking error, RMS, mean of the joints",
+            1e3 * float(np.mean(list(tracking.values()))),
+            "mrad",
+        ),
+        (
+            f"Joint tracking error, RMS, worst joint ({_words(worst)})",
+            1e3 * tracking[worst],
+            "mrad",
+        ),
         (
             f"Simulated torque less its law, RMS, worst joint ({_words(farthest)})",
             round(100 * law[farthest], 2),
             "% of law",
         ),
-        *((f"CoM error in {axis}, mean", 1e3 * value, "mm") for axis, value in metrics["com_rse_mean"].items()),
-        *((f"Creep of the {side} foot in a stance, largest", 1e3 * value, "mm") for side, value in metrics["stance_creep_max"].items()),
-        *((f"Estimated {angle}, RMS error", value, "deg") for angle, value in metrics["attitude_rmse_deg"].items()),
-        *((f"Estimated base velocity in {axis}, RMS error", 1e3 * value, "mm/s") for axis, value in metrics["base_velocity_rmse"].items()),
-        *((f"Estimator tick, {statistic}", value, "µs") for statistic, value in metrics["tick_us"].items()),
+        *(
+            (f"CoM error in {axis}, mean", 1e3 * value, "mm")
+            for axis, value in metrics["com_rse_mean"].items()
+        ),
+        *(
+            (f"Creep of the {side} foot in a stance, largest", 1e3 * value, "mm")
+            for side, value in metrics["stance_creep_max"].items()
+        ),
+        *(
+            (f"Estimated {angle}, RMS error", value, "deg")
+            for angle, value in metrics["attitude_rmse_deg"].items()
+        ),
+        *(
+            (f"Estimated base velocity in {axis}, RMS error", 1e3 * value, "mm/s")
+            for axis, value in metrics["base_velocity_rmse"].items()
+        ),
+        *(
+            (f"Estimator tick, {statistic}", value, "µs")
+            for statistic, value in metrics["tick_us"].items()
+        ),
     ]
     return numeric_table(("", "Value", "Unit"), rows)
 
@@ -120,9 +159,19 @@ def _tracking_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
 
 def _friction_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
     """Errors of the estimated friction, per joint and phase of its leg."""
-    kinds = [metrics[kind][phase] for phase in ("stance", "swing") for kind in ("friction_rmse", "friction_nrmse")]
-    rows = [(_words(joint), *(values[joint] for values in kinds)) for joint in metrics["joint_tracking_rms"]]
-    return numeric_table(("Joint", "Stance, RMSE [Nm]", "Stance, NRMSE [1]", "Swing, RMSE [Nm]", "Swing, NRMSE [1]"), rows)
+    kinds = [
+        metrics[kind][phase]
+        for phase in ("stance", "swing")
+        for kind in ("friction_rmse", "friction_nrmse")
+    ]
+    rows = [
+        (_words(joint), *(values[joint] for values in kinds))
+        for joint in metrics["joint_tracking_rms"]
+    ]
+    return numeric_table(
+        ("Joint", "Stance, RMSE [Nm]", "Stance, NRMSE [1]", "Swing, RMSE [Nm]", "Swing, NRMSE [1]"),
+        rows,
+    )
 
 
 def _consistency_table(log: Log) -> tuple[Table, ...]:
@@ -131,12 +180,18 @@ def _consistency_table(log: Log) -> tuple[Table, ...]:
         for name, parts in consistency(log).items()
         for part, found in parts.items()
     ]
-    return numeric_table(("Filter", "Innovation of", "Mean NIS [1]", "Lower bound", "Upper bound", "Innovations"), rows)
+    return numeric_table(
+        ("Filter", "Innovation of", "Mean NIS [1]", "Lower bound", "Upper bound", "Innovations"),
+        rows,
+    )
 
 
 def _scenarios(log: Log) -> tuple[Details, ...]:
     """Scenarios that the log holds: that of the simulation, and that of the estimator which ran over the log later."""
-    titles = {"scenario": "YAML", "estimator_scenario": "YAML of the estimator that ran over the log"}
+    titles = {
+        "scenario": "YAML",
+        "estimator_scenario": "YAML of the estimator that ran over the log",
+    }
     return tuple(Details(title, log.meta[key]) for key, title in titles.items() if key in log.meta)
 
 

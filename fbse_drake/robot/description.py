@@ -28,7 +28,9 @@ class Leg:
 
     def __post_init__(self) -> None:
         if bool(self.pads) == bool(self.corners):
-            raise InputError("pads: expected either these (3-axis force sensors) or corners (of a foot with a six-axis sensor)")
+            raise InputError(
+                "pads: expected either these (3-axis force sensors) or corners (of a foot with a six-axis sensor)"
+            )
         for point in self.corners:
             if len(point) != 3:
                 raise InputError(f"corners: expected points of three coordinates, found {point}")
@@ -70,7 +72,9 @@ class RobotDescription:
             raise InputError("expected either directives or urdf")
         for side, leg in self.legs.items():
             if len(leg.joints) != len(self.leg_joints):
-                raise InputError(f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}")
+                raise InputError(
+                    f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}"
+                )
         twice = [name for name, count in Counter(self.joint_names).items() if count > 1]
         if twice:
             raise InputError(f"joints: {twice[0]} is named twice")
@@ -94,9 +98,13 @@ class RobotDescription:
     def counterparts(self, joint: str) -> tuple[str, ...]:
         """The same joint of every leg; a further joint has itself alone."""
         role = self.roles[self.joint_names.index(joint)]
-        return tuple(name for name, other in zip(self.joint_names, self.roles, strict=True) if other == role)
+        return tuple(
+            name for name, other in zip(self.joint_names, self.roles, strict=True) if other == role
+        )
 
-    def per_joint(self, values: Mapping[str, float], *, key: str, default: float | None = None) -> np.ndarray:
+    def per_joint(
+        self, values: Mapping[str, float], *, key: str, default: float | None = None
+    ) -> np.ndarray:
         """A value for each joint, shape (n,), from `{all: ..., <leg joint>: ..., <joint>: ...}`; the more special key wins.
 
         Raises:

@@ -13,7 +13,12 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.multibody.tree import (
     Frame,
     Joint,
@@ -71,7 +76,9 @@ class PointMass:
     @property
     def inertia(self) -> SpatialInertia:
         """About Bo, in B; no body has that of a negative mass."""
-        return SpatialInertia(self.mass, self.position, UnitInertia.PointMass(self.position), skip_validity_check=True)
+        return SpatialInertia(
+            self.mass, self.position, UnitInertia.PointMass(self.position), skip_validity_check=True
+        )
 
 
 @dataclass(frozen=True)
@@ -102,23 +109,38 @@ class Robot:
     @cached_property
     def torque_units(self) -> list[str]:
         """Unit of each joint's torque, or of the force of a prismatic joint."""
-        return ["N" if self.plant.GetJointByName(name).type_name() == PrismaticJoint.kTypeName else "Nm" for name in self.joint_names]
+        return [
+            "N" if self.plant.GetJointByName(name).type_name() == PrismaticJoint.kTypeName else "Nm"
+            for name in self.joint_names
+        ]
 
     @cached_property
     def body_names(self) -> list[str]:
         """Model names of all bodies with a mass, but for point masses."""
-        bodies = [self.plant.get_body(index) for index in self.plant.GetBodyIndices(self.base.model_instance())]
-        return [body.name() for body in bodies if body.default_mass() > 0 and _POINT_MASS not in body.name()]
+        bodies = [
+            self.plant.get_body(index)
+            for index in self.plant.GetBodyIndices(self.base.model_instance())
+        ]
+        return [
+            body.name()
+            for body in bodies
+            if body.default_mass() > 0 and _POINT_MASS not in body.name()
+        ]
 
     def body(self, name: str) -> RigidBody:
         """Raises InputError where there is none of this name that has a mass."""
         if name not in self.body_names:
-            raise InputError(f"{name}: the model has no body of this name with a mass (there are: {', '.join(self.body_names)})")
+            raise InputError(
+                f"{name}: the model has no body of this name with a mass (there are: {', '.join(self.body_names)})"
+            )
         return self.plant.GetBodyByName(name)
 
     def added_to(self, name: str) -> list[RigidBody]:
         """Bodies that carry the point masses of a body, in its frame."""
-        bodies = [self.plant.get_body(index) for index in self.plant.GetBodyIndices(self.base.model_instance())]
+        bodies = [
+            self.plant.get_body(index)
+            for index in self.plant.GetBodyIndices(self.base.model_instance())
+        ]
         return [body for body in bodies if body.name().rpartition(_POINT_MASS)[0] == name]
 
     def sole(self, side: str) -> Frame:
@@ -148,17 +170,23 @@ class Robot:
     @cached_property
     def position_index(self) -> np.ndarray:
         """Place of each joint's angle in the plant's positions, shape (n,)."""
-        return np.array([self.plant.GetJointByName(name).position_start() for name in self.joint_names])
+        return np.array(
+            [self.plant.GetJointByName(name).position_start() for name in self.joint_names]
+        )
 
     @cached_property
     def velocity_index(self) -> np.ndarray:
         """Place of each joint's rate in the plant's velocities, shape (n,)."""
-        return np.array([self.plant.GetJointByName(name).velocity_start() for name in self.joint_names])
+        return np.array(
+            [self.plant.GetJointByName(name).velocity_start() for name in self.joint_names]
+        )
 
     @cached_property
     def joint_state_selector(self) -> np.ndarray:
         """Matrix that takes the plant's state to [joint positions, joint velocities], shape (2n, state)."""
-        columns = np.concatenate([self.position_index, self.plant.num_positions() + self.velocity_index])
+        columns = np.concatenate(
+            [self.position_index, self.plant.num_positions() + self.velocity_index]
+        )
         return np.eye(self.plant.num_multibody_states())[columns]
 
     @cached_property
@@ -194,7 +222,10 @@ class Robot:
         rows, columns = np.nonzero(self.implicit.has_clamp)
         names = [clamp_name(self.joint_names[j], row) for row, j in zip(rows, columns, strict=True)]
         places = (rows * len(self.joint_names) + columns).tolist()
-        return [(k, self.plant.GetJointActuatorByName(name)) for k, name in zip(places, names, strict=True)]
+        return [
+            (k, self.plant.GetJointActuatorByName(name))
+            for k, name in zip(places, names, strict=True)
+        ]
 
     def base_pose_positions(self, X_WB: RigidTransform) -> np.ndarray:
         """Default positions of the plant with the base at X_WB, shape (positions,)."""
@@ -289,14 +320,20 @@ def make_robot(
     if gantry_height is None and names.fixed_base:
         gantry_height = 0.0
     if gantry_height is not None and not _is_carried(plant, names.base):
-        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(names.base), RigidTransform([0, 0, gantry_height]))
+        plant.WeldFrames(
+            plant.world_frame(),
+            plant.GetFrameByName(names.base),
+            RigidTransform([0, 0, gantry_height]),
+        )
     if ground is not None:
         _add_ground(plant, ground)
         for side, leg in names.legs.items():
             _add_corners(plant, side, leg, ground)
         if gantry_height is None:
             gravity = plant.mutable_gravity_field()
-            gravity.set_gravity_vector(Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector()))
+            gravity.set_gravity_vector(
+                Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector())
+            )
     plant.Finalize()
     if builder is None:
         # A builder that never builds is never freed.
@@ -305,9 +342,13 @@ def make_robot(
     for side in names.sides:
         for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
             if not X_FP.rotation().IsNearlyIdentity(1e-9):
-                raise InputError(f"{path}: legs.{side}.pads: {pad} is not parallel to {names.legs[side].sole}")
+                raise InputError(
+                    f"{path}: legs.{side}.pads: {pad} is not parallel to {names.legs[side].sole}"
+                )
     if robot.has_floating_base and robot.imu.body() not in plant.GetBodiesWeldedTo(robot.base):
-        raise InputError(f"{path}: imu: {names.imu} moves against {names.base}; expected a frame that is fixed to it")
+        raise InputError(
+            f"{path}: imu: {names.imu} moves against {names.base}; expected a frame that is fixed to it"
+        )
     return robot, scene_graph
 
 
@@ -344,12 +385,18 @@ def _bare(urdf: Path) -> str:
 
 
 def _moving_joints(plant: MultibodyPlant) -> list[Joint]:
-    return [joint for joint in (plant.get_joint(index) for index in plant.GetJointIndices()) if joint.num_velocities() > 0]
+    return [
+        joint
+        for joint in (plant.get_joint(index) for index in plant.GetJointIndices())
+        if joint.num_velocities() > 0
+    ]
 
 
 def _is_carried(plant: MultibodyPlant, body: str) -> bool:
     """Has a joint this body as its child?"""
-    return any(plant.get_joint(index).child_body().name() == body for index in plant.GetJointIndices())
+    return any(
+        plant.get_joint(index).child_body().name() == body for index in plant.GetJointIndices()
+    )
 
 
 def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
@@ -360,7 +407,11 @@ def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
     check("base", names.base, plant.HasBodyNamed(names.base), "body")
     if names.imu:
         check("imu", names.imu, plant.HasFrameNamed(names.imu), "frame")
-    single = [joint.name() for joint in _moving_joints(plant) if joint.type_name() in (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)]
+    single = [
+        joint.name()
+        for joint in _moving_joints(plant)
+        if joint.type_name() in (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)
+    ]
     for side, leg in names.legs.items():
         for joint in leg.joints:
             check(f"legs.{side}.joints", joint, joint in single, "revolute or prismatic joint")
@@ -373,7 +424,9 @@ def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
     for joint in names.held:
         if joint not in single or joint in names.joint_names:
             others = ", ".join(name for name in single if name not in names.joint_names) or "none"
-            raise InputError(f"held.{joint}: expected a joint of the model that is not named elsewhere (there are: {others})")
+            raise InputError(
+                f"held.{joint}: expected a joint of the model that is not named elsewhere (there are: {others})"
+            )
 
 
 def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
@@ -390,7 +443,9 @@ def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
         elif isinstance(joint, PrismaticJoint):
             X_FM = RigidTransform(place * joint.translation_axis())
         else:
-            raise InputError(f"joint {joint.name()} is {joint.type_name()}: expected only revolute and prismatic joints")
+            raise InputError(
+                f"joint {joint.name()} is {joint.type_name()}: expected only revolute and prismatic joints"
+            )
         parent, child = joint.frame_on_parent(), joint.frame_on_child()
         plant.RemoveJoint(joint)
         plant.WeldFrames(parent, child, X_FM)
@@ -423,7 +478,9 @@ def _motors(plant: MultibodyPlant, joint_names: Sequence[str]) -> dict[str, Join
     return {name: actuators[name] for name in joint_names}
 
 
-def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]) -> None:
+def _add_point_masses(
+    plant: MultibodyPlant, names: RobotDescription, point_masses: Sequence[PointMass]
+) -> None:
     instance = plant.GetBodyByName(names.base).model_instance()
     inertias: dict[str, SpatialInertia] = {}
     # One carrier for all that is added to a body, one for all that is taken away. What takes mass away comes last: Drake does not add to a
@@ -437,7 +494,9 @@ def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_mass
         # A sum in place, but not in the body's own inertia.
         inertia = inertias.setdefault(point.body, copy(body.default_spatial_inertia()))
         if inertia.get_mass() + point.mass <= 0:
-            raise InputError(f"{point.body}: expected a mass > 0, found {inertia.get_mass() + point.mass:g} kg")
+            raise InputError(
+                f"{point.body}: expected a mass > 0, found {inertia.get_mass() + point.mass:g} kg"
+            )
         inertia += added
         key = (point.body, point.mass < 0)
         if key in carried:
@@ -449,7 +508,9 @@ def _add_point_masses(plant: MultibodyPlant, names: RobotDescription, point_mass
         plant.WeldFrames(plant.GetBodyByName(name, instance).body_frame(), carrier.body_frame())
     for name, inertia in inertias.items():
         if not inertia.IsPhysicallyValid():
-            raise InputError(f"{name}: expected the inertia of a body, found one that no distribution of mass has")
+            raise InputError(
+                f"{name}: expected the inertia of a body, found one that no distribution of mass has"
+            )
 
 
 def _corner_joints(side: str, leg: Leg) -> list[str]:
@@ -469,7 +530,9 @@ def _add_corners(plant: MultibodyPlant, side: str, leg: Leg, ground: Ground) -> 
     for name, p_FC in zip(_corner_joints(side, leg), leg.corners, strict=True):
         corner = plant.AddRigidBody(name, sole.model_instance(), SpatialInertia.Zero())
         plant.AddJoint(WeldJoint(name, sole, corner.body_frame(), RigidTransform(p_FC)))
-        plant.RegisterCollisionGeometry(corner, RigidTransform(), Sphere(_CORNER_RADIUS), name, properties)
+        plant.RegisterCollisionGeometry(
+            corner, RigidTransform(), Sphere(_CORNER_RADIUS), name, properties
+        )
 
 
 def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
@@ -482,5 +545,13 @@ def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
         point_stiffness=ground.stiffness,
         dissipation=ground.dissipation,
     )
-    plant.RegisterCollisionGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", properties)
-    plant.RegisterVisualGeometry(plant.world_body(), X_WG, Box(size, size, thickness), "ground", np.array([0.86, 0.88, 0.9, 1.0]))
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), X_WG, Box(size, size, thickness), "ground", properties
+    )
+    plant.RegisterVisualGeometry(
+        plant.world_body(),
+        X_WG,
+        Box(size, size, thickness),
+        "ground",
+        np.array([0.86, 0.88, 0.9, 1.0]),
+    )

@@ -6,7 +6,14 @@ from typing import ClassVar
 
 import numpy as np
 from numba import njit
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    State,
+)
 from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
@@ -129,7 +136,9 @@ class EncoderReadings(LeafSystem):
         # Before the first tick there is no last reading (NaN).
         self._last = self.DeclareDiscreteState(np.full(joints, np.nan))
         sources = {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
-        self.measured_joint_state = self.DeclareVectorOutputPort("measured_joint_state", 2 * joints, self._calc, sources)
+        self.measured_joint_state = self.DeclareVectorOutputPort(
+            "measured_joint_state", 2 * joints, self._calc, sources
+        )
         if config.velocity == "differenced":
             self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._remember)
 
@@ -141,7 +150,9 @@ class EncoderReadings(LeafSystem):
             measured[n:] = 0.0 if np.isnan(last[0]) else (measured[:n] - last) / config.period
 
     def _remember(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._last).set_value(self.measured_joint_state.Eval(context)[: self._n])
+        state.get_mutable_discrete_state(self._last).set_value(
+            self.measured_joint_state.Eval(context)[: self._n]
+        )
 
 
 class Encoders(Diagram):
@@ -166,7 +177,9 @@ class Encoders(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         scale = np.repeat([config.noise, config.velocity_noise], joints)
-        noise = scale * white_noise(seed, "encoders", ticks_until(duration, config.period), 2 * joints)
+        noise = scale * white_noise(
+            seed, "encoders", ticks_until(duration, config.period), 2 * joints
+        )
         errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, 2 * joints))
         readings = builder.AddNamedSystem("readings", EncoderReadings(config, joints))

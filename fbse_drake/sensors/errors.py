@@ -26,4 +26,6 @@ def held_signal(values: np.ndarray, period: float) -> TrajectorySource:
     """Source of `values` (ticks, size), each held for `period` [s]; the last one for ever."""
     # A B-spline of order 1 is piecewise constant. Its knots lie a hair before the ticks, so that a tick has its own value.
     knots = (np.arange(len(values) + 1) - 1e-6) * period
-    return TrajectorySource(BsplineTrajectory(BsplineBasis(1, list(knots)), list(values[:, :, None])))
+    return TrajectorySource(
+        BsplineTrajectory(BsplineBasis(1, list(knots)), list(values[:, :, None]))
+    )

@@ -7,8 +7,22 @@ from typing import ClassVar
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
-from pydrake.systems.primitives import Adder, ConstantVectorSource, DiscreteTimeDelay, Gain, MatrixGain, Saturation
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    System,
+)
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantVectorSource,
+    DiscreteTimeDelay,
+    Gain,
+    MatrixGain,
+    Saturation,
+)
 from scipy.linalg import block_diag
 
 from fbse_drake.errors import require_not_negative, require_positive
@@ -70,7 +84,9 @@ class FootForceConfig(Sensor):
         return {"measured_pad_force": force.reshape(len(log.time), -1)}
 
 
-def _by_foot(robot: Robot, pad_force: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _by_foot(
+    robot: Robot, pad_force: np.ndarray
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Forces at each foot's pads or corners, and the wrench on each six-axis sensor.
 
     Args:
@@ -93,18 +109,27 @@ def wrench_deviations(config: FootForceConfig, robot: Robot) -> list[np.ndarray]
     """Standard deviation of the noise in the wrench [moment, force] that is measured on each sole, shape (6,) each [Nm, N]."""
     six_axis = np.repeat([config.moment_noise, config.noise], 3)
     legs = robot.description.legs.values()
-    return [six_axis if leg.corners else config.noise * np.linalg.norm(G, axis=1) for leg, G in zip(legs, robot.grasp_maps, strict=True)]
+    return [
+        six_axis if leg.corners else config.noise * np.linalg.norm(G, axis=1)
+        for leg, G in zip(legs, robot.grasp_maps, strict=True)
+    ]
 
 
-def force_noise(config: FootForceConfig, robot: Robot, samples: int, random: np.random.Generator) -> np.ndarray:
+def force_noise(
+    config: FootForceConfig, robot: Robot, samples: int, random: np.random.Generator
+) -> np.ndarray:
     """Noise in the forces at the pads or corners of all feet, shape (samples, points, 3) [N]."""
     legs = list(robot.description.legs.values())
     noise = config.noise * random.standard_normal((samples, sum(leg.points for leg in legs), 3))
     first = 0
-    for leg, G, deviation in zip(legs, robot.grasp_maps, wrench_deviations(config, robot), strict=True):
+    for leg, G, deviation in zip(
+        legs, robot.grasp_maps, wrench_deviations(config, robot), strict=True
+    ):
         if leg.corners:
             wrench = deviation * random.standard_normal((samples, 6))
-            noise[:, first : first + leg.points] = (wrench @ np.linalg.pinv(G).T).reshape(samples, -1, 3)
+            noise[:, first : first + leg.points] = (wrench @ np.linalg.pinv(G).T).reshape(
+                samples, -1, 3
+            )
         first += leg.points
     return noise
 
@@ -127,15 +152,23 @@ class PadForces(LeafSystem):
         super().__init__()
         # Reactions are counted without the joints that were taken out of the model.
         place = {index: number for number, index in enumerate(robot.plant.GetJointIndices())}
-        self._joints = [place[joint.index()] for side in robot.description.sides for joint in robot.pad_joints(side)]
-        self._reaction_forces = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce.Zero()]))
+        self._joints = [
+            place[joint.index()]
+            for side in robot.description.sides
+            for joint in robot.pad_joints(side)
+        ]
+        self._reaction_forces = self.DeclareAbstractInputPort(
+            "reaction_forces", Value([SpatialForce.Zero()])
+        )
         sources = {self.input_port_ticket(self._reaction_forces.get_index())}
         self.DeclareVectorOutputPort("pad_force", 3 * len(self._joints), self._calc, sources)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         reactions = self._reaction_forces.Eval(context)
         # A joint's reaction acts on the pad, against the ground's force.
-        output.SetFromVector(-np.concatenate([reactions[joint].translational() for joint in self._joints]))
+        output.SetFromVector(
+            -np.concatenate([reactions[joint].translational() for joint in self._joints])
+        )
 
 
 class NoFeet(Diagram):
@@ -175,7 +208,9 @@ class FootForceSensors(Diagram):
     foot's corners that have this wrench, see `corner_forces`.
     """
 
-    def __init__(self, config: FootForceConfig, robot: Robot, time_step: float, seed: int, duration: float):
+    def __init__(
+        self, config: FootForceConfig, robot: Robot, time_step: float, seed: int, duration: float
+    ):
         """Puts the sensors together.
 
         Args:
@@ -189,13 +224,21 @@ class FootForceSensors(Diagram):
         legs = list(robot.description.legs.values())
         has_six_axes = any(leg.corners for leg in legs)
         # What the sensors of each foot read of the forces at its pads or corners.
-        maps = [np.eye(3 * leg.points) if leg.pads else G for leg, G in zip(legs, robot.grasp_maps, strict=True)]
+        maps = [
+            np.eye(3 * leg.points) if leg.pads else G
+            for leg, G in zip(legs, robot.grasp_maps, strict=True)
+        ]
         is_force = np.concatenate(
-            [np.ones(len(G), dtype=bool) if leg.pads else np.arange(6) >= 3 for leg, G in zip(legs, maps, strict=True)]
+            [
+                np.ones(len(G), dtype=bool) if leg.pads else np.arange(6) >= 3
+                for leg, G in zip(legs, maps, strict=True)
+            ]
         )
         size = len(is_force)
         deviation = np.where(is_force, config.noise, config.moment_noise)
-        noise = deviation * white_noise(seed, "foot force", ticks_until(duration, config.period), size)
+        noise = deviation * white_noise(
+            seed, "foot force", ticks_until(duration, config.period), size
+        )
         errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, size))
         limit = np.where(is_force, config.range, np.inf)
@@ -220,7 +263,9 @@ class FootForceSensors(Diagram):
         builder.Connect(noisy.get_output_port(), measured.get_input_port())
         told = measured.get_output_port()
         if has_six_axes:
-            corner_forces = builder.AddNamedSystem("corner_forces", MatrixGain(block_diag(*(np.linalg.pinv(G) for G in maps))))
+            corner_forces = builder.AddNamedSystem(
+                "corner_forces", MatrixGain(block_diag(*(np.linalg.pinv(G) for G in maps)))
+            )
             builder.Connect(told, corner_forces.get_input_port())
             told = corner_forces.get_output_port()
         builder.ExportInput(true.get_input_port(), "reaction_forces")

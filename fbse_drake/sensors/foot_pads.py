@@ -18,12 +18,18 @@ class FootPads:
         self._robot = robot
         legs = robot.description.legs
         # Places in the sole frame F, shape (P, 3) [m], and to which foot each belongs, shape (P,).
-        self.position = np.array([p for side in legs for p in robot.pad_positions(side)]).reshape(-1, 3)
-        self.foot = np.array([k for k, leg in enumerate(legs.values()) for _ in range(leg.points)], dtype=int)
+        self.position = np.array([p for side in legs for p in robot.pad_positions(side)]).reshape(
+            -1, 3
+        )
+        self.foot = np.array(
+            [k for k, leg in enumerate(legs.values()) for _ in range(leg.points)], dtype=int
+        )
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Values of all pads, (..., P, k), by foot."""
-        return [values[..., self.foot == foot, :] for foot in range(len(self._robot.description.legs))]
+        return [
+            values[..., self.foot == foot, :] for foot in range(len(self._robot.description.legs))
+        ]
 
 
 def corner_forces(robot: Robot, side: str, wrench: np.ndarray) -> np.ndarray:
@@ -50,7 +56,9 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
         pads, wrench = f"foot/{side}/pad_force", f"foot/{side}/wrench"
         if pads in log:
             if log[pads].shape[1] != leg.points:
-                raise InputError(f"channel {pads}: expected {leg.points} pads as in the model, found {log[pads].shape[1]}")
+                raise InputError(
+                    f"channel {pads}: expected {leg.points} pads as in the model, found {log[pads].shape[1]}"
+                )
             forces.append(log[pads])
         elif wrench in log:
             forces.append(corner_forces(robot, side, log[wrench]))
@@ -62,7 +70,12 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
 def leg_of_joint(robot: Robot) -> np.ndarray:
     """Which leg each joint belongs to, shape (n,); -1 for a joint that is no leg's: what is asked of its leg is then asked of the last."""
     legs = list(robot.description.legs.values())
-    return np.array([next((k for k, leg in enumerate(legs) if name in leg.joints), -1) for name in robot.joint_names])
+    return np.array(
+        [
+            next((k for k, leg in enumerate(legs) if name in leg.joints), -1)
+            for name in robot.joint_names
+        ]
+    )
 
 
 @njit(cache=True)
@@ -80,7 +93,9 @@ def vertical_loads(force: np.ndarray, pad_foot: np.ndarray, feet: int) -> np.nda
 
 
 @njit(cache=True)
-def foot_wrenches(force: np.ndarray, pad_position: np.ndarray, pad_foot: np.ndarray, feet: int) -> np.ndarray:
+def foot_wrenches(
+    force: np.ndarray, pad_position: np.ndarray, pad_foot: np.ndarray, feet: int
+) -> np.ndarray:
     """Wrench [moment, force] on each foot at the sole's origin in the sole frame, shape (feet, 6) [Nm, N].
 
     Args:

@@ -41,7 +41,13 @@ class ImuConfig(Sensor):
     period: float | None = None
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "acceleration_noise", "angular_velocity_noise", "acceleration_bias_walk", "angular_velocity_bias_walk")
+        require_not_negative(
+            self,
+            "acceleration_noise",
+            "angular_velocity_noise",
+            "acceleration_bias_walk",
+            "angular_velocity_bias_walk",
+        )
         for name in ("acceleration_bias", "angular_velocity_bias", "misalignment"):
             if len(getattr(self, name)) != 3:
                 raise InputError(f"{name}: expected three numbers, found {getattr(self, name)}")
@@ -59,7 +65,9 @@ def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:
     """What is added to the ideal signals at each tick, shape (ticks, 6) [m/s^2, rad/s]: bias, its random walk, white noise."""
     ticks = ticks_until(duration, config.period)
     noise = np.repeat([config.acceleration_noise, config.angular_velocity_noise], 3)
-    walk = np.repeat([config.acceleration_bias_walk, config.angular_velocity_bias_walk], 3) * np.sqrt(config.period)
+    walk = np.repeat(
+        [config.acceleration_bias_walk, config.angular_velocity_bias_walk], 3
+    ) * np.sqrt(config.period)
     drift = np.cumsum(white_noise(seed, "imu bias", ticks, 6), axis=0)
     bias = np.concatenate([config.acceleration_bias, config.angular_velocity_bias])
     return bias + walk * drift + noise * white_noise(seed, "imu", ticks, 6)
@@ -96,7 +104,9 @@ class Imu(Diagram):
         accelerometer = builder.AddNamedSystem("accelerometer", Accelerometer(body, X_BI, gravity))
         gyroscope = builder.AddNamedSystem("gyroscope", Gyroscope(body, X_BI))
         ideal = builder.AddNamedSystem("ideal", Multiplexer([3, 3]))
-        errors = builder.AddNamedSystem("errors", held_signal(imu_errors(config, seed, duration), config.period))
+        errors = builder.AddNamedSystem(
+            "errors", held_signal(imu_errors(config, seed, duration), config.period)
+        )
         measured = builder.AddNamedSystem("measured", Adder(2, 6))
         builder.Connect(accelerometer.get_output_port(), ideal.get_input_port(0))
         builder.Connect(gyroscope.get_output_port(), ideal.get_input_port(1))

@@ -3,7 +3,14 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    State,
+)
 from pydrake.systems.primitives import Adder
 
 from fbse_drake.errors import require_not_negative, require_positive
@@ -83,7 +90,9 @@ class JointTorqueSensors(Diagram):
     All (n,) [Nm].
     """
 
-    def __init__(self, config: JointTorqueConfig, joints: int, time_step: float, seed: int, duration: float):
+    def __init__(
+        self, config: JointTorqueConfig, joints: int, time_step: float, seed: int, duration: float
+    ):
         """Puts the sensors together.
 
         Args:
@@ -94,7 +103,9 @@ class JointTorqueSensors(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         true = builder.AddNamedSystem("true", TransmittedTorque(joints, time_step))
-        noise = config.noise * white_noise(seed, "joint torque", ticks_until(duration, config.period), joints)
+        noise = config.noise * white_noise(
+            seed, "joint torque", ticks_until(duration, config.period), joints
+        )
         errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, joints))
         builder.Connect(true.get_output_port(), noisy.get_input_port(0))

@@ -17,7 +17,9 @@ from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 
 # Axes of the leg with a closed inverse.
-_CLOSED_AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]], dtype=float)
+_CLOSED_AXES = np.array(
+    [[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]], dtype=float
+)
 _AXIS_TOLERANCE = 1e-9
 # A sole's pose is found to this [rad, m].
 _POSE_TOLERANCE = 1e-12
@@ -73,30 +75,49 @@ class LegKinematics:
         base = robot.base.body_frame()
         joints = [plant.GetJointByName(name) for name in leg.joints]
         if len(joints) != 6 or not all(isinstance(joint, RevoluteJoint) for joint in joints):
-            raise InputError(f"legs.{side}.joints: a walking robot's leg needs six revolute joints, found {len(joints)} joints")
+            raise InputError(
+                f"legs.{side}.joints: a walking robot's leg needs six revolute joints, found {len(joints)} joints"
+            )
         X_BJ = [joint.frame_on_parent().CalcPose(context, base) for joint in joints]
-        axes = np.array([X.rotation() @ joint.revolute_axis() for X, joint in zip(X_BJ, joints, strict=True)])
+        axes = np.array(
+            [X.rotation() @ joint.revolute_axis() for X, joint in zip(X_BJ, joints, strict=True)]
+        )
         sole = robot.sole(side).CalcPose(context, base)
         origins = np.array([X.translation() for X in X_BJ] + [sole.translation()])
         moved = [set(plant.GetBodiesKinematicallyAffectedBy([joint.index()])) for joint in joints]
         carried = {robot.sole(side).body().index()}
         if not all(after <= before for before, after in pairwise([*moved, carried])):
-            raise InputError(f"legs.{side}.joints: expected them from hip to foot, one behind the other, found {', '.join(leg.joints)}")
+            raise InputError(
+                f"legs.{side}.joints: expected them from hip to foot, one behind the other, found {', '.join(leg.joints)}"
+            )
         for name in robot.description.joints:
-            if carried <= set(plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name).index()])):
-                raise InputError(f"joints: {name} carries the {side} leg; a walking robot's legs begin at its base")
+            if carried <= set(
+                plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name).index()])
+            ):
+                raise InputError(
+                    f"joints: {name} carries the {side} leg; a walking robot's legs begin at its base"
+                )
         moved.append(set())
         masses, centers = [], []
         for i, origin in enumerate(origins[:6]):
             bodies = [plant.get_body(index) for index in moved[i] - moved[i + 1]]
             mass = sum(body.get_mass(context) for body in bodies)
             moment = sum(
-                body.get_mass(context) * (body.body_frame().CalcPose(context, base) @ body.CalcCenterOfMassInBodyFrame(context))
+                body.get_mass(context)
+                * (
+                    body.body_frame().CalcPose(context, base)
+                    @ body.CalcCenterOfMassInBodyFrame(context)
+                )
                 for body in bodies
             )
             masses.append(mass)
             centers.append(moment / mass - origin if mass > 0 else np.zeros(3))
-        middle = np.array([0.5 * (joint.position_lower_limit() + joint.position_upper_limit()) for joint in joints])
+        middle = np.array(
+            [
+                0.5 * (joint.position_lower_limit() + joint.position_upper_limit())
+                for joint in joints
+            ]
+        )
         return cls(
             # An axis along one of the base's is exactly so.
             np.where(np.abs(axes - axes.round()) < _AXIS_TOLERANCE, axes.round() + 0.0, axes),
@@ -117,7 +138,9 @@ class LegKinematics:
             and np.allclose(self.sole, np.eye(3), atol=_AXIS_TOLERANCE)
         )
 
-    def inverse(self, R_BF: np.ndarray, p_BF: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    def inverse(
+        self, R_BF: np.ndarray, p_BF: np.ndarray, start: np.ndarray | None = None
+    ) -> np.ndarray:
         """Joint angles that put the sole at a pose; the knee bent as its range has it.
 
         Args:
@@ -157,13 +180,19 @@ class LegKinematics:
         for limit, violation in ((a + b, distance - (a + b)), (abs(a - b), abs(a - b) - distance)):
             if violation.max() > 0:
                 worst = int(violation.argmax())
-                raise UnreachableError(worst, f"hip to ankle {distance[worst]:.3f} m, the leg allows {limit:.3f} m")
+                raise UnreachableError(
+                    worst, f"hip to ankle {distance[worst]:.3f} m, the leg allows {limit:.3f} m"
+                )
         knee = np.arccos(np.clip((distance**2 - a**2 - b**2) / (2 * a * b), -1, 1))
         ankle_roll = np.arctan2(r[:, 1], r[:, 2])
         lean = np.arctan2(-a * np.sin(knee), b + a * np.cos(knee))
         ankle_pitch = lean - np.arctan2(r[:, 0], np.hypot(r[:, 1], r[:, 2]))
         # What the three hip joints must add: Rz(yaw) Rx(roll) Ry(pitch).
-        hip = R_BF @ _rotation(self.axes[5], -ankle_roll) @ _rotation(self.axes[4], -(knee + ankle_pitch))
+        hip = (
+            R_BF
+            @ _rotation(self.axes[5], -ankle_roll)
+            @ _rotation(self.axes[4], -(knee + ankle_pitch))
+        )
         hip_yaw = np.arctan2(-hip[:, 0, 1], hip[:, 1, 1])
         hip_roll = np.arctan2(hip[:, 2, 1], np.hypot(hip[:, 0, 1], hip[:, 1, 1]))
         hip_pitch = np.arctan2(-hip[:, 2, 0], hip[:, 2, 2])
@@ -171,7 +200,12 @@ class LegKinematics:
 
     def _pose(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Sole's rotation (N, 3, 3), position (N, 3) and Jacobian (N, 6, 6) for angles q (N, 6)."""
-        R, p, axes, origins = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3)), [], []
+        R, p, axes, origins = (
+            np.broadcast_to(np.eye(3), (len(q), 3, 3)),
+            np.zeros((len(q), 3)),
+            [],
+            [],
+        )
         for i in range(6):
             p = p + R @ self.offsets[i]
             axes.append(R @ self.axes[i])
@@ -188,7 +222,11 @@ class LegKinematics:
         position, axes, origins = np.zeros((samples, 3)), [], []
         # Motion for the given rates and zero joint accelerations, recursed from base to foot.
         omega, alpha, bias = np.zeros((samples, 3)), np.zeros((samples, 3)), np.zeros((samples, 3))
-        moment, J_moment, bias_moment = np.zeros((samples, 3)), np.zeros((samples, 3, 6)), np.zeros((samples, 3))
+        moment, J_moment, bias_moment = (
+            np.zeros((samples, 3)),
+            np.zeros((samples, 3, 6)),
+            np.zeros((samples, 3)),
+        )
 
         def carried(r: np.ndarray) -> np.ndarray:
             return bias + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
@@ -210,16 +248,32 @@ class LegKinematics:
         r = R @ self.offsets[6]
         bias, position = carried(r), position + r
         J = _jacobian(axes, origins, position)
-        return LegMotion(R @ self.sole, position, J, np.concatenate([alpha, bias], axis=1), moment, J_moment, bias_moment)
+        return LegMotion(
+            R @ self.sole,
+            position,
+            J,
+            np.concatenate([alpha, bias], axis=1),
+            moment,
+            J_moment,
+            bias_moment,
+        )
 
 
 def _jacobian(axes: list[np.ndarray], origins: list[np.ndarray], point: np.ndarray) -> np.ndarray:
     """Of a point's spatial velocity [angular, linear] with respect to the rates about the axes through the origins, (N, 6, joints)."""
-    return np.stack([np.concatenate([e, np.cross(e, point - o)], axis=1) for e, o in zip(axes, origins, strict=True)], axis=2)
+    return np.stack(
+        [
+            np.concatenate([e, np.cross(e, point - o)], axis=1)
+            for e, o in zip(axes, origins, strict=True)
+        ],
+        axis=2,
+    )
 
 
 def _rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Rotation matrices about a fixed unit axis, shape (N, 3, 3)."""
     x, y, z = axis
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle)[:, None, None] * K + (1 - np.cos(angle))[:, None, None] * (K @ K)
+    return (
+        np.eye(3) + np.sin(angle)[:, None, None] * K + (1 - np.cos(angle))[:, None, None] * (K @ K)
+    )

@@ -29,7 +29,11 @@ class LipmTrajectory:
         after, before = t - breaks[piece], breaks[piece + 1] - t
         decay = (-self.omega) ** derivative * np.exp(-self.omega * after)
         growth = self.omega**derivative * np.exp(-self.omega * before)
-        return self.particular(t, derivative) + decay[:, None] * self.decaying[piece] + growth[:, None] * self.growing[piece]
+        return (
+            self.particular(t, derivative)
+            + decay[:, None] * self.decaying[piece]
+            + growth[:, None] * self.growing[piece]
+        )
 
 
 def solve_lipm(zmp: PPoly, com_height: float, gravity: float) -> LipmTrajectory:
@@ -60,7 +64,12 @@ def solve_lipm(zmp: PPoly, com_height: float, gravity: float) -> LipmTrajectory:
     for i in range(pieces - 1):
         row = 2 * i + 1
         matrix[row, 2 * i : 2 * i + 4] = across[i], 1.0, -1.0, -across[i + 1]
-        matrix[row + 1, 2 * i : 2 * i + 4] = -omega * across[i], omega, omega, -omega * across[i + 1]
+        matrix[row + 1, 2 * i : 2 * i + 4] = (
+            -omega * across[i],
+            omega,
+            omega,
+            -omega * across[i + 1],
+        )
         length = zmp.x[i + 1] - zmp.x[i]
         for order in (0, 1):
             end = _evaluate_piece(particular, i, length, order)

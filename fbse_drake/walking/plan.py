@@ -33,7 +33,11 @@ class Phase:
     @property
     def label(self) -> str:
         """`DS` for double support, else the supporting leg's initial and S, as `LS`; empty without support."""
-        return "DS" if len(self.support) > 1 else "".join(f"{side[0].upper()}S" for side in self.support)
+        return (
+            "DS"
+            if len(self.support) > 1
+            else "".join(f"{side[0].upper()}S" for side in self.support)
+        )
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,10 @@ def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float
         inside = (phase.start < plan.time) & (plan.time < phase.end)
         if not inside.any():
             continue
-        corners = [plan.feet[side].position[inside][0, :2] + foot_corners[side][:, :2] for side in phase.support]
+        corners = [
+            plan.feet[side].position[inside][0, :2] + foot_corners[side][:, :2]
+            for side in phase.support
+        ]
         distance = support_margin(plan.zmp[inside], np.concatenate(corners))
         if distance.min() < margin:
             time = plan.time[inside][distance.argmin()]

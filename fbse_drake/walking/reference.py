@@ -146,30 +146,48 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         InputError: a step out of reach, the ZMP too near the edge, a joint beyond its limits, an unknown joint.
     """
     if isinstance(config, Recorded):
-        raise InputError("a recorded motion is not simulated without its log: see fbse compare and fbse study")
+        raise InputError(
+            "a recorded motion is not simulated without its log: see fbse compare and fbse study"
+        )
     if isinstance(config, JointSines):
         return _joint_sines(config, robot, time)
     if not robot.has_floating_base:
-        raise InputError(f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines")
+        raise InputError(
+            f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
+        )
     legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
     lateral = {side: float(np.sign(leg.offsets[:, 1].sum())) for side, leg in legs.items()}
     corners = {side: robot.pad_positions(side) for side in legs}
     gravity = robot.plant.gravity_field().gravity_vector()
     plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
     try:
-        joint_motion, base, motions = _inverse_kinematics(robot, legs, plan, _posture(config.posture, robot.description))
+        joint_motion, base, motions = _inverse_kinematics(
+            robot, legs, plan, _posture(config.posture, robot.description)
+        )
     except np.linalg.LinAlgError:
-        raise InputError("a leg is stretched out straight, where its joint velocities are not defined; lower com_height") from None
+        raise InputError(
+            "a leg is stretched out straight, where its joint velocities are not defined; lower com_height"
+        ) from None
     _check_limits(robot, time, joint_motion.position, plan)
     torque = _feedforward(robot, plan, joint_motion, base, motions)
-    return Reference(time, joint_motion.position, joint_motion.velocity, joint_motion.acceleration, torque, base, plan)
+    return Reference(
+        time,
+        joint_motion.position,
+        joint_motion.velocity,
+        joint_motion.acceleration,
+        torque,
+        base,
+        plan,
+    )
 
 
 def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarray:
     """Positions of all joints, those of the legs at zero, shape (n,)."""
     for joint in posture:
         if joint not in names.joints:
-            raise InputError(f"posture.{joint}: expected a joint that is no leg's (there are: {', '.join(names.joints) or 'none'})")
+            raise InputError(
+                f"posture.{joint}: expected a joint that is no leg's (there are: {', '.join(names.joints) or 'none'})"
+            )
     return names.per_joint(posture, key="posture", default=0.0)
 
 
@@ -195,20 +213,30 @@ def _inverse_kinematics(
                 q[side] = leg.inverse(level, plan.feet[side].position - p_WB, start=q.get(side))
             except UnreachableError as error:
                 raise InputError(_unreachable(plan, side, error)) from None
-        com = p_WB + (base_moment + sum(leg.forward(q[side]).moment for side, leg in legs.items())) / total_mass
+        com = (
+            p_WB
+            + (base_moment + sum(leg.forward(q[side]).moment for side, leg in legs.items()))
+            / total_mass
+        )
         correction = plan.com.position - com
         p_WB = p_WB + correction
         if np.abs(correction).max() < _COM_TOLERANCE:
             break
     else:
-        raise InputError(f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change com_height")
+        raise InputError(
+            f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change com_height"
+        )
 
     # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m.
     still = {side: leg.forward(q[side]) for side, leg in legs.items()}
-    gain = {side: m.J_moment @ np.linalg.inv(m.J)[:, :, 3:] / total_mass for side, m in still.items()}
+    gain = {
+        side: m.J_moment @ np.linalg.inv(m.J)[:, :, 3:] / total_mass for side, m in still.items()
+    }
     lever = np.eye(3) - sum(gain.values())
 
-    def solve(com: np.ndarray, feet: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def solve(
+        com: np.ndarray, feet: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         right = com - sum(np.einsum("nij,nj->ni", gain[side], feet[side]) for side in legs)
         base = np.linalg.solve(lever, right[:, :, None])[:, :, 0]
         return base, {side: feet[side] - base for side in legs}
@@ -221,12 +249,24 @@ def _inverse_kinematics(
     for side, motion in motions.items():
         solved = _solve_leg(motion.J, motion.Jdot_v[:, :3], motion.Jdot_v[:, 3:])
         foot_bias[side] = solved
-        com_bias += (motion.Jdot_v_moment - np.einsum("nij,nj->ni", motion.J_moment, solved)) / total_mass
-    a_WB, relative = solve(plan.com.acceleration - com_bias, {side: plan.feet[side].acceleration for side in legs})
-    a = {side: _solve_leg(motions[side].J, np.zeros((samples, 3)), relative[side]) - foot_bias[side] for side in legs}
+        com_bias += (
+            motion.Jdot_v_moment - np.einsum("nij,nj->ni", motion.J_moment, solved)
+        ) / total_mass
+    a_WB, relative = solve(
+        plan.com.acceleration - com_bias, {side: plan.feet[side].acceleration for side in legs}
+    )
+    a = {
+        side: _solve_leg(motions[side].J, np.zeros((samples, 3)), relative[side]) - foot_bias[side]
+        for side in legs
+    }
 
     others = np.tile(posture[6 * len(legs) :], (samples, 1))
-    joints = PointMotion(*(np.hstack([*values.values(), still]) for values, still in ((q, others), (v, 0 * others), (a, 0 * others))))
+    joints = PointMotion(
+        *(
+            np.hstack([*values.values(), still])
+            for values, still in ((q, others), (v, 0 * others), (a, 0 * others))
+        )
+    )
     return joints, PointMotion(p_WB, v_WB, a_WB), motions
 
 
@@ -255,7 +295,13 @@ def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan 
         )
 
 
-def _feedforward(robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointMotion, motions: dict[str, LegMotion]) -> np.ndarray:
+def _feedforward(
+    robot: Robot,
+    plan: TaskPlan,
+    joints: PointMotion,
+    base: PointMotion,
+    motions: dict[str, LegMotion],
+) -> np.ndarray:
     """Joint torques that let the model follow the reference, feet loaded so that the ZMP is where inverse dynamics has it.
 
     Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot, the place
@@ -268,8 +314,14 @@ def _feedforward(robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointM
     positions[:, robot.base.floating_positions_start() + 4 :][:, :3] = base.position
     positions[:, robot.position_index] = joints.position
     start = robot.base.floating_velocities_start_in_v()
-    rates, accelerations = np.zeros((samples, plant.num_velocities())), np.zeros((samples, plant.num_velocities()))
-    for target, linear, joint in ((rates, base.velocity, joints.velocity), (accelerations, base.acceleration, joints.acceleration)):
+    rates, accelerations = (
+        np.zeros((samples, plant.num_velocities())),
+        np.zeros((samples, plant.num_velocities())),
+    )
+    for target, linear, joint in (
+        (rates, base.velocity, joints.velocity),
+        (accelerations, base.acceleration, joints.acceleration),
+    ):
         target[:, start + 3 : start + 6] = linear
         target[:, robot.velocity_index] = joint
     generalized = np.empty((samples, plant.num_velocities()))
@@ -282,19 +334,30 @@ def _feedforward(robot: Robot, plan: TaskPlan, joints: PointMotion, base: PointM
     # Total contact wrench: moment about the base origin and force, world axes.
     moment, force = generalized[:, start : start + 3], generalized[:, start + 3 : start + 6]
     # Its ZMP: where the horizontal moment vanishes on the ground.
-    zmp = base.position[:, :2] + (np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2]) / force[:, 2:]
+    zmp = (
+        base.position[:, :2]
+        + (np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2])
+        / force[:, 2:]
+    )
     weights, cops = share_load(plan, zmp)
-    spin = moment[:, 2] - ((zmp[:, 0] - base.position[:, 0]) * force[:, 1] - (zmp[:, 1] - base.position[:, 1]) * force[:, 0])
+    spin = moment[:, 2] - (
+        (zmp[:, 0] - base.position[:, 0]) * force[:, 1]
+        - (zmp[:, 1] - base.position[:, 1]) * force[:, 0]
+    )
     torque = generalized[:, robot.velocity_index].copy()
     for k, (side, motion) in enumerate(motions.items()):
         F = weights[side][:, None] * force
         arm = np.hstack([cops[side], np.zeros((samples, 1))]) - plan.feet[side].position
         M = np.cross(arm, F) + np.stack([0 * spin, 0 * spin, weights[side] * spin], axis=1)
-        torque[:, 6 * k : 6 * k + 6] -= np.einsum("nji,nj->ni", motion.J, np.concatenate([M, F], axis=1))
+        torque[:, 6 * k : 6 * k + 6] -= np.einsum(
+            "nji,nj->ni", motion.J, np.concatenate([M, F], axis=1)
+        )
     return torque
 
 
-def share_load(plan: TaskPlan, zmp: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def share_load(
+    plan: TaskPlan, zmp: np.ndarray
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Load share and centre of pressure of each foot.
 
     The share follows the planned ZMP along the line between the points where it rests in each foot (`plan.rest_point`); the centres
@@ -309,8 +372,12 @@ def share_load(plan: TaskPlan, zmp: np.ndarray) -> tuple[dict[str, np.ndarray], 
     first, second = plan.feet
     anchor = {side: plan.feet[side].position[:, :2] + plan.rest_point[side] for side in plan.feet}
     between = anchor[first] - anchor[second]
-    place = np.einsum("ni,ni->n", plan.zmp - anchor[second], between) / np.einsum("ni,ni->n", between, between)
-    share = np.where(plan.support(first), np.where(plan.support(second), np.clip(place, 0.0, 1.0), 1.0), 0.0)
+    place = np.einsum("ni,ni->n", plan.zmp - anchor[second], between) / np.einsum(
+        "ni,ni->n", between, between
+    )
+    share = np.where(
+        plan.support(first), np.where(plan.support(second), np.clip(place, 0.0, 1.0), 1.0), 0.0
+    )
     shares = {first: share, second: 1.0 - share}
     offset = zmp - sum(shares[side][:, None] * anchor[side] for side in plan.feet)
     return shares, {side: anchor[side] + offset for side in plan.feet}
@@ -321,18 +388,26 @@ def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Referenc
         raise InputError("JointSines needs a robot with a fixed base (robot.gantry_height)")
     names = robot.description
     posture, amplitude, frequency, phase = (
-        names.per_joint(getattr(config, key), key=key, default=0.0) for key in ("posture", "amplitude", "frequency", "phase")
+        names.per_joint(getattr(config, key), key=key, default=0.0)
+        for key in ("posture", "amplitude", "frequency", "phase")
     )
     motion = [np.empty((len(time), len(posture))) for _ in range(3)]
     for joint in range(len(posture)):
-        for order, values in enumerate(smooth_sine(time, frequency[joint], config.ramp, float(time[-1]), phase[joint])):
-            motion[order][:, joint] = amplitude[joint] * values + (posture[joint] if order == 0 else 0.0)
+        for order, values in enumerate(
+            smooth_sine(time, frequency[joint], config.ramp, float(time[-1]), phase[joint])
+        ):
+            motion[order][:, joint] = amplitude[joint] * values + (
+                posture[joint] if order == 0 else 0.0
+            )
     plant = robot.plant
     context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
     torque = np.empty_like(motion[0])
     rates, accelerations = np.zeros(plant.num_velocities()), np.zeros(plant.num_velocities())
     for k in range(len(time)):
-        rates[robot.velocity_index], accelerations[robot.velocity_index] = motion[1][k], motion[2][k]
+        rates[robot.velocity_index], accelerations[robot.velocity_index] = (
+            motion[1][k],
+            motion[2][k],
+        )
         robot.set_joint_positions(context, motion[0][k])
         plant.SetVelocities(context, rates)
         plant.CalcForceElementsContribution(context, forces)
@@ -340,7 +415,9 @@ def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Referenc
     _check_limits(robot, time, motion[0], None)
     still = np.zeros((len(time), 3))
     X_WB = robot.base.EvalPoseInWorld(context)
-    return Reference(time, *motion, torque, PointMotion(still + X_WB.translation(), still, still), None)
+    return Reference(
+        time, *motion, torque, PointMotion(still + X_WB.translation(), still, still), None
+    )
 
 
 class ReferenceSource(Diagram):
@@ -360,9 +437,13 @@ class ReferenceSource(Diagram):
     def __init__(self, reference: Reference):
         super().__init__()
         builder = DiagramBuilder()
-        position = PiecewisePolynomial.CubicHermite(reference.time, reference.joint_position.T, reference.joint_velocity.T)
+        position = PiecewisePolynomial.CubicHermite(
+            reference.time, reference.joint_position.T, reference.joint_velocity.T
+        )
         torque = PiecewisePolynomial.FirstOrderHold(reference.time, reference.feedforward_torque.T)
-        desired_state = builder.AddNamedSystem("desired_state", TrajectorySource(position, output_derivative_order=1))
+        desired_state = builder.AddNamedSystem(
+            "desired_state", TrajectorySource(position, output_derivative_order=1)
+        )
         feedforward = builder.AddNamedSystem("feedforward_torque", TrajectorySource(torque))
         builder.ExportOutput(desired_state.get_output_port(), "desired_state")
         builder.ExportOutput(feedforward.get_output_port(), "feedforward_torque")

@@ -8,7 +8,9 @@ from fbse_drake.errors import require_positive
 from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
 
 
-def smooth_sine(time: np.ndarray, frequency: float, ramp: float, duration: float, phase: float = 0.0) -> list[np.ndarray]:
+def smooth_sine(
+    time: np.ndarray, frequency: float, ramp: float, duration: float, phase: float = 0.0
+) -> list[np.ndarray]:
     """A sine that swells from rest over `ramp` [s] and dies out before `duration` [s]; with its first two derivatives."""
     rise = [smooth_step(time / ramp, k) / ramp**k for k in range(3)]
     fall = [(-1.0) ** k * smooth_step((duration - time) / ramp, k) / ramp**k for k in range(3)]
@@ -18,7 +20,11 @@ def smooth_sine(time: np.ndarray, frequency: float, ramp: float, duration: float
         rise[2] * fall[0] + 2 * rise[1] * fall[1] + rise[0] * fall[2],
     ]
     w = 2 * np.pi * frequency
-    sine = [np.sin(w * time + phase), w * np.cos(w * time + phase), -(w**2) * np.sin(w * time + phase)]
+    sine = [
+        np.sin(w * time + phase),
+        w * np.cos(w * time + phase),
+        -(w**2) * np.sin(w * time + phase),
+    ]
     return [
         envelope[0] * sine[0],
         envelope[1] * sine[0] + envelope[0] * sine[1],
@@ -49,21 +55,37 @@ class _Stand:
         require_positive(self, "frequency", "ramp", "com_height", "foot_spacing")
 
     def _plan(
-        self, axis: int, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float
+        self,
+        axis: int,
+        time: np.ndarray,
+        lateral: dict[str, float],
+        foot_corners: dict[str, np.ndarray],
+        gravity: float,
     ) -> TaskPlan:
         com = [np.zeros((len(time), 3)) for _ in range(3)]
         com[0][:, 2] = self.com_height
-        for order, values in enumerate(smooth_sine(time, self.frequency, self.ramp, float(time[-1]))):
+        for order, values in enumerate(
+            smooth_sine(time, self.frequency, self.ramp, float(time[-1]))
+        ):
             com[order][:, axis] += self.amplitude * values
         still = np.zeros((len(time), 3))
         feet = {
-            side: PointMotion(still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still)
+            side: PointMotion(
+                still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still
+            )
             for side, sign in lateral.items()
         }
         # A point mass: the ZMP is where the line along (acceleration - gravity) meets the ground.
         zmp = com[0][:, :2] - com[2][:, :2] * (com[0][:, 2] / (gravity + com[2][:, 2]))[:, None]
         rest_point = {side: np.array([self.zmp_forward, 0.0]) for side in lateral}
-        plan = TaskPlan(time, PointMotion(*com), feet, zmp, (Phase(0.0, float(time[-1]), tuple(lateral)),), rest_point)
+        plan = TaskPlan(
+            time,
+            PointMotion(*com),
+            feet,
+            zmp,
+            (Phase(0.0, float(time[-1]), tuple(lateral)),),
+            rest_point,
+        )
         check_zmp(plan, foot_corners, self.zmp_margin)
         return plan
 
@@ -72,7 +94,13 @@ class _Stand:
 class Squat(_Stand):
     """The CoM moves up and down."""
 
-    def plan(self, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float) -> TaskPlan:
+    def plan(
+        self,
+        time: np.ndarray,
+        lateral: dict[str, float],
+        foot_corners: dict[str, np.ndarray],
+        gravity: float,
+    ) -> TaskPlan:
         """See `Walk.plan`."""
         return self._plan(2, time, lateral, foot_corners, gravity)
 
@@ -81,6 +109,12 @@ class Squat(_Stand):
 class Sway(_Stand):
     """The CoM moves to the left and right."""
 
-    def plan(self, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float) -> TaskPlan:
+    def plan(
+        self,
+        time: np.ndarray,
+        lateral: dict[str, float],
+        foot_corners: dict[str, np.ndarray],
+        gravity: float,
+    ) -> TaskPlan:
         """See `Walk.plan`."""
         return self._plan(1, time, lateral, foot_corners, gravity)

@@ -45,9 +45,18 @@ class Walk:
     posture: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_positive(self, "initial_double_support", "single_support", "double_support", "com_height", "foot_spacing")
+        require_positive(
+            self,
+            "initial_double_support",
+            "single_support",
+            "double_support",
+            "com_height",
+            "foot_spacing",
+        )
         if self.single_supports < 1:
-            raise InputError(f"single_supports: expected a whole number >= 1, found {self.single_supports}")
+            raise InputError(
+                f"single_supports: expected a whole number >= 1, found {self.single_supports}"
+            )
         require_not_negative(self, "step_height")
 
     def phases(self, sides: tuple[str, str], duration: float) -> list[Phase]:
@@ -57,14 +66,20 @@ class Walk:
             InputError: `first_support` is no side of this robot.
         """
         if self.first_support not in sides:
-            raise InputError(f"first_support: expected one of {', '.join(sides)}, found {self.first_support}")
+            raise InputError(
+                f"first_support: expected one of {', '.join(sides)}, found {self.first_support}"
+            )
         other = next(side for side in sides if side != self.first_support)
         support = [self.first_support if k % 2 == 0 else other for k in range(self.single_supports)]
         # Rounded to a nanosecond, so that a phase ends on a control tick where it should.
         phases = [Phase(0.0, round(self.initial_double_support, 9), sides)]
         for side in support:
-            phases.append(Phase(phases[-1].end, round(phases[-1].end + self.single_support, 9), (side,)))
-            phases.append(Phase(phases[-1].end, round(phases[-1].end + self.double_support, 9), sides))
+            phases.append(
+                Phase(phases[-1].end, round(phases[-1].end + self.single_support, 9), (side,))
+            )
+            phases.append(
+                Phase(phases[-1].end, round(phases[-1].end + self.double_support, 9), sides)
+            )
         last = phases[-1]
         return [*phases[:-1], Phase(last.start, max(last.end, duration), sides)]
 
@@ -77,12 +92,20 @@ class Walk:
         for k, (number, phase) in enumerate(singles):
             stance = phase.support[0]
             swing = next(side for side in sides if side != stance)
-            landing = x[stance] + (0.0 if k == len(singles) - 1 and len(singles) > 1 else self.step_length)
+            landing = x[stance] + (
+                0.0 if k == len(singles) - 1 and len(singles) > 1 else self.step_length
+            )
             result[number] = (swing, x[swing], landing)
             x[swing] = landing
         return result
 
-    def plan(self, time: np.ndarray, lateral: dict[str, float], foot_corners: dict[str, np.ndarray], gravity: float) -> TaskPlan:
+    def plan(
+        self,
+        time: np.ndarray,
+        lateral: dict[str, float],
+        foot_corners: dict[str, np.ndarray],
+        gravity: float,
+    ) -> TaskPlan:
         """CoM, feet and ZMP at `time` (N,) [s].
 
         Args:
@@ -96,16 +119,26 @@ class Walk:
         phases = self.phases(tuple(lateral), float(time[-1]))
         footholds = self.footholds(phases)
         feet = {side: self._foot(side, lateral[side], time, phases, footholds) for side in lateral}
-        rest_point = {side: np.array([self.zmp_forward, -sign * self.zmp_inward]) for side, sign in lateral.items()}
+        rest_point = {
+            side: np.array([self.zmp_forward, -sign * self.zmp_inward])
+            for side, sign in lateral.items()
+        }
         zmp, com = self._com(phases, footholds, lateral, rest_point, gravity)
         height = [np.full((len(time), 1), value) for value in (self.com_height, 0.0, 0.0)]
         com_motion = PointMotion(*(np.hstack([com(time, k), height[k]]) for k in range(3)))
-        plan = TaskPlan(time, com_motion, feet, zmp(np.clip(time, 0, zmp.x[-1])), tuple(phases), rest_point)
+        plan = TaskPlan(
+            time, com_motion, feet, zmp(np.clip(time, 0, zmp.x[-1])), tuple(phases), rest_point
+        )
         check_zmp(plan, foot_corners, self.zmp_margin)
         return plan
 
     def _foot(
-        self, side: str, lateral: float, time: np.ndarray, phases: list[Phase], footholds: dict[int, tuple[str, float, float]]
+        self,
+        side: str,
+        lateral: float,
+        time: np.ndarray,
+        phases: list[Phase],
+        footholds: dict[int, tuple[str, float, float]],
     ) -> PointMotion:
         position = np.tile([self.start, lateral * self.foot_spacing / 2, 0.0], (len(time), 1))
         velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
@@ -143,12 +176,16 @@ class Walk:
         for number, phase in enumerate(phases):
             if phase.is_single:
                 side = phase.support[0]
-                targets.append(np.array([x[side], lateral[side] * self.foot_spacing / 2]) + rest_point[side])
+                targets.append(
+                    np.array([x[side], lateral[side] * self.foot_spacing / 2]) + rest_point[side]
+                )
                 x[footholds[number][0]] = footholds[number][2]
         targets.append(np.array([np.mean(list(x.values())) + self.zmp_forward, 0.0]))
 
         # Double supports move, single supports rest, and after the last double support the robot stands.
-        breaks = [phase.start for phase in phases] + [round(phases[-1].start + self.double_support, 9)]
+        breaks = [phase.start for phase in phases] + [
+            round(phases[-1].start + self.double_support, 9)
+        ]
         moves = []
         for number, phase in enumerate(phases):
             k = (number + 1) // 2
@@ -162,12 +199,16 @@ class Walk:
         def polynomial(step: np.ndarray, offset: np.ndarray, bumps: np.ndarray) -> PPoly:
             c = _STEP[:, None, None] * step + _BUMP[:, None, None] * bumps[:, None]
             c[-1] += offset
-            return PPoly(c / np.diff(breaks)[None, :, None] ** np.arange(6, -1, -1)[:, None, None], breaks)
+            return PPoly(
+                c / np.diff(breaks)[None, :, None] ** np.arange(6, -1, -1)[:, None, None], breaks
+            )
 
         step, offset = np.array([m[1] for m in moves]), np.array([m[0] for m in moves])
         plain = polynomial(step, offset, np.zeros(len(moves)))
         pieces = np.arange(len(moves))
-        first, last = (polynomial(0 * step, 0 * offset, pieces == bumped) for bumped in (0, len(phases) - 1))
+        first, last = (
+            polynomial(0 * step, 0 * offset, pieces == bumped) for bumped in (0, len(phases) - 1)
+        )
         ends = breaks[[0, -1]]
         # The CoM depends linearly on the ZMP: two bumps make its velocity vanish at both ends.
         speed = [solve_lipm(zmp, self.com_height, gravity)(ends, 1) for zmp in (plain, first, last)]
