@@ -149,7 +149,8 @@ def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
         changing = np.abs(values[1:, moving]).max(axis=1) > 0
         if changing.any() and (share := float(held[changing].mean())) > _REPEATED:
             late = 500 * evidence.period / (1 - share)
-            text = f"{100 * share:.0f} % of its samples repeat the one before: it comes {late:.2g} ms late on average; its noise is not white"
+            text = f"{100 * share:.0f} % of its samples repeat the one before: "
+            text += f"it comes {late:.2g} ms late on average; its noise is not white"
             yield remark("held", "warning", name, 1.0 / (1.0 - share), "samples", text)
 
 

@@ -58,7 +58,8 @@ class NeighbourTorque(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (np.roll(motion.command, 1, axis=-1),), (0.0,)
 
@@ -108,7 +109,8 @@ class TorqueDropouts(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         wave = sum(
             np.sin(2 * np.pi * frequency * motion.time) for frequency in _DROPOUT_FREQUENCIES

@@ -28,7 +28,8 @@ class TorqueGain(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:
         return (motion.command,), (0.0,)
 
@@ -51,7 +52,8 @@ class TorqueBias(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,  # noqa: ARG004
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[float], Sequence[float]]:
         return (1.0,), (0.0,)
 

@@ -138,13 +138,18 @@ class GroundSlope(ContactEffect):
     y: float = 0.0
 
     def contact(
-        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+        self,
+        ground: Ground,
+        plant: MultibodyPlantConfig,
+        friction: float,  # noqa: ARG002
     ) -> tuple[Ground, MultibodyPlantConfig]:
         return replace(ground, slope=[ground.slope[0] + self.x, ground.slope[1] + self.y]), plant
 
     @staticmethod
     def sole_motion(
-        pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
+        pad_force: np.ndarray,  # noqa: ARG004
+        pad_positions: np.ndarray,  # noqa: ARG004
+        time: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         still = _still(len(time))
         return np.stack([still + [1.0, 0.0, 0.0], still + [0.0, 1.0, 0.0]]), np.stack(
@@ -171,7 +176,10 @@ class GroundCompliance(ContactEffect):
     compliance: float = 0.0
 
     def contact(
-        self, ground: Ground, plant: MultibodyPlantConfig, friction: float
+        self,
+        ground: Ground,
+        plant: MultibodyPlantConfig,
+        friction: float,  # noqa: ARG002
     ) -> tuple[Ground, MultibodyPlantConfig]:
         # Drake puts the springs of both surfaces in series, so this adds to the compliance of the contact as a whole.
         share = 1.0 / (1.0 + self.compliance * ground.stiffness)

@@ -70,7 +70,8 @@ class ViscousFriction(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (motion.velocity,), (1.0,)
 
@@ -225,7 +226,8 @@ class DirectionalViscousFriction(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         return (np.abs(motion.velocity),), (np.sign(motion.velocity),)
 
@@ -282,7 +284,8 @@ class QuadraticDrag(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         speed = np.abs(motion.velocity)
         return (motion.velocity * speed,), (2.0 * speed,)

@@ -104,7 +104,7 @@ class SensorEffect(Effect):
         memory: np.ndarray,
         values: ResolvedEffect,
         robot: Robot,
-        period: float,
+        period: float,  # noqa: ARG003
     ) -> SensorSignals:
         """What the sensors ought to read over a whole log if this is what they read.
 
@@ -180,7 +180,10 @@ class FootForceGain(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,
     ) -> SensorSignals:
         gain = _pads_of(values.linear[0], robot)
         return replace(signals, pad_force=(1.0 + gain[:, None]) * signals.pad_force)
@@ -205,7 +208,10 @@ class FootForceBias(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,
     ) -> SensorSignals:
         has_pads = np.array([bool(leg.pads) for leg in robot.description.legs.values()])
         signals = replace(
@@ -239,7 +245,10 @@ class FootMomentBias(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,
     ) -> SensorSignals:
         return _with_wrenches(
             signals, np.concatenate([values.linear, np.zeros_like(values.linear)]).T, robot
@@ -270,7 +279,10 @@ class FootForceMisalignment(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,
     ) -> SensorSignals:
         wrenches = _wrenches(signals.pad_force, robot)
         # S: the axes that the sensors really have.
@@ -308,7 +320,10 @@ class FootForceLag(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,  # noqa: ARG004
+        robot: Robot,
     ) -> SensorSignals:
         read_last, stays = np.moveaxis(memory[:6], 0, -1), memory[6][..., None]
         return _with_wrenches(
@@ -344,7 +359,7 @@ class FootForceLag(SensorEffect):
     def undone(
         cls,
         measured: SensorSignals,
-        memory: np.ndarray,
+        memory: np.ndarray,  # noqa: ARG003
         values: ResolvedEffect,
         robot: Robot,
         period: float,
@@ -384,7 +399,10 @@ class AccelerometerGain(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         return replace(signals, specific_force=(1.0 + values.linear[0, 0]) * signals.specific_force)
 
@@ -410,7 +428,10 @@ class AccelerometerBias(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         return replace(signals, specific_force=signals.specific_force + values.linear[:, 0])
 
@@ -435,7 +456,10 @@ class GyroscopeBias(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         return replace(signals, angular_velocity=signals.angular_velocity + values.linear[:, 0])
 
@@ -467,7 +491,10 @@ class ImuMisalignment(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         # S: the axes that the sensors really have.
         R_IS = Rotation.from_rotvec(values.linear[:, 0]).as_matrix()
@@ -496,7 +523,10 @@ class EncoderOffset(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         return replace(signals, joint_position=signals.joint_position + values.linear[0])
 
@@ -534,7 +564,10 @@ class TransmissionElasticity(SensorEffect):
 
     @staticmethod
     def reading(
-        signals: SensorSignals, memory: np.ndarray, values: ResolvedEffect, robot: Robot
+        signals: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         (compliance,), (time_constant,) = values.linear, values.nonlinear
         followed, command = memory

@@ -64,7 +64,8 @@ class JointSpring(JointTorqueEffect):
 
     @staticmethod
     def basis(
-        motion: JointMotion, nonlinear: np.ndarray
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:
         return (motion.position, 1.0), (0.0, 0.0)
 
