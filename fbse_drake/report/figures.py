@@ -173,7 +173,7 @@ def run_figures(
             "Joint torques",
             "Commanded torque and the feed-forward torque of the plan. What lies between the two is friction and whatever else the plan "
             "leaves out.",
-            True,
+            "joint/torque_command" in log,
             lambda: torques(log),
         ),
         (
