@@ -370,7 +370,9 @@ def test_a_recording_of_a_robot_is_enough(
     assert "nan" not in printed
 
 
-def test_estimate_without_torques_says_so_in_a_line(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_estimate_without_torques_says_so_in_a_line(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
     untold = without_estimates(Log.load(walk / "log.npz"), "truth/", "joint/torque_command")
     untold.save(tmp_path / "untold.npz")
     arguments = ["estimate", *WALK, str(tmp_path / "untold.npz"), "--out", str(tmp_path / "out")]
@@ -378,7 +380,9 @@ def test_estimate_without_torques_says_so_in_a_line(walk: Path, tmp_path: Path, 
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
     printed = capsys.readouterr().out.splitlines()
     assert "The friction is not known: the log has no joint/torque_command." in printed
-    assert sum(line.startswith("Noise believed in, per sample: joint angle") for line in printed) == 1
+    assert (
+        sum(line.startswith("Noise believed in, per sample: joint angle") for line in printed) == 1
+    )
     log = Log.load(tmp_path / "out/log.npz")
     assert "estimate/base/velocity" in log
     assert "estimate/joint/friction_torque" not in log
