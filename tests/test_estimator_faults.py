@@ -305,7 +305,7 @@ REMAINS = {
     "residual": 1e-9,
     "base_velocity": 3e-3,
     "rotation": 1e-3,
-    "joint_acceleration": 1e-9,
+    "joint_acceleration": 0.05,
     "bias": 0.02,
     "support": 0,
     "joint_position": 0,
