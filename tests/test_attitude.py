@@ -6,11 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import Accelerometer, Gyroscope
 from rig import CLOCK, TICK, Base, Rig, numbers, pack, rms, robot_copy
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.spatial import (
     normalized,
     quaternion_from_gravity,
@@ -32,7 +39,9 @@ class Attitude(Rig):
     def __init__(self, base: Base = BASE, sensors: SensorBeliefs = USUAL_SENSORS, **config: float):
         types = base.monitor.posterior_type, base.model.posterior_type
         super().__init__(
-            AttitudeEstimator(AttitudeConfig(**config), sensors, base.robot, *types, CLOCK)
+            AttitudeEstimator(
+                AttitudeConfig(**config), sensors, ImuMount(base.robot).R_BI, *types, CLOCK
+            )
         )
         self._base = base
         self.fix(model=self.feet(np.eye(3)))
@@ -306,3 +315,50 @@ def test_innovations_are_as_large_as_believed():
     # 6000 values of chi-square with one degree of freedom, 4 sigma.
     assert np.mean(nis) == pytest.approx(1, abs=4 * math.sqrt(2 / 6000))
     assert rms(posterior["rotation"] - np.eye(3)) < 1e-3
+
+
+def test_an_imu_in_a_diagram_of_ones_own_tells_the_tilt():
+    """Drake's own sensors on a pendulum that swings by 0.1 rad, and its IMU turned on the link."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    link = plant.AddRigidBody("link", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    X_LA = RigidTransform([0.0, 0.0, 1.0])
+    hinge = plant.AddJoint(
+        RevoluteJoint(
+            "hinge",
+            plant.world_frame(),
+            plant.AddFrame(FixedOffsetFrame("a", link.body_frame(), X_LA)),
+            [0, 1, 0],
+        )
+    )
+    plant.Finalize()
+    X_LI = RigidTransform(RollPitchYaw(0.3, -0.2, 0.5), [0.05, 0.0, 0.1])
+    gravity = plant.gravity_field().gravity_vector()
+    accelerometer = builder.AddSystem(Accelerometer(link, X_LI, gravity))
+    gyroscope = builder.AddSystem(Gyroscope(link, X_LI))
+    poses = plant.get_body_poses_output_port()
+    velocities = plant.get_body_spatial_velocities_output_port()
+    accelerations = plant.get_body_spatial_accelerations_output_port()
+    builder.Connect(poses, accelerometer.get_body_poses_input_port())
+    builder.Connect(velocities, accelerometer.get_body_velocities_input_port())
+    builder.Connect(accelerations, accelerometer.get_body_accelerations_input_port())
+    builder.Connect(poses, gyroscope.get_body_poses_input_port())
+    builder.Connect(velocities, gyroscope.get_body_velocities_input_port())
+    config = AttitudeConfig(level_feet=0.0, motion_acceleration=0.3, standing_time=0.0)
+    ports = accelerometer.get_measurement_output_port(), gyroscope.get_measurement_output_port()
+    R_LI = X_LI.rotation().matrix()
+    attitude = AttitudeEstimator.AddToBuilder(
+        builder, *ports, period=1e-3, R_BI=R_LI, config=config
+    )
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    hinge.set_angle(plant.GetMyMutableContextFromRoot(context), 0.1)
+    orientation, errors = attitude.GetOutputPort("orientation"), []
+    for time in np.arange(0.5, 6.0, 0.1):
+        simulator.AdvanceTo(time)
+        q = orientation.Eval(attitude.GetMyContextFromRoot(context))
+        true = plant.EvalBodyPoseInWorld(plant.GetMyContextFromRoot(context), link)
+        up = Rotation.from_quat(q, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+        errors.append(np.linalg.norm(np.cross(up, true.rotation().matrix()[2])))
+    # Gravity alone, whose direction the acceleration hides, would be off by the whole swing.
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02

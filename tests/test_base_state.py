@@ -23,6 +23,7 @@ from fbse_drake.estimators.base_state import (
 )
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
@@ -40,7 +41,7 @@ class BaseState(Rig):
     def __init__(self, kind: type[BaseStateEstimator], config: AdaptiveLipm | ContactAided):
         readings, model = BASE.monitor.posterior_type, BASE.model.posterior_type
         self._attitude = AttitudeEstimator(
-            AttitudeConfig(), USUAL_SENSORS, BASE.robot, readings, model, CLOCK
+            AttitudeConfig(), USUAL_SENSORS, ImuMount(BASE.robot).R_BI, readings, model, CLOCK
         )
         types = readings, self._attitude.posterior_type, model
         super().__init__(kind(config, BASE.robot, *types, CLOCK, (0.0, 0.0)))

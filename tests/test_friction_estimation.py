@@ -14,6 +14,7 @@ from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.friction import (
     ModelAided,
     ModelAidedEstimator,
@@ -36,7 +37,7 @@ ACCELERATION = JointAccelerationEstimator(
     BASE.robot,
     READINGS,
     AttitudeEstimator(
-        AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK
+        AttitudeConfig(), USUAL_SENSORS, ImuMount(BASE.robot).R_BI, READINGS, MODEL, CLOCK
     ).posterior_type,
     MODEL,
     CLOCK,

@@ -17,6 +17,7 @@ from fbse_drake.estimators.base_filter import InvariantFilter
 from fbse_drake.estimators.base_state import ContactAided
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -30,7 +31,9 @@ from fbse_drake.scenario import RobotConfig
 GRAVITY = 9.81
 BASE = Base.of()
 READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
-ATTITUDE = AttitudeEstimator(AttitudeConfig(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK)
+ATTITUDE = AttitudeEstimator(
+    AttitudeConfig(), USUAL_SENSORS, ImuMount(BASE.robot).R_BI, READINGS, MODEL, CLOCK
+)
 PAPER = load_scenario("paper_walk_fbse", "paper_method").estimator
 # What an estimator believes of sensors without errors.
 EXACT = Fbse(

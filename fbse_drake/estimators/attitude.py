@@ -10,13 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from pydrake.math import RotationMatrix
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from fbse_drake.errors import require_not_negative, require_positive
-from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import (
+    Clock,
+    RecursiveEstimator,
+    Status,
+    connect_fields,
+)
 from fbse_drake.estimators.spatial import (
     Quaternion,
     Vector,
@@ -37,7 +41,6 @@ from fbse_drake.estimators.spatial import (
     vector,
     yaw_of,
 )
-from fbse_drake.robot.plant import Robot
 
 _NOT_FINITE = float(Status.NOT_FINITE)
 
@@ -452,7 +455,7 @@ class AttitudeEstimator(RecursiveEstimator):
         self,
         config: AttitudeConfig,
         sensors: SensorBeliefs,
-        robot: Robot,
+        R_BI: np.ndarray,
         measurements: np.dtype,
         model: np.dtype,
         clock: Clock,
@@ -460,6 +463,7 @@ class AttitudeEstimator(RecursiveEstimator):
         """Declares ports and state.
 
         Args:
+            R_BI: how the IMU sits in the base, (3, 3).
             measurements, model: types of the inputs' posteriors.
         """
         gravity, error = ("gg", "ga", "gb", "aa", "ab", "bb"), ("pp", "pb", "bb")
@@ -483,12 +487,49 @@ class AttitudeEstimator(RecursiveEstimator):
             innovation_variance=record_type(gravity=(), quaternion=(), feet=()),
         )
         super().__init__(posterior_type, clock)
-        R_BI = ImuMount(robot).R_BI
         q_IB = RotationMatrix(R_BI.T).ToQuaternion().wxyz()
         self._known = record(config=config, sensors=sensors, R_BI=R_BI, q_IB=q_IB)
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior("measurements", "model")
+
+    @classmethod
+    def AddToBuilder(
+        cls,
+        builder: DiagramBuilder,
+        specific_force: OutputPort,
+        angular_velocity: OutputPort,
+        *,
+        period: float,
+        R_BI: np.ndarray | None = None,
+        config: AttitudeConfig | None = None,
+        sensors: SensorBeliefs = USUAL_SENSORS,
+    ) -> "AttitudeEstimator":
+        """Adds one that knows an IMU and nothing else to anybody's diagram.
+
+        Args:
+            specific_force, angular_velocity: what the IMU measures in its axes, (3,) each
+                [m/s^2, rad/s].
+            period: tick [s].
+            R_BI: how the IMU sits in the base, (3, 3); by default in its axes.
+
+        Returns:
+            The estimator, whose output ports are `orientation` and the other fields.
+        """
+        triple = (3,)
+        readings = record_type(
+            trust=(2,), support=(0,), specific_force=triple, angular_velocity=triple
+        )
+        no_feet = record_type(status=(), foot_rotation=(0, 3, 3))
+        R_BI = np.eye(3) if R_BI is None else R_BI
+        clock = Clock(period, period * (1 - 1e-6))
+        types = (readings, no_feet)
+        system = cls(config or AttitudeConfig(), sensors, R_BI, *types, clock)
+        builder.AddSystem(system)
+        imu = {"specific_force": specific_force, "angular_velocity": angular_velocity}
+        connect_fields(builder, system.GetInputPort("measurements"), readings, imu)
+        connect_fields(builder, system.GetInputPort("model"), no_feet, {})
+        return system
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray

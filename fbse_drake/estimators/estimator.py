@@ -17,7 +17,7 @@ from fbse_drake.estimators.base_state import (
     ContactAidedEstimator,
 )
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
-from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.floating_base import FloatingBaseModel, ImuMount
 from fbse_drake.estimators.friction import (
     FrictionConfig,
     ModelAided,
@@ -240,8 +240,9 @@ class EstimatorDiagram(Diagram):
         """Attitude first, then the base state."""
         measurements, model = self._type("sensor_monitor"), self._type("model")
         kinds = (measurements, model)
+        R_BI = ImuMount(robot).R_BI
         attitude = self._add(
-            "attitude", AttitudeEstimator(config.attitude, self._sensors, robot, *kinds, clock)
+            "attitude", AttitudeEstimator(config.attitude, self._sensors, R_BI, *kinds, clock)
         )
         self._join(attitude, measurements="sensor_monitor", model="model")
         shared = (robot, measurements, self._type("attitude"), model, clock, origin)

@@ -2,13 +2,23 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 
 import numpy as np
 from numba import njit
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, State
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    State,
+)
+from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from fbse_drake.estimators.records import as_record, parts, size_of
 
@@ -157,3 +167,21 @@ class RecursiveEstimator(LeafSystem):
 
     def _remember(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state().set_value(0, self._posterior.Eval(context))
+
+
+def connect_fields(
+    builder: DiagramBuilder, target: InputPort, kind: np.dtype, ports: Mapping[str, OutputPort]
+) -> None:
+    """Feeds an input that takes a record from plain ports, field by field.
+
+    Args:
+        kind: type of the record.
+        ports: by field, flat; a field without one is zero.
+    """
+    sizes = {name: part.stop - part.start for name, part in parts(kind).items()}
+    joined = builder.AddSystem(Multiplexer(list(sizes.values())))
+    for i, (name, size) in enumerate(sizes.items()):
+        zero = None if name in ports else builder.AddSystem(ConstantVectorSource(np.zeros(size)))
+        source = ports[name] if zero is None else zero.get_output_port()
+        builder.Connect(source, joined.get_input_port(i))
+    builder.Connect(joined.get_output_port(), target)
