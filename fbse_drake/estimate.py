@@ -98,6 +98,7 @@ def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
         noise = differentiated_noise(sensors.encoders.angle_noise, float(log.meta["period"]))
         encoders = replace(sensors.encoders, velocity="exact", velocity_noise=noise)
         scenario = replace(scenario, sensors=replace(sensors, encoders=encoders))
+        return replace(scenario.believed_sensors, joint_velocity_derived=True)
     return scenario.believed_sensors
 
 

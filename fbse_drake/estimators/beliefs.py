@@ -31,6 +31,8 @@ class SensorBeliefs:
     joint_velocity_noise: float | None = None
     # Are joint velocities differences of counted angles, which may repeat themselves?
     joint_velocity_counted: bool | None = None
+    # Are they made of the angles by the reader of a log, so that they cannot contradict them?
+    joint_velocity_derived: bool | None = None
     # Accelerometer [m/s^2] and gyro [rad/s].
     acceleration_noise: float | None = None
     angular_velocity_noise: float | None = None
@@ -70,6 +72,7 @@ USUAL_SENSORS = SensorBeliefs(
     joint_position_noise=1.5e-5,
     joint_velocity_noise=5.0e-4,
     joint_velocity_counted=False,
+    joint_velocity_derived=False,
     acceleration_noise=0.02,
     angular_velocity_noise=1.0e-3,
     force_noise=0.5,
@@ -97,4 +100,4 @@ def beliefs_of(
     floors = {name: _FINEST * getattr(USUAL_SENSORS, name) for name in stated}
     noises = {name: max(noise, floors[name]) for name, noise in stated.items()}
     counted = differenced and encoders.resolution > 0
-    return SensorBeliefs(**noises, joint_velocity_counted=counted)
+    return SensorBeliefs(**noises, joint_velocity_counted=counted, joint_velocity_derived=False)

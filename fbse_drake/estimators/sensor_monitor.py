@@ -265,7 +265,7 @@ def _watch_sensors(
         known: record with the values of `SensorMonitorConfig` as `limits` and of `SensorBeliefs` as
             `beliefs`; the mass that the feet carry [kg], 0 where they need not; which foot each pad
             belongs to; the thresholds of `detect_support`; whether joint velocities are
-            `counted`; and how long a `reading` takes, see `Clock`.
+            `counted` or `derived`; and how long a `reading` takes, see `Clock`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged
@@ -292,7 +292,9 @@ def _watch_sensors(
         elapsed,
         math.inf if known.counted else after,
     )
-    if _watch_joints(posterior, last, elapsed, sensors, known) and trust[0] == _OK:
+    # Velocities that are derived from the angles come late and tell nothing of their own.
+    comparable = math.nan if known.derived else elapsed
+    if _watch_joints(posterior, last, comparable, sensors, known) and trust[0] == _OK:
         trust[0] = _IMPLAUSIBLE
     trust[1] = _watch_channels(
         trust[1],
@@ -463,6 +465,7 @@ class SensorMonitor(RecursiveEstimator):
             limits=config,
             beliefs=beliefs,
             counted=bool(beliefs.joint_velocity_counted),
+            derived=bool(beliefs.joint_velocity_derived),
             reading=clock.reading,
             weighed_mass=mass if checks_load else 0.0,
             pad_foot=FootPads(robot).foot,
