@@ -218,7 +218,7 @@ def test_base_pose_is_the_recordings_own(estimated: EstimationResult) -> None:
     assert np.sqrt(np.mean(tilt[fresh] ** 2)) < 0.8
     # Yaw is that of the start.
     drift = np.rad2deg(yaw(found) - yaw(own))
-    assert np.abs(drift - drift[:100].mean())[fresh].max() < 3.0
+    assert np.abs(drift - drift[:100].mean())[fresh].max() < 3.2
 
 
 def test_at_rest_the_tilt_is_that_of_the_accelerometer(estimated: EstimationResult) -> None:

@@ -18,7 +18,7 @@ from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.records import as_record, record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import (
     Rotation,
     Vector,
@@ -802,12 +802,12 @@ def _estimate_base(
     is_fresh = trust[0] == 0
     for sensor in range(1, len(trust)):
         is_fresh = is_fresh and (trust[sensor] == 0 or trust[sensor] == _IMPLAUSIBLE)
-    if was_known and is_fresh:
+    if was_known and is_fresh and elapsed <= LONGEST_COMPARED_TICK:
         relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
         _cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
-    elif not is_fresh:
+    elif not is_fresh or elapsed > LONGEST_COMPARED_TICK:
         x.check.age = 0.0
         x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:

@@ -22,6 +22,10 @@ from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from fbse_drake.estimators.records import as_record, parts, size_of
 
+# Sensors are compared with each other at ticks of at most this [s]. Between rarer readings healthy
+# ones differ as much as faulty ones, and nothing is said.
+LONGEST_COMPARED_TICK = 0.0025
+
 
 class Status(IntEnum):
     """What an estimator says of its inputs."""

@@ -15,7 +15,13 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status, start_share
+from fbse_drake.estimators.recursive import (
+    LONGEST_COMPARED_TICK,
+    Clock,
+    RecursiveEstimator,
+    Status,
+    start_share,
+)
 from fbse_drake.estimators.spatial import vector
 from fbse_drake.estimators.support import (
     MeasuredSupport,
@@ -292,8 +298,10 @@ def _watch_sensors(
         elapsed,
         math.inf if known.counted else after,
     )
-    # Velocities that are derived from the angles come late and tell nothing of their own.
-    comparable = math.nan if known.derived else elapsed
+    # Velocities that are made of the angles come late and tell nothing of their own.
+    comparable = elapsed
+    if known.derived or known.counted or elapsed > LONGEST_COMPARED_TICK:
+        comparable = math.nan
     if _watch_joints(posterior, last, comparable, sensors, known) and trust[0] == _OK:
         trust[0] = _IMPLAUSIBLE
     trust[1] = _watch_channels(

@@ -26,6 +26,9 @@ from fbse_drake.signals import Signal, signals_of
 # Time constant of the smoothing of joint velocities that are differentiated from angles [s]. Short:
 # estimators believe in noise, but not in lag.
 _DIFFERENTIATION_TIME = 0.001
+# The same where the clock that stamps the samples jitters, which differences take for motion; from
+# so much of a period on.
+_JITTER_TIME, _JITTER = 0.004, 0.05
 
 
 @in_library
@@ -65,9 +68,17 @@ class EncoderConfig(Sensor):
     def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:
         """Without `joint/velocity` the angles are differentiated and smoothed."""
         if "joint/velocity" not in log:
-            velocity = differentiate(log.time, log["joint/position"], _DIFFERENTIATION_TIME)
+            smoothing = _smoothing_time(log.time, float(log.meta["period"]))
+            velocity = differentiate(log.time, log["joint/position"], smoothing)
             log = replace(log, channels={**log.channels, "joint/velocity": velocity})
         return super().readings(robot, log)
+
+
+def _smoothing_time(time: np.ndarray, period: float) -> float:
+    """Time constant for `differentiate` [s]; samples may be missing, which is no jitter."""
+    periods = np.diff(time) / period
+    jitter = np.sqrt(np.mean((periods - np.round(periods)) ** 2)) if len(periods) else 0.0
+    return _JITTER_TIME if jitter > _JITTER else _DIFFERENTIATION_TIME
 
 
 def differentiate(time: np.ndarray, position: np.ndarray, time_constant: float) -> np.ndarray:
