@@ -357,7 +357,7 @@ def test_a_recording_of_a_robot_is_enough(
     )
     settled = kept > 300
     error = friction[settled] - truth[kept[settled] - 1]
-    assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(truth**2))
+    assert np.sqrt(np.mean(error**2)) < 0.6 * np.sqrt(np.mean(truth**2))
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["fell"], metrics["outcome"]) == (None, "recorded")
     assert math.isnan(metrics["friction_nrmse"]["stance"]["left_knee_pitch"])
