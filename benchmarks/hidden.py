@@ -685,7 +685,7 @@ class Store:
         os.environ |= dict.fromkeys(
             ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
         )
-        # Drake's diagrams hold on to what they were built of: a process that simulates again and again grows.
+        # The shells of systems written in Python are never freed: a process grows slowly.
         with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=10) as pool:
             for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
                 pass

@@ -16,7 +16,9 @@ from pydrake.systems.framework import BasicVector, Context
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.cross_check import cross_check, cross_check_type, firm_foot_rate
 from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME
 from fbse_drake.estimators.records import as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import (
@@ -61,31 +63,13 @@ _UNKNOWN_RATE, _UNKNOWN_ACCELERATION = 0.3, 3.0
 # An innovation is taken for a fault, and counts as little as makes it just likely, above this
 # quantile of chi^2 with three degrees of freedom (one in 3000).
 _GATE = 18.5
-# For how long innovations must agree to be no white noise [s], and how much larger than white noise
-# leaves it their mean square must be.
-_AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
-# Over which times accelerations are compared [s], and after how long without contradiction the
-# sensors are believed again.
-_BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
-# By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
-# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
-# long it takes to learn what they always do [s].
-_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
-# The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
-_ROLLING, _FIRM_SHARE = 0.4, 0.3
-# A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
-# that foot rests again [rad/s], or for so long [s].
-_RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
 # Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
 _MEMORY = 0.1
 # They stay within so many of the standard deviations that they had so long ago [s]: they hardly
 # walk, and a sensor that drifts faster is at fault. A deviation is at least so many random walks.
 _LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
-# A reading counts at most as much [m/s^2], so that it is soon forgotten.
-_LARGEST_ACCELERATION = 50.0
-# What the rate [rad/s] and the acceleration [m/s^2] are off by that standing feet show.
-_FOOT_RATE_ERROR, _FOOT_ACCELERATION_ERROR = 0.05, 0.3
-
+# What the rate is off by that standing feet show [rad/s].
+_FOOT_RATE_ERROR = 0.05
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
 _AT_REST, _WALKING_SPEED = 0.1, 0.03
@@ -334,7 +318,7 @@ def _update(
     count, excess = (1.0 + keep) / (1.0 - keep), 0.0
     for i in range(3):
         agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
-        excess += count * agreement[i] ** 2 - _AGREEMENT * S[i, i] / 3.0
+        excess += count * agreement[i] ** 2 - AGREEMENT * S[i, i] / 3.0
     W = _inverse(S)
     distance = dot(vector(innovation), rotate(W, vector(innovation)))
     widening = max(0.0, excess)
@@ -445,7 +429,7 @@ def _listen_to_foot(
     R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
     R_BF = rotation(model.foot_rotation[foot])
     p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
-    start, keep = _FEET + 6 * foot, math.exp(-elapsed / _AGREEMENT_TIME)
+    start, keep = _FEET + 6 * foot, math.exp(-elapsed / AGREEMENT_TIME)
     # Errors that last for some time, as white noise that leaves as much over many ticks.
     lasting = max(1.0, 2.0 * config.foot_time / elapsed) * max(1.0, _FIRM_LOAD / share) ** 2
     held = (_unrest(v) ** 2 - 1.0) * lasting
@@ -543,145 +527,6 @@ def _listen_to_forces(
 
 
 @njit(cache=True)
-def _clipped(a: Vector, limit: float) -> Vector:
-    return (
-        min(max(a[0], -limit), limit),
-        min(max(a[1], -limit), limit),
-        min(max(a[2], -limit), limit),
-    )
-
-
-@njit(cache=True)
-def _norm(a: Vector) -> float:
-    return math.sqrt(dot(a, a))
-
-
-@njit(cache=True)
-def _cross_check(
-    x: np.ndarray,
-    f_raw: Vector,
-    relative: Vector,
-    push: Vector,
-    load: np.ndarray,
-    rests: bool,
-    rolling: Vector,
-    rate: Vector,
-    elapsed: float,
-) -> None:
-    """Compares IMU, joints and foot forces, and says whom to doubt.
-
-    The accelerometer shows, with the joints' motion, how the centre of mass accelerates, and so do
-    the foot forces. The gyro shows, with the joints' motion, that a standing foot rests. Where they
-    contradict each other whoever changed more is doubted.
-
-    Args:
-        x: record of `check`, see `InvariantBaseFilter`.
-        f_raw, relative, push: acceleration of the IMU, of the centre of mass relative to it, and
-            by the foot forces, in base axes [m/s^2].
-        load: the feet's forces by the robot's mass, (feet, 3) [m/s^2].
-        rests: is there a foot that stands firmly?
-        rolling: its angular velocity, else zero [rad/s].
-        rate: the gyro's reading [rad/s].
-    """
-    limit = _LARGEST_ACCELERATION
-    a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
-    if x.age == 0.0:
-        for span in range(2):
-            put(x.mean[span, 0], a)
-            put(x.mean[span, 1], (0.0, 0.0, 0.0))
-            put(x.mean[span, 2], c)
-            for foot in range(len(load)):
-                put(x.load[span, foot], _clipped(vector(load[foot]), limit))
-        x.spread, x.rolling[:], x.doubt[:], x.agreed = 0.0, 0.0, 0.0, 0.0
-        x.was_firm = x.stepped = 0.0
-    brief, long = 1.0 - math.exp(-elapsed / _BRIEF), 1.0 - math.exp(-elapsed / _LONG)
-    x.age += elapsed
-    changes = 0.0
-    for i in range(3):
-        changes += min((a[i] - x.mean[0, 0, i]) ** 2 + (c[i] - x.mean[0, 2, i]) ** 2, 400.0)
-    x.spread += brief * (changes - x.spread)
-    for span in range(2):
-        gain = brief if span == 0 else long
-        for i in range(3):
-            x.mean[span, 0, i] += gain * (a[i] - x.mean[span, 0, i])
-            x.mean[span, 1, i] += gain * (b[i] - x.mean[span, 1, i])
-            x.mean[span, 2, i] += gain * (c[i] - x.mean[span, 2, i])
-            for foot in range(len(load)):
-                reading = min(max(load[foot, i], -limit), limit)
-                x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
-    for i in range(3):
-        x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
-    turned = _norm(subtract(rate, vector(x.last_rate)))
-    rolled = _norm(subtract(rolling, vector(x.last_rolling)))
-    if rests and x.was_firm > 0 and min(turned, rolled) > _RATE_STEP and x.stepped == 0:
-        x.doubt[:], x.doubt[0], x.stepped = 0.0, 1.0, elapsed
-    elif x.stepped > 0:
-        x.stepped += elapsed
-    x.was_firm = 1.0 if rests else 0.0
-    put(x.last_rate, rate)
-    put(x.last_rolling, rolling)
-    z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
-    excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
-    is_late = 0.0 < x.stepped < _PATIENCE
-    turns = _norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
-    turns = turns or (is_late and not rests)
-    if x.age < _LONG:
-        return
-    if not turns and excess < _CONTRADICTION:
-        x.agreed += elapsed
-    else:
-        x.agreed = 0.0
-        if x.doubt.max() == 0:
-            _blame(x, turns)
-    if x.agreed > _AGREED:
-        x.doubt[:], x.stepped = 0.0, 0.0
-    if x.doubt.max() == 0:
-        x.habit_age += elapsed
-        gain = elapsed / min(_HABIT_TIME, x.habit_age)
-        for i in range(3):
-            x.habit[i] += gain * (z[i] - x.habit[i])
-
-
-@njit(cache=True)
-def _blame(x: np.ndarray, turns: bool) -> None:
-    """Sets who is doubted: the IMU, or the feet whose forces changed most."""
-    change = np.zeros(4)
-    for k in range(3):
-        change[k] = _norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
-    if turns or change[0] + change[1] > change[2]:
-        x.doubt[0] = 1.0
-        return
-    feet, largest = len(x.doubt) - 1, 0.0
-    for foot in range(feet):
-        moved = _norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
-        x.doubt[1 + foot] = moved
-        largest = max(largest, moved)
-    for foot in range(feet):
-        x.doubt[1 + foot] = 1.0 if x.doubt[1 + foot] >= 0.5 * largest else 0.0
-
-
-@njit(cache=True)
-def _rolling(
-    stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray
-) -> tuple[bool, Vector]:
-    """Angular velocity of the standing foot that carries most, in base axes [rad/s].
-
-    Returns:
-        Does it carry enough to stand firmly? If not, the velocity is zero.
-    """
-    best = -1
-    for foot in range(len(stands)):
-        if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
-            best = foot
-    if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
-        return False, (0.0, 0.0, 0.0)
-    J, w_F = model.foot_jacobian[best], (0.0, 0.0, 0.0)
-    for j in range(6, J.shape[1]):
-        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
-    return True, add(w, rotate(rotation(model.foot_rotation[best]), w_F))
-
-
-@njit(cache=True)
 def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
@@ -753,7 +598,7 @@ def _estimate_base(
     mean_wrench = foot_wrenches(mean_force, known.pads.position, known.pads.foot, feet)
     weight = known.mass * 9.81
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
-    rests, rolling = _rolling(x.foot_standing, wrench, weight, w_now, model)
+    rests, rolling = firm_foot_rate(x.foot_standing, wrench, weight, w_now, model)
     if first:
         _start(x, measured, model, known)
     else:
@@ -806,7 +651,7 @@ def _estimate_base(
         relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
-        _cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
+        cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
     elif not is_fresh or elapsed > LONGEST_COMPARED_TICK:
         x.check.age = 0.0
         x.check.doubt[:] = 0.0
@@ -962,7 +807,7 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance is the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
-        check                  what `_cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
+        check                  what `cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
                                feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
                                50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
                                contradicts; `last_rate`, `last_rolling` (3,) and `was_firm` of
@@ -1076,19 +921,5 @@ def base_filter_type(robot: Robot) -> np.dtype:
         kept_for=(),
         leash=(2, 4, 3),
         leashed_for=(),
-        check=record_type(
-            doubt=(1 + feet,),
-            mean=(2, 3, 3),
-            load=(2, feet, 3),
-            rolling=(3,),
-            habit=(3,),
-            last_rate=(3,),
-            last_rolling=(3,),
-            was_firm=(),
-            stepped=(),
-            spread=(),
-            age=(),
-            habit_age=(),
-            agreed=(),
-        ),
+        check=cross_check_type(feet),
     )

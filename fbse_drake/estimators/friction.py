@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.plant import Robot
@@ -97,16 +98,10 @@ class ModelAided:
 
 FrictionConfig = RecursiveLeastSquares | ModelAided
 
-# For how long innovations must agree to be no noise [s], and how much larger than noise leaves it
-# their mean square must be then.
-_AGREEMENT_TIME, _AGREEMENT = 0.02, 3.0
 # An innovation counts as little as makes it just likely beyond so many standard deviations, ...
 _GATE = 5.0
 # ... and what the model does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
-# How long it takes to learn that the sensors are noisier than believed [s], and how much of that
-# one tick may tell.
-_NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
 
 
 @dataclass(frozen=True)
@@ -364,8 +359,8 @@ def _estimate_friction(
     regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
-    keep, keep_doubt = math.exp(-elapsed / _AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
-    count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / _NOISE_TIME)
+    keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
+    count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / NOISE_TIME)
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
@@ -422,13 +417,13 @@ def _estimate_friction(
             # Differences of innovations show the noise, whatever the model is wrong by ...
             change = innovation - last.innovation[joint]
             rough = (
-                min(_LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
+                min(LARGEST_SHARE, change * change / (2.0 * S)) if last.noise[joint] > 0 else 1.0
             )
             noise = max(1.0, noise * (1.0 + learning * (rough - 1.0)))
             # ... and their mean what the model is wrong by, beyond the noise.
             agreement = keep * last.agreement[joint] + (1.0 - keep) * likely * innovation
             posterior.agreement[joint] = agreement
-            if count * agreement * agreement > _AGREEMENT * S:
+            if count * agreement * agreement > AGREEMENT * S:
                 unexplained = column[0] / S * agreement / elapsed
                 P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
         else:

@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
+from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.spatial import (
@@ -22,9 +23,6 @@ from fbse_drake.estimators.spatial import (
     vector,
 )
 from fbse_drake.robot.plant import Robot
-
-# For how long innovations must agree to be no noise [s].
-_AGREEMENT_TIME = 0.02
 
 
 @dataclass(frozen=True)
@@ -240,7 +238,7 @@ def _foot_variance(
     sinks, it is believed to: by the mean that their noise does not reach, for as many ticks as that
     mean lasts. The running means are filled.
     """
-    keep, row = math.exp(-elapsed / _AGREEMENT_TIME), 0
+    keep, row = math.exp(-elapsed / AGREEMENT_TIME), 0
     count = (1.0 + keep) / (1.0 - keep)
     variance = np.empty(len(y))
     for foot in range(len(stands)):

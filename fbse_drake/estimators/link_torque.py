@@ -10,17 +10,13 @@ from numba import njit
 from pydrake.systems.framework import Context, State
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
 _NOT_FINITE = float(Status.NOT_FINITE)
-
-
-# How long it takes to learn that foot forces are noisier than believed [s], and how much of that
-# one tick may tell.
-_NOISE_TIME, _LARGEST_SHARE = 0.3, 9.0
 
 
 @njit(cache=True)
@@ -43,7 +39,7 @@ def _watch_forces(
     It shows in second differences, to which forces that change smoothly add little; one tick does
     not tell much, for a foot may just have landed.
     """
-    learning = 1.0 - math.exp(-elapsed / _NOISE_TIME)
+    learning = 1.0 - math.exp(-elapsed / NOISE_TIME)
     posterior.wrench[:] = wrench
     posterior.wrench_change[:] = wrench - last.wrench
     for foot in range(len(wrench)):
@@ -55,7 +51,7 @@ def _watch_forces(
         for i in range(6):
             bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
             share += bend * bend / (36.0 * excess * known.wrench_variance[foot, i])
-        learnt = excess * (1.0 + learning * (min(_LARGEST_SHARE, share) - 1.0))
+        learnt = excess * (1.0 + learning * (min(LARGEST_SHARE, share) - 1.0))
         posterior.force_noise[foot] = max(1.0, learnt)
 
 

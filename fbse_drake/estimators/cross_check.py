@@ -1,0 +1,192 @@
+"""Do IMU, joints and feet contradict each other, and whom is to be doubted?"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.spatial import (
+    Vector,
+    add,
+    dot,
+    put,
+    rotate,
+    rotation,
+    scale,
+    subtract,
+    vector,
+)
+
+# Over which times accelerations are compared [s], and after how long without contradiction the
+# sensors are believed again.
+_BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
+# By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
+# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
+# long it takes to learn what they always do [s].
+_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
+# The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
+_ROLLING, _FIRM_SHARE = 0.4, 0.3
+# A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
+# that foot rests again [rad/s], or for so long [s].
+_RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
+# A reading counts at most as much [m/s^2], so that it is soon forgotten.
+_LARGEST_ACCELERATION = 50.0
+
+
+def cross_check_type(feet: int) -> np.dtype:
+    """What `cross_check` remembers: `doubt` (1 + feet,) of the IMU and of each foot, and more."""
+    return record_type(
+        doubt=(1 + feet,),
+        mean=(2, 3, 3),
+        load=(2, feet, 3),
+        rolling=(3,),
+        habit=(3,),
+        last_rate=(3,),
+        last_rolling=(3,),
+        was_firm=(),
+        stepped=(),
+        spread=(),
+        age=(),
+        habit_age=(),
+        agreed=(),
+    )
+
+
+@njit(cache=True)
+def _clipped(a: Vector, limit: float) -> Vector:
+    return (
+        min(max(a[0], -limit), limit),
+        min(max(a[1], -limit), limit),
+        min(max(a[2], -limit), limit),
+    )
+
+
+@njit(cache=True)
+def _norm(a: Vector) -> float:
+    return math.sqrt(dot(a, a))
+
+
+@njit(cache=True)
+def cross_check(
+    x: np.ndarray,
+    f_raw: Vector,
+    relative: Vector,
+    push: Vector,
+    load: np.ndarray,
+    rests: bool,
+    rolling: Vector,
+    rate: Vector,
+    elapsed: float,
+) -> None:
+    """Compares IMU, joints and foot forces, and says whom to doubt.
+
+    The accelerometer shows, with the joints' motion, how the centre of mass accelerates, and so do
+    the foot forces. The gyro shows, with the joints' motion, that a standing foot rests. Where they
+    contradict each other whoever changed more is doubted.
+
+    Args:
+        x: record of `cross_check_type`, filled.
+        f_raw, relative, push: acceleration of the IMU, of the centre of mass relative to it, and
+            by the foot forces, in base axes [m/s^2].
+        load: the feet's forces by the robot's mass, (feet, 3) [m/s^2].
+        rests: is there a foot that stands firmly?
+        rolling: its angular velocity, else zero [rad/s].
+        rate: the gyro's reading [rad/s].
+    """
+    limit = _LARGEST_ACCELERATION
+    a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
+    if x.age == 0.0:
+        for span in range(2):
+            put(x.mean[span, 0], a)
+            put(x.mean[span, 1], (0.0, 0.0, 0.0))
+            put(x.mean[span, 2], c)
+            for foot in range(len(load)):
+                put(x.load[span, foot], _clipped(vector(load[foot]), limit))
+        x.spread, x.rolling[:], x.doubt[:], x.agreed = 0.0, 0.0, 0.0, 0.0
+        x.was_firm = x.stepped = 0.0
+    brief, long = 1.0 - math.exp(-elapsed / _BRIEF), 1.0 - math.exp(-elapsed / _LONG)
+    x.age += elapsed
+    changes = 0.0
+    for i in range(3):
+        changes += min((a[i] - x.mean[0, 0, i]) ** 2 + (c[i] - x.mean[0, 2, i]) ** 2, 400.0)
+    x.spread += brief * (changes - x.spread)
+    for span in range(2):
+        gain = brief if span == 0 else long
+        for i in range(3):
+            x.mean[span, 0, i] += gain * (a[i] - x.mean[span, 0, i])
+            x.mean[span, 1, i] += gain * (b[i] - x.mean[span, 1, i])
+            x.mean[span, 2, i] += gain * (c[i] - x.mean[span, 2, i])
+            for foot in range(len(load)):
+                reading = min(max(load[foot, i], -limit), limit)
+                x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
+    for i in range(3):
+        x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
+    turned = _norm(subtract(rate, vector(x.last_rate)))
+    rolled = _norm(subtract(rolling, vector(x.last_rolling)))
+    if rests and x.was_firm > 0 and min(turned, rolled) > _RATE_STEP and x.stepped == 0:
+        x.doubt[:], x.doubt[0], x.stepped = 0.0, 1.0, elapsed
+    elif x.stepped > 0:
+        x.stepped += elapsed
+    x.was_firm = 1.0 if rests else 0.0
+    put(x.last_rate, rate)
+    put(x.last_rolling, rolling)
+    z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
+    excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
+    is_late = 0.0 < x.stepped < _PATIENCE
+    turns = _norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
+    turns = turns or (is_late and not rests)
+    if x.age < _LONG:
+        return
+    if not turns and excess < _CONTRADICTION:
+        x.agreed += elapsed
+    else:
+        x.agreed = 0.0
+        if x.doubt.max() == 0:
+            _blame(x, turns)
+    if x.agreed > _AGREED:
+        x.doubt[:], x.stepped = 0.0, 0.0
+    if x.doubt.max() == 0:
+        x.habit_age += elapsed
+        gain = elapsed / min(_HABIT_TIME, x.habit_age)
+        for i in range(3):
+            x.habit[i] += gain * (z[i] - x.habit[i])
+
+
+@njit(cache=True)
+def _blame(x: np.ndarray, turns: bool) -> None:
+    """Sets who is doubted: the IMU, or the feet whose forces changed most."""
+    change = np.zeros(4)
+    for k in range(3):
+        change[k] = _norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
+    if turns or change[0] + change[1] > change[2]:
+        x.doubt[0] = 1.0
+        return
+    feet, largest = len(x.doubt) - 1, 0.0
+    for foot in range(feet):
+        moved = _norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
+        x.doubt[1 + foot] = moved
+        largest = max(largest, moved)
+    for foot in range(feet):
+        x.doubt[1 + foot] = 1.0 if x.doubt[1 + foot] >= 0.5 * largest else 0.0
+
+
+@njit(cache=True)
+def firm_foot_rate(
+    stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray
+) -> tuple[bool, Vector]:
+    """Angular velocity of the standing foot that carries most, in base axes [rad/s].
+
+    Returns:
+        Does it carry enough to stand firmly? If not, the velocity is zero.
+    """
+    best = -1
+    for foot in range(len(stands)):
+        if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
+            best = foot
+    if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
+        return False, (0.0, 0.0, 0.0)
+    J, w_F = model.foot_jacobian[best], (0.0, 0.0, 0.0)
+    for j in range(6, J.shape[1]):
+        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
+    return True, add(w, rotate(rotation(model.foot_rotation[best]), w_F))
