@@ -20,6 +20,7 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.floating_base import FloatingBaseModel, ImuMount
 from fbse_drake.estimators.friction import (
     FrictionConfig,
+    FrictionEstimator,
     ModelAided,
     ModelAidedEstimator,
     RecursiveLeastSquaresEstimator,
@@ -166,11 +167,13 @@ class EstimatorDiagram(Diagram):
         )
         self._connect_model(link_torque, "over_step")
         self._feed(link_torque, "torque_command")
-        kind = RecursiveLeastSquaresEstimator
+        shared = (robot, measurements, self._type("link_torque"), clock)
+        friction: FrictionEstimator
         if isinstance(config.friction, ModelAided):
-            kind = ModelAidedEstimator
-        kinds = (measurements, self._type("link_torque"))
-        friction = self._add("friction", kind(config.friction, robot, *kinds, clock))
+            friction = ModelAidedEstimator(config.friction, sensors, *shared)
+        else:
+            friction = RecursiveLeastSquaresEstimator(config.friction, *shared)
+        self._add("friction", friction)
         self._join(friction, measurements="sensor_monitor", link_torque="link_torque")
 
     def _add_momentum_observer(

@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
@@ -79,8 +80,9 @@ class ModelAided:
     disturbance_uncertainty: float = 0.1
     # Random walk of the parameters [its unit/sqrt(s)].
     parameter_walk: float = 0.0
-    # Time constant of the smoothing of the velocity that the model sees [s].
-    velocity_smoothing: float = 0.0015
+    # Time constant of the smoothing of the velocity that the model sees [s]; by default as long as
+    # the noise of the velocities asks for.
+    velocity_smoothing: float | None = None
     # What is taken while a leg swings: the `measurement` as in stance, or the `model` alone.
     swing: str = "measurement"
     # By what the nonlinear parameters (a transition velocity) may be wrong: the model is a mixture
@@ -91,7 +93,8 @@ class ModelAided:
     def __post_init__(self) -> None:
         require_not_negative(self, "parameter_uncertainty", "parameter_walk")
         require_not_negative(self, "disturbance_walk", "disturbance_uncertainty")
-        require_not_negative(self, "velocity_smoothing")
+        if self.velocity_smoothing is not None:
+            require_not_negative(self, "velocity_smoothing")
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
 
@@ -102,6 +105,8 @@ FrictionConfig = RecursiveLeastSquares | ModelAided
 _GATE = 5.0
 # ... and what the model does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
+# How fast the legs of a walking robot reverse, in its order of magnitude [rad/s^2].
+_REVERSAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -137,8 +142,10 @@ class FrictionRegressor:
     @cached_property
     def shaped(self) -> np.ndarray:
         """Which parameters' basis torques change with the nonlinear parameters."""
-        motion = JointMotion(np.full(len(self.initial), 0.1))
-        basis, other = (self.effect.basis(motion, f * self.nonlinear)[0] for f in (1.0, 2.0))
+        # Slow and fast: a sharp sign has long levelled off where a blunt one still rises.
+        velocity = np.geomspace(1e-6, 10.0, 50)[:, None] * np.ones(len(self.initial))
+        one, two = (f * self.nonlinear[:, None] for f in (1.0, 2.0))
+        basis, other = (self.effect.basis(JointMotion(velocity), x)[0] for x in (one, two))
         changes = [np.any(x != y) for x, y in zip(basis, other, strict=True)]
         return np.flatnonzero(changes) if self.factors else np.empty(0, dtype=int)
 
@@ -312,6 +319,19 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         posterior["friction"] = np.where(valid, smooth, (phi * parameters).sum(axis=1))
 
 
+def smoothing_time(noise: float, period: float) -> float:
+    """Time constant of a low-pass of first order that blurs as much as it lets noise through [s].
+
+    Over a reversal at acceleration a the time constant T lags by a T, and of white noise s at every
+    `period` h it leaves s sqrt(h / 2 T).
+
+    Args:
+        noise: standard deviation of a velocity [rad/s].
+        period: between two velocities [s].
+    """
+    return (noise**2 * period / (2 * _REVERSAL**2)) ** (1 / 3)
+
+
 @njit(cache=True)
 def smooth_velocity(
     posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
@@ -477,6 +497,7 @@ class ModelAidedEstimator(FrictionEstimator):
     def __init__(
         self,
         config: ModelAided,
+        sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
         link_torque: np.dtype,
@@ -491,7 +512,9 @@ class ModelAidedEstimator(FrictionEstimator):
         super().__init__(
             regressor, robot, measurements, link_torque, clock, regressor.weights + 2, **shapes
         )
-        self._config, self._smoothing = config, float(config.velocity_smoothing)
+        self._config, self._smoothing = config, config.velocity_smoothing
+        if self._smoothing is None:
+            self._smoothing = smoothing_time(sensors.joint_velocity_noise, clock.period)
         measures_swing = config.swing == "measurement"
         self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
 
