@@ -13,7 +13,8 @@ from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
-from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.friction import (
     ModelAided,
