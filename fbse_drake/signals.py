@@ -219,7 +219,8 @@ def channel_kind(channel: str) -> tuple[str, Shape]:
     for row in _TABLE:
         if re.fullmatch(row.channel, channel):
             return row.unit, row.shape
-    hint = "see fbse_drake.signals; that of a sensor of your own is one once its module is imported"
+    own = "that of a sensor or estimator of your own is one once its module is imported"
+    hint = f"see fbse_drake.signals; {own}"
     raise InputError(f"channel {channel}: not a channel of a log ({hint})")
 
 

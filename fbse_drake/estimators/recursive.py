@@ -122,6 +122,9 @@ class RecursiveEstimator(LeafSystem):
     `time`, that of its tick [s], NaN before the first; the second one of an estimator is `status`,
     see `Status`. A posterior that would not be finite is not taken: the last one is held and the
     status says so.
+
+    A subclass declares its inputs (`DeclareVectorInputPort`, `_declare_record_input`,
+    `_declare_remembered_input`), then calls `_declare_posterior`; its `_tick` makes the posterior.
     """
 
     def __init__(self, posterior_type: np.dtype, clock: Clock):
@@ -280,7 +283,8 @@ def connect_fields(
 
     Args:
         kind: type of the record.
-        fields: by name, each a port, flat, or a constant; those that are not given are zero.
+        fields: by name, each a port, flat, or a constant, one number for all or each; those that
+            are not given are zero.
 
     Raises:
         InputError: a field that the record has not, or of another size.
@@ -292,10 +296,10 @@ def connect_fields(
             raise InputError(f"{where}: there is no field {name} (there are: {', '.join(sizes)})")
     joined = builder.AddSystem(Multiplexer(list(sizes.values())))
     for i, (name, size) in enumerate(sizes.items()):
-        source = fields.get(name, np.zeros(size))
+        source = fields.get(name, 0.0)
         if not isinstance(source, OutputPort):
-            constant = ConstantVectorSource(np.ravel(np.asarray(source, dtype=float)))
-            source = builder.AddSystem(constant).get_output_port()
+            constant = np.full(size, source) if np.ndim(source) == 0 else np.ravel(source)
+            source = builder.AddSystem(ConstantVectorSource(constant)).get_output_port()
         if source.size() != size:
             found = source.size()
             raise InputError(f"{where}: field {name}: expected {size} numbers, found {found}")
