@@ -172,6 +172,7 @@ def test_estimator_and_compensation_of_a_user_s_own(folder: Path):
         ("def add", "def adds", r"estimator GearLoss: the method add is missing"),
         ("def system", "def systems", r"compensation DeadZone: the method system is missing"),
         ("joint/lost_power", "zmp", r"estimator GearLoss: channel estimate/zmp: there is one"),
+        ("joint/lost_power", "joint/lost_torque", r"channel estimate/joint/lost_torque: there is"),
         (
             '("friction", p',
             '("friction", model="model", make=p',
@@ -196,6 +197,15 @@ def test_what_does_not_fit_gets_one_line(folder: Path, old: str, new: str, messa
     with pytest.raises(InputError, match=message) as error:
         simulate(load_scenario(folder / "mine.yaml"))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_kind_of_channel_that_nobody_estimates_yet_is_free():
+    row = signals.estimated("joint/lost_torque", "friction", "lost", "Nm", ("n",))
+    signals.register(row)
+    assert signals.estimates()[-1] == row
+    with pytest.raises(InputError, match="there is one of this name"):
+        signals.register(signals.estimated("joint/lost_torque", "gear", "lost", "Nm", ("n",)))
 
 
 def test_systems_of_a_chain_share_what_feeds_them():

@@ -147,7 +147,7 @@ class InvariantFilter:
         """
         make = partial(InvariantBaseFilter, self, chain.sensors, chain.robot, origin=origin)
         chain.add("base_state", make, measurements="sensor_monitor", model="model")
-        chain.rename("base_state", "attitude")
+        chain.alias("base_state", "attitude")
         chain.connect("base_state.last_angular_velocity_bias", "model.angular_velocity_bias")
         chain.connect("base_state.last_doubt", "sensor_monitor.doubt")
 

@@ -62,7 +62,8 @@ class Chain:
 
         Its posterior's fields become channels as the table of signals says (`Estimator.signals`).
         Inputs that nothing is connected to take the signal of their name: what a sensor measures,
-        or `torque_command`.
+        or `torque_command` (which has to be that of the tick before where the command may depend on
+        the estimate: a remembered input).
 
         Args:
             make: the system's class, or a partial call of it; gets the types of the inputs that
@@ -80,8 +81,8 @@ class Chain:
             self.connect(source, f"{name}.{port}")
         return system
 
-    def rename(self, system: str, name: str) -> None:
-        """Lets a system stand for another, too: its fields are taken for that one's."""
+    def alias(self, system: str, name: str) -> None:
+        """Gives a system a second name, as one that does the work of two."""
         self._systems[name] = self._systems[system]
 
     def connect(self, source: str, target: str) -> None:
