@@ -1,7 +1,8 @@
-"""Libraries of classes that YAML files name by their tags: effects, sensors, estimators, compensations.
+"""Libraries of classes that YAML files name by their tags.
 
-Each kind has a base class with a static method `alternatives`, see `fbse_drake.schema`, and a class
-decorator `in_library` in the module of that base class.
+There are effects, sensors, estimators and compensations. Each kind has a base class with a static
+method `alternatives`, see `fbse_drake.schema`, and a class decorator `in_library` in the module of
+that base class.
 """
 
 from abc import ABCMeta

@@ -159,7 +159,7 @@ def test_estimator_and_compensation_of_a_user_s_own(folder: Path):
         (
             "!GearLoss",
             "!GearLosses",
-            r"estimator: expected one of !NoEstimator, .*!Fbse.*!GearLoss, found the tag !GearLosses",
+            r"estimator: expected one of !NoEst.*!Fbse.*!GearLoss, found the tag !GearLosses",
         ),
         (
             "!DeadZone",
@@ -392,7 +392,7 @@ def test_stages_in_a_diagram_of_ones_own(run: Run):
         ({"measurements": {}, "link_torque": {"torque": 0.0}}, r"there is no field torque \(there"),
         (
             {"measurements": {}, "link_torque": {"residual": [0.0, 0.0]}},
-            r"RecursiveLeastSquaresEstimator: input link_torque: field residual: expected 1 numbers",
+            r"Estimator: input link_torque: field residual: expected 1 numbers",
         ),
     ],
 )
