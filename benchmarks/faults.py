@@ -38,8 +38,7 @@ from scipy.signal import lfilter
 from benchmarks.fbse import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.estimate import Replay
-from fbse_drake.estimators.estimator import EstimatorDiagram
-from fbse_drake.estimators.reference_methods import NoEstimator
+from fbse_drake.estimators.estimator import EstimatorDiagram, NoEstimator
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import ended_step

@@ -26,7 +26,8 @@ from rich.progress import track
 from benchmarks.fbse import print_table
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.estimate import estimate
-from fbse_drake.estimators.estimator import DisturbanceObserver, EstimatorConfig
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import friction_error, joint_sides, run_metrics, settled, stance
@@ -102,7 +103,7 @@ CASES = (
 )
 
 
-def watchers(default: EstimatorConfig) -> Iterator[tuple[str, str, EstimatorConfig]]:
+def watchers(default: Estimator) -> Iterator[tuple[str, str, Estimator]]:
     """Method, variant and estimator of each that runs over a log."""
     yield "default", "", default
     for bandwidth in _BANDWIDTHS:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.estimator import Fbse, make_estimator
+from fbse_drake.estimators.estimator import make_estimator
 from fbse_drake.estimators.recursive import start_share
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
@@ -129,10 +129,8 @@ class Replay:
                 where = f"the estimator's input {name} ({channels})"
                 raise InputError(f"the log has no channel for {where}")
         self.estimator, self.time = estimator, log.time
-        self.remarks: tuple[str, ...] = ()
-        if isinstance(scenario.estimator, Fbse):
-            self.remarks = (sensors.text,)
-        if not estimator.knows_friction:
+        self.remarks = scenario.estimator.remarks(sensors)
+        if scenario.estimator.gives_friction and not estimator.knows_friction:
             self.remarks += ("The friction is not known: the log has no joint/torque_command.",)
         self.context = estimator.CreateDefaultContext()
         # Takes the update of every tick.

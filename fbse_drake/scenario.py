@@ -20,15 +20,14 @@ from pydrake.multibody.plant import (
 from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake import resources, schema
-from fbse_drake.control.compensation import CompensationConfig, NoCompensation
+from fbse_drake.control.compensation import Compensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs, beliefs_of
-from fbse_drake.estimators.estimator import EstimatorConfig, Fbse, believed_sensors
-from fbse_drake.estimators.reference_methods import FixedFriction, NoEstimator, TorqueSensor
+from fbse_drake.estimators.estimator import Estimator, NoEstimator
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.implicit import ImplicitTorque
 from fbse_drake.robot.plant import Ground, Robot, make_robot
@@ -242,7 +241,8 @@ class Scenario:
     seed: int = 0
     # Length of the experiment [s].
     duration: float = 11.5
-    # Python files (relative to the scenario's) or modules with effects and sensors of your own.
+    # Python files (relative to the scenario's) or modules with effects, sensors, estimators and
+    # compensations of your own.
     effect_modules: list[str] = field(default_factory=list)
     # What really happens.
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -257,9 +257,9 @@ class Scenario:
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
     # Who estimates the friction: !NoEstimator, !Fbse, or a reference method: !TrueFriction, !TorqueSensor, !DisturbanceObserver or
     # !FixedFriction.
-    estimator: EstimatorConfig = field(default_factory=NoEstimator)
+    estimator: Estimator = field(default_factory=NoEstimator)
     # What the controller makes of it: !NoCompensation, !IntegralCompensation or !FeedforwardCompensation.
-    compensation: CompensationConfig = field(default_factory=NoCompensation)
+    compensation: Compensation = field(default_factory=NoCompensation)
     fall: FallConfig = field(default_factory=FallConfig)
     log: LogConfig = field(default_factory=LogConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
@@ -296,14 +296,15 @@ class Scenario:
             raise InputError(
                 f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}"
             )
-        if isinstance(self.estimator, NoEstimator) and self.compensation.uses_estimate:
+        if self.compensation.uses_estimate and not self.estimator.gives_friction:
             raise InputError("compensation: needs an estimator (estimator: !Fbse {})")
-        if isinstance(self.estimator, TorqueSensor) and self.sensors.joint_torque is None:
-            raise InputError(
-                "estimator: !TorqueSensor needs sensors.joint_torque (as in sensors.joint_torque: {noise: 0.3})"
+        sensors = self.sensors.by_name
+        with located("estimator: "):
+            self.estimator.check_sensors(
+                [port for sensor in sensors.values() for port in sensor.ports()]
             )
         periods = {"control.period": self.control.period, "log.period": self.log.period}
-        for name, sensor in self.sensors.by_name.items():
+        for name, sensor in sensors.items():
             where = f"sensors.more.{name}" if name in self.sensors.more else f"sensors.{name}"
             times = {f"{where}.{key}": getattr(sensor, key) for key in sensor.whole_steps}
             periods |= {key: time for key, time in times.items() if time != 0}
@@ -325,7 +326,7 @@ class Scenario:
         """What the estimator believes of the sensors."""
         sensors = self.sensors
         usual = beliefs_of(sensors.encoders, sensors.imu, sensors.foot_force)
-        return believed_sensors(self.estimator, usual)
+        return self.estimator.believed_sensors(usual)
 
     @property
     def believed(self) -> RobotConfig:
@@ -443,12 +444,10 @@ def check_joints(scenario: Scenario) -> None:
         names.per_joint(getattr(scenario.control, key), key=f"control.{key}")
     for key in ("torque_noise", "torque_noise_share", "least_speed"):
         names.per_joint(getattr(scenario.recording, key), key=f"recording.{key}", default=0.0)
-    if scenario.compensation.uses_estimate:
-        scenario.compensation.low_pass(names)
-    if isinstance(scenario.estimator, FixedFriction):
-        scenario.estimator.model.resolve(names, key="estimator.model")
-    if isinstance(scenario.estimator, Fbse):
-        scenario.estimator.friction.model.resolve(names, key="estimator.friction.model")
+    with located("compensation."):
+        scenario.compensation.check(names)
+    with located("estimator."):
+        scenario.estimator.check(names)
 
 
 def dump_scenario(scenario: Scenario, name: str) -> str:

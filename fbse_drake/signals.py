@@ -1,6 +1,6 @@
 """The table of signals: ports of a station, channels of a log that they become, units and shapes.
 
-A sensor of a user's own adds its rows with `register`.
+Sensors and estimators of a user's own add their rows with `register`.
 """
 
 import re
@@ -51,16 +51,19 @@ class Signal:
         return tuple(size // known if axis == "m" else int(axis) for axis in shape)
 
 
-def _estimate(
+def estimated(
     channel: str,
     estimator: str,
     field: str,
     unit: str = "-",
     shape: Shape = ("m",),
 ) -> Signal:
-    """A field of an estimator's posterior, whose port is named like its channel.
+    """A row for a field of an estimator's posterior, whose port is named like its channel.
 
-    The unit "-" is that of the filter's own states, see its LeafSystem.
+    Args:
+        channel: its name, without `estimate/`.
+        estimator: name of the system in its chain.
+        unit: "-" for that of the filter's own states, see its LeafSystem.
     """
     name = f"estimate/{channel}"
     return Signal(name, unit, shape, name, estimator=estimator, field=field)
@@ -68,7 +71,7 @@ def _estimate(
 
 def _own(estimator: str, field: str, unit: str = "-", shape: Shape = ("m",)) -> Signal:
     """A field whose channel is named like its estimator and itself."""
-    return _estimate(f"{estimator}/{field}", estimator, field, unit, shape)
+    return estimated(f"{estimator}/{field}", estimator, field, unit, shape)
 
 
 def _status(estimator: str) -> Signal:
@@ -110,40 +113,40 @@ _TABLE: list[Signal] = [
     # What it is by the effects' laws, at the velocity that came out of the step.
     Signal("truth/joint/friction_law_torque", "Nm", ("n",)),
     # Estimates.
-    _estimate("sensors/status", "sensor_monitor", "trust", "1"),
-    _estimate("support", "sensor_monitor", "support", "1"),
+    estimated("sensors/status", "sensor_monitor", "trust", "1"),
+    estimated("support", "sensor_monitor", "support", "1"),
     _status("attitude"),
-    _estimate("base/orientation", "attitude", "orientation", "1", (4,)),
-    _estimate("imu/angular_velocity_bias", "attitude", "angular_velocity_bias", "rad/s", (3,)),
-    _estimate("imu/acceleration_bias", "attitude", "acceleration_bias", "m/s^2", (3,)),
+    estimated("base/orientation", "attitude", "orientation", "1", (4,)),
+    estimated("imu/angular_velocity_bias", "attitude", "angular_velocity_bias", "rad/s", (3,)),
+    estimated("imu/acceleration_bias", "attitude", "acceleration_bias", "m/s^2", (3,)),
     _own("attitude", "covariance"),
     _own("attitude", "innovation"),
     _own("attitude", "innovation_variance"),
     _status("base_state"),
-    _estimate("base/position", "base_state", "base_position", "m", (3,)),
-    _estimate("base/velocity", "base_state", "base_velocity", "m/s", (3,)),
-    _estimate("com/position", "base_state", "com_position", "m", (3,)),
-    _estimate("com/velocity", "base_state", "com_velocity", "m/s", (3,)),
-    _estimate("zmp", "base_state", "zmp", "m", (2,)),
+    estimated("base/position", "base_state", "base_position", "m", (3,)),
+    estimated("base/velocity", "base_state", "base_velocity", "m/s", (3,)),
+    estimated("com/position", "base_state", "com_position", "m", (3,)),
+    estimated("com/velocity", "base_state", "com_velocity", "m/s", (3,)),
+    estimated("zmp", "base_state", "zmp", "m", (2,)),
     # Standard deviations along the world's axes; of the attitude, of a rotation vector.
-    _estimate("base/attitude_std", "base_state", "attitude_std", "rad", (3,)),
-    _estimate("base/velocity_std", "base_state", "velocity_std", "m/s", (3,)),
-    _estimate("base/position_std", "base_state", "position_std", "m", (3,)),
+    estimated("base/attitude_std", "base_state", "attitude_std", "rad", (3,)),
+    estimated("base/velocity_std", "base_state", "velocity_std", "m/s", (3,)),
+    estimated("base/position_std", "base_state", "position_std", "m", (3,)),
     _own("base_state", "foot_innovation"),
     _own("base_state", "foot_innovation_variance"),
     _own("base_state", "covariance"),
     _own("base_state", "innovation"),
     _own("base_state", "innovation_variance"),
     _status("joint_acceleration"),
-    _estimate("joint/acceleration", "joint_acceleration", "joint_acceleration", "rad/s^2", ("n",)),
+    estimated("joint/acceleration", "joint_acceleration", "joint_acceleration", "rad/s^2", ("n",)),
     _own("joint_acceleration", "innovation"),
     _own("joint_acceleration", "innovation_variance"),
     _status("link_torque"),
-    _estimate("joint/link_torque", "link_torque", "link_torque", "Nm", ("n",)),
-    _estimate("joint/residual_torque", "link_torque", "residual", "Nm", ("n",)),
+    estimated("joint/link_torque", "link_torque", "link_torque", "Nm", ("n",)),
+    estimated("joint/residual_torque", "link_torque", "residual", "Nm", ("n",)),
     _status("friction"),
-    _estimate("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
-    _estimate("joint/friction_torque_std", "friction", "friction_std", "Nm", ("n",)),
+    estimated("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
+    estimated("joint/friction_torque_std", "friction", "friction_std", "Nm", ("n",)),
     _own("friction", "parameters", shape=("n", "m")),
     _own("friction", "parameter_variance", shape=("n", "m")),
     _own("friction", "innovation"),
@@ -175,8 +178,12 @@ def register(*signals: Signal) -> None:
     """
     new = [signal for signal in signals if signal not in _TABLE]
     for signal in new:
-        if any(re.fullmatch(row.channel, signal.channel) for row in _TABLE):
-            raise InputError(f"channel {signal.channel}: there is one of this name already")
+        kind = (signal.unit, signal.shape)
+        for row in _TABLE:
+            # A channel that comes from nowhere yet can have a port.
+            is_free = not row.port and (row.unit, row.shape) == kind
+            if re.fullmatch(row.channel, signal.channel) and not is_free:
+                raise InputError(f"channel {signal.channel}: there is one of this name already")
         if signal.port in ports():
             raise InputError(f"port {signal.port}: there is one of this name already")
     _TABLE.extend(new)
@@ -212,7 +219,8 @@ def channel_kind(channel: str) -> tuple[str, Shape]:
     for row in _TABLE:
         if re.fullmatch(row.channel, channel):
             return row.unit, row.shape
-    hint = "see fbse_drake.signals; that of a sensor of your own is one once its module is imported"
+    own = "that of a sensor or estimator of your own is one once its module is imported"
+    hint = f"see fbse_drake.signals; {own}"
     raise InputError(f"channel {channel}: not a channel of a log ({hint})")
 
 

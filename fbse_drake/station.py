@@ -21,7 +21,6 @@ from pydrake.systems.primitives import (
 )
 
 from fbse_drake import signals
-from fbse_drake.control.compensation import FrictionCompensation
 from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.contact import contact_with_effects
 from fbse_drake.effects.implicit import ImplicitLaw, implicit_law
@@ -305,7 +304,8 @@ def add_estimator(
     if estimator is None:
         return {}
     builder.AddNamedSystem("estimator", estimator)
-    connect_by_name(builder, ports, estimator)
+    with located("estimator: "):
+        connect_by_name(builder, ports, estimator)
     return outputs_by_name(estimator)
 
 
@@ -318,14 +318,17 @@ def add_compensation(
 ) -> None:
     """Adds what the controller makes of the estimate; without it, an input of the station."""
     target = controller.GetInputPort("friction_estimate")
-    if not scenario.compensation.uses_estimate:
-        builder.ExportInput(target, "friction_estimate")
-        return
-    period = scenario.control.period
-    system = FrictionCompensation(scenario.compensation, names, Clock(period, period * (1 - 1e-6)))
-    compensation = builder.AddNamedSystem("compensation", system)
-    builder.Connect(ports["friction_estimate"], compensation.get_input_port())
-    builder.Connect(compensation.GetOutputPort("torque"), target)
+    with located("compensation: "):
+        system = scenario.compensation.system(names, Clock.every(scenario.control.period))
+        if system is None:
+            builder.ExportInput(target, "friction_estimate")
+            return
+        builder.AddNamedSystem("compensation", system)
+        connect_by_name(builder, ports, system)
+        if not system.HasOutputPort("torque"):
+            found = ", ".join(outputs_by_name(system)) or "none"
+            raise InputError(f"expected an output port torque, found {found}")
+    builder.Connect(system.GetOutputPort("torque"), target)
 
 
 def add_meshcat(builder: DiagramBuilder, meshcat: Meshcat | None) -> None:

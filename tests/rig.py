@@ -11,7 +11,7 @@ from pydrake.systems.framework import System
 
 from fbse_drake import Log, Scenario, resources
 from fbse_drake.estimate import estimate
-from fbse_drake.estimators.estimator import EstimatorConfig, EstimatorDiagram, make_estimator
+from fbse_drake.estimators.estimator import Estimator, EstimatorDiagram, make_estimator
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.records import as_record, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
@@ -122,7 +122,7 @@ def part(log: Log, seconds: float) -> Log:
     )
 
 
-def estimated(log: Log, scenario: Scenario, config: EstimatorConfig, **changes: object) -> Log:
+def estimated(log: Log, scenario: Scenario, config: Estimator, **changes: object) -> Log:
     """The log with the estimates of another estimator."""
     return estimate(dataclasses.replace(scenario, estimator=config, **changes), log).log
 
@@ -138,7 +138,7 @@ def inputs_of(log: Log) -> dict[str, np.ndarray]:
     }
 
 
-def diagram(config: EstimatorConfig, scenario: Scenario) -> EstimatorDiagram:
+def diagram(config: Estimator, scenario: Scenario) -> EstimatorDiagram:
     """The estimator as the scenario's station has it."""
     believed = scenario.believed
     robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia)

@@ -17,7 +17,7 @@ from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.discrepancy.study import model_error, train_and_rest
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
-from fbse_drake.estimators.reference_methods import FixedFriction
+from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig

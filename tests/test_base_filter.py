@@ -19,7 +19,8 @@ from fbse_drake.estimators.base_filter import (
     InvariantFilter,
 )
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
-from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.records import as_record
 from fbse_drake.robot.plant import grasp_map

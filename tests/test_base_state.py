@@ -22,7 +22,7 @@ from fbse_drake.estimators.base_state import (
     ContactAidedEstimator,
 )
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
-from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig

@@ -15,13 +15,10 @@ from fbse_drake.control.compensation import (
     IntegralCompensation,
     NoCompensation,
 )
-from fbse_drake.estimators.estimator import Fbse
-from fbse_drake.estimators.reference_methods import (
-    NoEstimator,
-    TorqueSensor,
-    TorqueSensorEstimator,
-    TrueFriction,
-)
+from fbse_drake.estimators.estimator import NoEstimator
+from fbse_drake.estimators.fbse import Fbse
+from fbse_drake.estimators.torque_sensor import TorqueSensor, TorqueSensorEstimator
+from fbse_drake.estimators.true_friction import TrueFriction
 from fbse_drake.report.metrics import joint_tracking_rms
 from fbse_drake.robot.description import load_description
 from fbse_drake.sensors.joint_torque import JointTorqueConfig

@@ -9,8 +9,9 @@ from conftest import scenario
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
 from fbse_drake.estimate import estimate
-from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse, make_estimator
-from fbse_drake.estimators.reference_methods import NoEstimator
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.estimator import NoEstimator, make_estimator
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sensors.encoders import differentiate

@@ -13,18 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
-from fbse_drake.estimators.estimator import (
-    DisturbanceObserver,
-    EstimatorConfig,
-    Fbse,
-    FixedFriction,
-)
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.estimator import Estimator
+from fbse_drake.estimators.fbse import Fbse
+from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.estimators.recursive import RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 
 Run = Callable[..., Log]
 
-ESTIMATORS: dict[str, EstimatorConfig] = {
+ESTIMATORS: dict[str, Estimator] = {
     "best": Fbse(),
     "paper": load_scenario("paper_walk_fbse", "paper_method").estimator,
     "observer": DisturbanceObserver(),
@@ -276,7 +274,7 @@ def test_hard_walks_are_trusted(run: Run, overrides: tuple[str, ...]):
 
 
 def recorded(
-    walk: Log, config: EstimatorConfig, ticks: int
+    walk: Log, config: Estimator, ticks: int
 ) -> tuple[Replay, dict[RecursiveEstimator, dict[str, np.ndarray]]]:
     """The diagram's systems, each with samples (ticks, size) of all its input ports. They live as long as the diagram."""
     replay = Replay(diagram(config, scenario("paper_walk_fbse", "duration=3")))

@@ -13,14 +13,13 @@ from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
-from fbse_drake.estimators.estimator import DisturbanceObserver, Fbse
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.friction import (
     FrictionRegressor,
     ModelAided,
-    ModelAidedEstimator,
     RecursiveLeastSquares,
-    RecursiveLeastSquaresEstimator,
     recursive_least_squares,
     smooth_velocity,
     smoothing_time,
@@ -94,11 +93,8 @@ class Friction(Rig):
     def __init__(self, config: RecursiveLeastSquares | ModelAided):
         types = READINGS, MODEL, ACCELERATION.posterior_type
         self._link = LinkTorqueEstimator(USUAL_SENSORS, BASE.robot, *types, CLOCK)
-        shared = BASE.robot, READINGS, self._link.posterior_type, CLOCK
-        if isinstance(config, ModelAided):
-            super().__init__(ModelAidedEstimator(config, USUAL_SENSORS, *shared))
-        else:
-            super().__init__(RecursiveLeastSquaresEstimator(config, *shared))
+        inputs = {"measurements": READINGS, "link_torque": self._link.posterior_type}
+        super().__init__(config.system(USUAL_SENSORS, BASE.robot, **inputs, clock=CLOCK))
 
     def see(
         self,

@@ -244,7 +244,7 @@ def test_a_sensor_of_a_user_s_own(tmp_path: Path):
         (
             "StrainGauge",
             "JointTemperature",
-            r"sensor JointTemperature: there is another of this name",
+            r"sensor JointTemperature: the library has another sensor of this name",
         ),
     ],
 )

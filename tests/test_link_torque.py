@@ -16,7 +16,7 @@ from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.base_filter import InvariantFilter
 from fbse_drake.estimators.base_state import ContactAided
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
-from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,

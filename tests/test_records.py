@@ -8,19 +8,17 @@ from conftest import scenario
 from rig import Base, Replay, Rig, diagram, inputs_of, numbers
 
 from fbse_drake import Log, load_scenario
-from fbse_drake.estimators.estimator import (
-    DisturbanceObserver,
-    EstimatorConfig,
-    Fbse,
-    FixedFriction,
-)
+from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.estimator import Estimator
+from fbse_drake.estimators.fbse import Fbse
+from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.estimators.records import as_record, parts, record, record_type, size_of
 from fbse_drake.estimators.recursive import RecursiveEstimator
 from fbse_drake.estimators.support import MeasuredSupport
 
 FEW = record_type(time=(), anchor=(2, 3), covariance=record_type(pp=(), pv=(3,)), none=(0, 3))
 Run = Callable[..., Log]
-ESTIMATORS: dict[str, EstimatorConfig] = {
+ESTIMATORS: dict[str, Estimator] = {
     "best": Fbse(),
     "paper": load_scenario("paper_walk_fbse", "paper_method").estimator,
     "observer": DisturbanceObserver(),

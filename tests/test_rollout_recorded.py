@@ -15,7 +15,7 @@ from fbse_drake.effects.actuation import DcMotor
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
-from fbse_drake.estimators.reference_methods import FixedFriction
+from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.scenario import RobotConfig
 from fbse_drake.walking.reference import JointSines, Recorded
 

@@ -20,7 +20,7 @@ from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import rms as row_rms
 from fbse_drake.effects.friction import LoadDependentFriction
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.reference_methods import NoEstimator
+from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.robot.plant import Robot, grasp_map, make_robot
 from fbse_drake.scenario import Scenario, SensorsConfig
 from fbse_drake.walking.leg_kinematics import LegKinematics, UnreachableError

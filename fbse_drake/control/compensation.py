@@ -1,15 +1,25 @@
-"""What the controller makes of a friction estimate (paper Sec. 7.4)."""
+"""What the controller makes of a friction estimate (paper Sec. 7.4), and the library of it.
+
+A compensation is a frozen dataclass with its settings, which makes the system that compensates.
+Behind `@in_library` a scenario file can name it:
+
+    compensation: !FeedforwardCompensation {share: 0.8}
+
+One of a user's own is such a class in a module that the scenario names (`effect_modules`).
+"""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, System
 
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.library import require_new
 from fbse_drake.robot.description import RobotDescription
 
 
@@ -24,20 +34,86 @@ class LowPass(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NoCompensation:
+class Compensation(ABC):
+    """Base of the compensations: a frozen dataclass with their settings."""
+
+    uses_estimate: ClassVar[bool] = True
+
+    @staticmethod
+    def alternatives() -> tuple[type["Compensation"], ...]:
+        """What can stand for a compensation in a scenario file (see `fbse_drake.schema`)."""
+        return tuple(_LIBRARY.values())
+
+    @abstractmethod
+    def system(self, names: RobotDescription, clock: Clock) -> System | None:
+        """The system that compensates, if any.
+
+        Its output port `torque` (n,) [Nm] is added to the command. Its input ports are named like
+        the station's ports, of which it takes what it needs: `friction_estimate` (n,) [Nm] and
+        others, see `fbse_drake.station.Station`.
+
+        Raises:
+            InputError: see `check`.
+        """
+
+    def check(self, names: RobotDescription) -> None:  # noqa: B027
+        """Raises InputError for an unknown joint, or one without a value that it needs."""
+
+
+_LIBRARY: dict[str, type[Compensation]] = {}
+
+T = TypeVar("T", bound=type[Compensation])
+
+
+def in_library(compensation: T) -> T:
+    """Class decorator: puts a compensation into the library.
+
+    Raises:
+        InputError: it lacks a method, or there is another compensation of its name.
+    """
+    require_new(_LIBRARY, "compensation", compensation)
+    _LIBRARY[compensation.__name__] = compensation
+    return compensation
+
+
+def library() -> dict[str, type[Compensation]]:
+    """All compensations by class name."""
+    return dict(_LIBRARY)
+
+
+@in_library
+@dataclass(frozen=True)
+class NoCompensation(Compensation):
     """The estimate is only watched."""
 
     uses_estimate: ClassVar[bool] = False
 
+    def system(self, names: RobotDescription, clock: Clock) -> None:
+        """None."""
+
 
 @dataclass(frozen=True)
-class IntegralCompensation:
+class LowPassCompensation(Compensation):
+    """Base of those that pass the estimate on through a low-pass of first order for each joint."""
+
+    @abstractmethod
+    def low_pass(self, names: RobotDescription) -> LowPass:
+        """Raises InputError, see `check`."""
+
+    def check(self, names: RobotDescription) -> None:
+        self.low_pass(names)
+
+    def system(self, names: RobotDescription, clock: Clock) -> "FrictionCompensation":
+        return FrictionCompensation(self, names, clock)
+
+
+@in_library
+@dataclass(frozen=True)
+class IntegralCompensation(LowPassCompensation):
     """The paper's integral law (69), read as tau_tor_dot = k_i (u_F - tau_tor).
 
     That is the estimate through a low-pass of bandwidth k_i.
     """
-
-    uses_estimate: ClassVar[bool] = True
 
     # Integral gain by joint [rad/s]; the paper has 1 in the hip pitch, 4 in the ankle roll and 2
     # elsewhere.
@@ -49,15 +125,13 @@ class IntegralCompensation:
                 raise InputError(f"gain.{joint}: expected a number >= 0, found {value:g}")
 
     def low_pass(self, names: RobotDescription) -> LowPass:
-        """Raises InputError for an unknown joint, or one without a gain."""
-        return LowPass(names.per_joint(self.gain, key="compensation.gain"), 1.0, math.inf)
+        return LowPass(names.per_joint(self.gain, key="gain"), 1.0, math.inf)
 
 
+@in_library
 @dataclass(frozen=True)
-class FeedforwardCompensation:
+class FeedforwardCompensation(LowPassCompensation):
     """The estimate, low-passed and limited, is added to the command."""
-
-    uses_estimate: ClassVar[bool] = True
 
     # Cut-off of the low-pass of first order [Hz].
     cutoff: float = 20.0
@@ -73,12 +147,8 @@ class FeedforwardCompensation:
             raise InputError(f"share: expected a number in [0, 1], found {self.share:g}")
 
     def low_pass(self, names: RobotDescription) -> LowPass:
-        """The same for all joints."""
         rate = np.full(len(names.joint_names), 2 * math.pi * self.cutoff)
         return LowPass(rate, self.share, self.limit)
-
-
-CompensationConfig = NoCompensation | IntegralCompensation | FeedforwardCompensation
 
 
 class FrictionCompensation(RecursiveEstimator):
@@ -99,18 +169,13 @@ class FrictionCompensation(RecursiveEstimator):
     no status.)
     """
 
-    def __init__(
-        self,
-        config: IntegralCompensation | FeedforwardCompensation,
-        names: RobotDescription,
-        clock: Clock,
-    ):
+    def __init__(self, config: LowPassCompensation, names: RobotDescription, clock: Clock):
         """Raises InputError for an unknown joint, or one without a gain."""
         n = len(names.joint_names)
         super().__init__(record_type(time=(), torque=(n,)), clock)
         self._rate, self._share, self._limit = config.low_pass(names)
         self._estimate = self.DeclareVectorInputPort("friction_estimate", n)
-        self._declare_posterior("friction_estimate")
+        self._declare_posterior()
 
     def _tick(
         self,

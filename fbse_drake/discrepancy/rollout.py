@@ -11,7 +11,7 @@ from fbse_drake.discrepancy.servo import scaled_gains, stretches
 from fbse_drake.effects.effect import ResolvedEffect
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.reference_methods import NoEstimator
+from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RobotConfig, Scenario

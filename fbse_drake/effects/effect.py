@@ -19,6 +19,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 
 from fbse_drake.errors import InputError
+from fbse_drake.library import require_new
 from fbse_drake.robot.description import RobotDescription
 
 # A prismatic joint is to a revolute one as the end of a lever of this length to its axis [m]: plausible values are converted with it.
@@ -207,10 +208,7 @@ def in_library(effect: T) -> T:
     for name in ("description", "signature", "experiment", "parameters"):
         if not hasattr(effect, name):
             raise InputError(f"effect {effect.__name__}: the class variable {name} is missing")
-    if effect.__abstractmethods__:
-        raise InputError(
-            f"effect {effect.__name__}: the method {min(effect.__abstractmethods__)} is missing"
-        )
+    require_new(_LIBRARY, "effect", effect)
     names = [field.name for field in fields(effect)]
     if names != list(effect.parameters):
         raise InputError(
@@ -222,14 +220,6 @@ def in_library(effect: T) -> T:
                 f"effect {effect.__name__}: parameter {name} is not linear, so it is searched in its plausible range: "
                 f"expected 0 < low < high, found {parameter.plausible}"
             )
-    known = _LIBRARY.get(effect.__name__)
-    if known is not None and (known.__module__, known.__qualname__) != (
-        effect.__module__,
-        effect.__qualname__,
-    ):
-        raise InputError(
-            f"effect {effect.__name__}: the library has another effect of this name, in {known.__module__}"
-        )
     _LIBRARY[effect.__name__] = effect
     return effect
 

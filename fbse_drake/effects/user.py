@@ -1,4 +1,4 @@
-"""Effects of a user's own, from Python files or modules that a scenario names."""
+"""Classes of a user's own, from Python files or modules that a scenario names."""
 
 import importlib
 import importlib.util
@@ -10,7 +10,7 @@ from fbse_drake.errors import InputError
 
 
 def import_effect_modules(entries: Iterable[str], folder: Path) -> list[str]:
-    """Imports modules, whose effects then are in the library; each once per process.
+    """Imports modules, whose classes then are in the libraries; each once per process.
 
     Args:
         entries: names of modules, or paths of Python files (`*.py`), relative to `folder`.

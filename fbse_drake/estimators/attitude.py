@@ -5,6 +5,7 @@ A Kalman filter for gravity feeds an extended Kalman filter on the quaternion.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +15,10 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
+from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import (
-    Clock,
-    RecursiveEstimator,
-    Status,
-    connect_fields,
-)
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import (
     Quaternion,
     Vector,
@@ -41,6 +39,7 @@ from fbse_drake.estimators.spatial import (
     vector,
     yaw_of,
 )
+from fbse_drake.robot.plant import Robot
 
 _NOT_FINITE = float(Status.NOT_FINITE)
 
@@ -80,6 +79,11 @@ class AttitudeConfig:
             "level_feet",
         )
         require_positive(self, "motion_acceleration", "motion_time", "stance_time")
+
+    def add(self, chain: Chain) -> None:
+        """Adds `attitude` to a chain that has `sensor_monitor` and `model`."""
+        make = partial(AttitudeEstimator, self, chain.sensors, ImuMount(chain.robot).R_BI)
+        chain.add("attitude", make, measurements="sensor_monitor", model="model")
 
 
 class GravityEstimate(NamedTuple):
@@ -491,7 +495,16 @@ class AttitudeEstimator(RecursiveEstimator):
         self._known = record(config=config, sensors=sensors, R_BI=R_BI, q_IB=q_IB)
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
-        self._declare_posterior("measurements", "model")
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot | None = None) -> dict[str, np.dtype]:  # noqa: ARG004
+        """Those of an IMU alone, without feet."""
+        imu = {"specific_force": (3,), "angular_velocity": (3,)}
+        return {
+            "measurements": record_type(trust=(2,), support=(0,), **imu),
+            "model": record_type(status=(), foot_rotation=(0, 3, 3)),
+        }
 
     @classmethod
     def AddToBuilder(
@@ -516,20 +529,15 @@ class AttitudeEstimator(RecursiveEstimator):
         Returns:
             The estimator, whose output ports are `orientation` and the other fields.
         """
-        triple = (3,)
-        readings = record_type(
-            trust=(2,), support=(0,), specific_force=triple, angular_velocity=triple
-        )
-        no_feet = record_type(status=(), foot_rotation=(0, 3, 3))
-        R_BI = np.eye(3) if R_BI is None else R_BI
-        clock = Clock(period, period * (1 - 1e-6))
-        types = (readings, no_feet)
-        system = cls(config or AttitudeConfig(), sensors, R_BI, *types, clock)
-        builder.AddSystem(system)
         imu = {"specific_force": specific_force, "angular_velocity": angular_velocity}
-        connect_fields(builder, system.GetInputPort("measurements"), readings, imu)
-        connect_fields(builder, system.GetInputPort("model"), no_feet, {})
-        return system
+        return super().AddToBuilder(
+            builder,
+            {"measurements": imu, "model": {}},
+            period=period,
+            config=config or AttitudeConfig(),
+            sensors=sensors,
+            R_BI=np.eye(3) if R_BI is None else R_BI,
+        )
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray

@@ -9,18 +9,23 @@ acceleration of the centre of mass from the foot forces.
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
 from pydrake.systems.framework import BasicVector, Context
 
 from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.estimators.attitude import AttitudeConfig
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.cross_check import cross_check, cross_check_type, firm_foot_rate
-from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME
 from fbse_drake.estimators.records import as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
     Rotation,
     Vector,
@@ -86,6 +91,9 @@ class InvariantFilter:
     Errors that last are given by their size (standard deviation) and by how long they last.
     """
 
+    # Do monitor and model hear what it knows?
+    feeds_back: ClassVar[bool] = True
+
     # What a standing foot does in spite of all, because it rolls, tilts, slips or sinks: position
     # [m], orientation [rad], velocity [m/s] and angular velocity [rad/s] ...
     foot_position: float = 3.5e-4
@@ -129,6 +137,19 @@ class InvariantFilter:
             "gyro_walk",
             "accelerometer_walk",
         )
+
+    def add(self, chain: Chain, attitude: AttitudeConfig, origin: tuple[float, float]) -> None:  # noqa: ARG002
+        """Adds `base_state`, which is `attitude` as well, to a chain.
+
+        Args:
+            attitude: of the stage that it replaces.
+            origin: see `InvariantBaseFilter`.
+        """
+        make = partial(InvariantBaseFilter, self, chain.sensors, chain.robot, origin=origin)
+        chain.add("base_state", make, measurements="sensor_monitor", model="model")
+        chain.alias("base_state", "attitude")
+        chain.connect("base_state.last_angular_velocity_bias", "model.angular_velocity_bias")
+        chain.connect("base_state.last_doubt", "sensor_monitor.doubt")
 
 
 @njit(cache=True)
@@ -852,7 +873,7 @@ class InvariantBaseFilter(RecursiveEstimator):
         )
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
-        self._declare_posterior("measurements", "model")
+        self._declare_posterior()
         self.DeclareVectorOutputPort(
             "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
         )
@@ -860,6 +881,10 @@ class InvariantBaseFilter(RecursiveEstimator):
         feet = len(robot.description.sides)
         state = {self.xd_ticket()}
         self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, state)
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        return {"measurements": measurements_type(robot), "model": model_type(robot)}
 
     def _calc_last_doubt(self, context: Context, output: BasicVector) -> None:
         last = as_record(context.get_discrete_state().value(0), self.posterior_type)

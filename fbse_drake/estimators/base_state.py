@@ -4,17 +4,22 @@ The paper's adaptive Kalman filter on the LIPM, and leg kinematics fused with th
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
-from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
+from fbse_drake.estimators.attitude import AttitudeConfig
+from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.floating_base import ImuMount, base_specific_force, model_type
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
     Vector,
     add,
@@ -31,7 +36,33 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
 
 @dataclass(frozen=True)
-class AdaptiveLipm:
+class _AfterAttitude(ABC):
+    """What the estimators share that take the attitude from the stage before."""
+
+    feeds_back: ClassVar[bool] = False
+
+    def add(self, chain: Chain, attitude: AttitudeConfig, origin: tuple[float, float]) -> None:
+        """Adds `attitude` and `base_state` to a chain that has `sensor_monitor` and `model`.
+
+        Args:
+            origin: see `BaseStateEstimator`.
+        """
+        attitude.add(chain)
+        chain.add(
+            "base_state",
+            partial(self.system, chain.robot, origin=origin),
+            measurements="sensor_monitor",
+            attitude="attitude",
+            model="model",
+        )
+
+    @abstractmethod
+    def system(self, robot: Robot, **arguments: Any) -> "BaseStateEstimator":
+        """The estimator with these settings; arguments as of its class."""
+
+
+@dataclass(frozen=True)
+class AdaptiveLipm(_AfterAttitude):
     """The paper's stable adaptive Kalman filter (13)-(31); defaults are Table II."""
 
     # Initial process noise, measurement noise and state covariance, each times the identity.
@@ -46,9 +77,12 @@ class AdaptiveLipm:
         require_positive(self, "process_noise", "measurement_noise", "covariance")
         require_positive(self, "measurement_memory", "process_memory")
 
+    def system(self, robot: Robot, **arguments: Any) -> "BaseStateEstimator":
+        return AdaptiveLipmEstimator(self, robot, **arguments)
+
 
 @dataclass(frozen=True)
-class ContactAided:
+class ContactAided(_AfterAttitude):
     """Kalman filter on base position, velocity and acceleration error.
 
     It is predicted with the IMU and corrected with the legs that stand.
@@ -68,6 +102,9 @@ class ContactAided:
         require_positive(self, "acceleration_noise", "position_noise", "velocity_noise")
         require_positive(self, "acceleration_error_time")
         require_not_negative(self, "acceleration_error")
+
+    def system(self, robot: Robot, **arguments: Any) -> "BaseStateEstimator":
+        return ContactAidedEstimator(self, robot, **arguments)
 
 
 # Acceleration of the base while the IMU is not trusted: zero, give or take this [m/s^2].
@@ -298,7 +335,15 @@ class BaseStateEstimator(RecursiveEstimator):
         self._measurements = self._declare_record_input("measurements", measurements)
         self._attitude = self._declare_record_input("attitude", attitude)
         self._model = self._declare_record_input("model", model)
-        self._declare_posterior("measurements", "attitude", "model")
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        return {
+            "measurements": measurements_type(robot),
+            "attitude": record_type(rotation=(3, 3), angular_velocity=(3,)),
+            "model": model_type(robot),
+        }
 
 
 class AdaptiveLipmEstimator(BaseStateEstimator):

@@ -19,6 +19,7 @@ from pydrake.systems.framework import BasicVector, Context, ValueProducer
 
 from fbse_drake.estimators.records import as_record, record, record_type, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
+from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
     Rotation,
     Vector,
@@ -141,6 +142,25 @@ def _put_terms(
             p[2] -= R_BF[1, k] * J[3 + k, x]
 
 
+def model_type(robot: Robot) -> np.dtype:
+    """Type of the posterior of `FloatingBaseModel`."""
+    n, f = len(robot.joint_names), len(robot.description.sides)
+    v = 6 + n
+    return record_type(
+        time=(),
+        status=(),
+        mass_matrix=(n, v),
+        bias=(n,),
+        foot_jacobian=(f, 6, v),
+        foot_bias=(f, 6),
+        foot_position=(f, 3),
+        foot_rotation=(f, 3, 3),
+        com=(3,),
+        com_velocity=(3,),
+        velocity=(v,),
+    )
+
+
 @dataclass(frozen=True)
 class _Workspace:
     """Where a tick asks Drake: memory of a context's own, in which nothing lasts but the base."""
@@ -193,22 +213,7 @@ class FloatingBaseModel(RecursiveEstimator):
             measurements: type of the input's posterior.
             knows_bias: has an input `angular_velocity_bias`.
         """
-        n, f = len(robot.joint_names), len(robot.description.sides)
-        v = 6 + n
-        posterior_type = record_type(
-            time=(),
-            status=(),
-            mass_matrix=(n, v),
-            bias=(n,),
-            foot_jacobian=(f, 6, v),
-            foot_bias=(f, 6),
-            foot_position=(f, 3),
-            foot_rotation=(f, 3, 3),
-            com=(3,),
-            com_velocity=(3,),
-            velocity=(v,),
-        )
-        super().__init__(posterior_type, clock)
+        super().__init__(model_type(robot), clock)
         self._robot, self._plant, self._world = robot, robot.plant, robot.plant.world_frame()
         self._soles = [robot.sole(side) for side in robot.description.sides]
         # Place in the plant's velocities, and in its state, of each of ours.
@@ -221,22 +226,23 @@ class FloatingBaseModel(RecursiveEstimator):
             v_index=robot.plant.num_positions() + order,
         )
         self._measurements = self._declare_record_input("measurements", measurements)
-        self._bias, inputs = None, ["measurements"]
+        self._bias = None
         if knows_bias:
             self._bias = self.DeclareVectorInputPort("angular_velocity_bias", 3)
-            inputs.append("angular_velocity_bias")
         # Never computed anew: an entry of the cache is what a context can keep for itself.
         self._workspace = self.DeclareCacheEntry(
             "workspace",
             ValueProducer(self._allocate_workspace, ValueProducer.NoopCalc),
             {self.nothing_ticket()},
         )
-        self._declare_posterior(*inputs)
+        self._declare_posterior()
         self.DeclareStateOutputPort("at_step_start", self._last)
-        size, self._reading = size_of(posterior_type), clock.reading
-        sources = {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs}
-        tickets = sources | {self.time_ticket(), self.xd_ticket()}
-        self.DeclareVectorOutputPort("over_step", size, self._calc_over_step, tickets)
+        size, self._reading = size_of(self.posterior_type), clock.reading
+        self.DeclareVectorOutputPort("over_step", size, self._calc_over_step, self._tickets())
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        return {"measurements": measurements_type(robot)}
 
     def _calc_over_step(self, context: Context, output: BasicVector) -> None:
         start = context.get_discrete_state().value(0)

@@ -8,6 +8,7 @@ times.
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -58,6 +59,15 @@ class RecursiveLeastSquares:
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
 
+    def system(
+        self,
+        sensors: SensorBeliefs,  # noqa: ARG002
+        robot: Robot,
+        **arguments: Any,
+    ) -> "FrictionEstimator":
+        """The estimator with these settings; arguments as of its class."""
+        return RecursiveLeastSquaresEstimator(self, robot, **arguments)
+
 
 @dataclass(frozen=True)
 class ModelAided:
@@ -97,6 +107,10 @@ class ModelAided:
             require_not_negative(self, "velocity_smoothing")
         if self.swing not in ("model", "measurement"):
             raise InputError(f"swing: expected model or measurement, found {self.swing}")
+
+    def system(self, sensors: SensorBeliefs, robot: Robot, **arguments: Any) -> "FrictionEstimator":
+        """The estimator with these settings; arguments as of its class."""
+        return ModelAidedEstimator(self, sensors, robot, **arguments)
 
 
 FrictionConfig = RecursiveLeastSquares | ModelAided
@@ -240,7 +254,19 @@ class FrictionEstimator(RecursiveEstimator):
         self._leg = leg_of_joint(robot)
         self._measurements = self._declare_record_input("measurements", measurements)
         self._link = self._declare_record_input("link_torque", link_torque)
-        self._declare_posterior("measurements", "link_torque")
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        n, feet = len(robot.joint_names), len(robot.description.sides)
+        measured = ("residual", "torque_variance", "impulse_variance", "valid")
+        return {
+            # Joints of no leg ask for the last one's, so there is at least one.
+            "measurements": record_type(
+                trust=(2 + feet,), support=(max(1, feet),), joint_velocity=(n,)
+            ),
+            "link_torque": record_type(**dict.fromkeys(measured, (n,))),
+        }
 
 
 class RecursiveLeastSquaresEstimator(FrictionEstimator):

@@ -9,10 +9,11 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.floating_base import ImuMount, base_specific_force
+from fbse_drake.estimators.floating_base import ImuMount, base_specific_force, model_type
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
     put,
     rotate,
@@ -363,13 +364,13 @@ class JointAccelerationEstimator(RecursiveEstimator):
         robot: Robot,
         measurements: np.dtype,
         attitude: np.dtype,
-        model: np.dtype,
+        model_over_step: np.dtype,
         clock: Clock,
     ):
         """Declares ports and state.
 
         Args:
-            measurements, attitude, model: types of the inputs' posteriors.
+            measurements, attitude, model_over_step: types of the inputs.
         """
         n, feet = len(robot.joint_names), len(robot.description.sides)
         v = 6 + n
@@ -395,8 +396,16 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._legs = [np.array([robot.joint_names.index(x) for x in joints]) for joints in legs]
         self._measurements = self._declare_record_input("measurements", measurements)
         self._attitude = self._declare_record_input("attitude", attitude)
-        self._model = self._declare_record_input("model_over_step", model)
-        self._declare_posterior("measurements", "attitude", "model_over_step")
+        self._model = self._declare_record_input("model_over_step", model_over_step)
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        return {
+            "measurements": measurements_type(robot),
+            "attitude": record_type(rotation=(3, 3), acceleration_bias=(3,)),
+            "model_over_step": model_type(robot),
+        }
 
     def _tick(
         self,

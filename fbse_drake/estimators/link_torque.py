@@ -7,12 +7,14 @@ import math
 
 import numpy as np
 from numba import njit
-from pydrake.systems.framework import Context, State
+from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
@@ -175,16 +177,16 @@ class LinkTorqueEstimator(RecursiveEstimator):
         sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
-        model: np.dtype,
-        acceleration: np.dtype,
+        model_over_step: np.dtype,
+        joint_acceleration: np.dtype,
         clock: Clock,
     ):
         """Declares ports and state.
 
         Args:
-            measurements, model, acceleration: types of the inputs' posteriors.
+            measurements, model_over_step, joint_acceleration: types of the inputs.
         """
-        n, legs, pads = len(robot.joint_names), robot.description.legs, FootPads(robot)
+        n, legs = len(robot.joint_names), robot.description.legs
         posterior_type = record_type(
             time=(),
             status=(),
@@ -208,11 +210,26 @@ class LinkTorqueEstimator(RecursiveEstimator):
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
-        self._model = self._declare_record_input("model_over_step", model)
-        self._acceleration = self._declare_record_input("joint_acceleration", acceleration)
-        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self.DeclareDiscreteState(n)  # the last command
-        self._declare_posterior("measurements", "model_over_step", "joint_acceleration")
+        self._model = self._declare_record_input("model_over_step", model_over_step)
+        self._acceleration = self._declare_record_input("joint_acceleration", joint_acceleration)
+        self._torque_command = self._declare_remembered_input("torque_command", n)
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        n = len(robot.joint_names)
+        v = 6 + n
+        return {
+            "measurements": measurements_type(robot),
+            "model_over_step": model_type(robot),
+            "joint_acceleration": record_type(
+                base_angular_acceleration=(3,),
+                base_specific_force=(3,),
+                joint_acceleration=(n,),
+                known=(n,),
+                sensitivity=(v, v),
+            ),
+        }
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
@@ -224,10 +241,6 @@ class LinkTorqueEstimator(RecursiveEstimator):
             self._measurements.Eval(context),
             self._model.Eval(context),
             self._acceleration.Eval(context),
-            context.get_discrete_state().value(1),
+            self._torque_command.Eval(context),
             self._known,
         )
-
-    def _remember(self, context: Context, state: State) -> None:
-        super()._remember(context, state)
-        state.get_mutable_discrete_state().set_value(1, self._torque_command.Eval(context))

@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import (
     BasicVector,
     Context,
+    DependencyTicket,
     DiagramBuilder,
+    DiscreteStateIndex,
     InputPort,
     LeafSystem,
     OutputPort,
@@ -20,7 +24,9 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
+from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.records import as_record, parts, size_of
+from fbse_drake.robot.plant import Robot
 
 # Sensors are compared with each other at ticks of at most this [s]. Between rarer readings healthy
 # ones differ as much as faulty ones, and nothing is said.
@@ -54,6 +60,11 @@ class Clock:
     # sample.
     reading: float = 0.001
 
+    @staticmethod
+    def every(period: float) -> "Clock":
+        """Ticks each `period` [s]; readings are means over a tick."""
+        return Clock(period, period * (1 - 1e-6), period)
+
 
 @njit(cache=True)
 def start_share(elapsed: float, reading: float) -> float:
@@ -81,6 +92,25 @@ class RecordInput:
         return np.ndarray((), self.kind, self.port.Eval(context))
 
 
+@dataclass(frozen=True)
+class RememberedInput:
+    """An input port whose value of the tick before counts: before the first, it is zero."""
+
+    port: InputPort
+    index: DiscreteStateIndex
+
+    def Eval(self, context: Context) -> np.ndarray:
+        """The value a tick ago."""
+        return context.get_discrete_state(self.index).value()
+
+    def remember(self, context: Context, state: State) -> None:
+        """Keeps the present value for the next tick."""
+        state.get_mutable_discrete_state(self.index).set_value(self.port.Eval(context))
+
+
+T = TypeVar("T", bound="RecursiveEstimator")
+
+
 class RecursiveEstimator(LeafSystem):
     """Base of the estimators.
 
@@ -92,6 +122,9 @@ class RecursiveEstimator(LeafSystem):
     `time`, that of its tick [s], NaN before the first; the second one of an estimator is `status`,
     see `Status`. A posterior that would not be finite is not taken: the last one is held and the
     status says so.
+
+    A subclass declares its inputs (`DeclareVectorInputPort`, `_declare_record_input`,
+    `_declare_remembered_input`), then calls `_declare_posterior`; its `_tick` makes the posterior.
     """
 
     def __init__(self, posterior_type: np.dtype, clock: Clock):
@@ -106,21 +139,75 @@ class RecursiveEstimator(LeafSystem):
         start = np.zeros(size_of(posterior_type))
         as_record(start, posterior_type)["time"] = math.nan
         self._last = self.DeclareDiscreteState(start)
+        # Types of the records on its input ports.
+        self.record_inputs: dict[str, np.dtype] = {}
+        self._remembered: list[RememberedInput] = []
         self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, self._remember)
         self.DeclareForcedUnrestrictedUpdateEvent(self._remember)
 
-    def _declare_record_input(self, name: str, kind: np.dtype) -> RecordInput:
-        """Declares an input port for a posterior of this type."""
-        return RecordInput(self.DeclareVectorInputPort(name, size_of(kind)), kind)
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:  # noqa: ARG004
+        """Fields that it reads of the records on its input ports, by port.
 
-    def _declare_posterior(self, *inputs: str) -> None:
-        """Declares the outputs; to be called when the input ports are declared.
+        These types are arguments of the constructor, which takes any that have these fields.
+        """
+        return {}
+
+    @classmethod
+    def AddToBuilder(
+        cls: type[T],
+        builder: DiagramBuilder,
+        inputs: Mapping[str, OutputPort | Mapping[str, OutputPort | ArrayLike]],
+        *,
+        period: float,
+        **arguments: Any,
+    ) -> T:
+        """Adds one to anybody's diagram.
 
         Args:
-            inputs: names of the ports that the posterior is made from.
+            inputs: what feeds each input port: a port; or the fields of a record that it reads, see
+                `input_types` and `connect_fields`.
+            period: tick [s].
+            arguments: of the constructor, but for the clock and the types of its inputs.
+
+        Returns:
+            The estimator, whose output ports are the fields of its posterior.
+
+        Raises:
+            InputError: an input or a field that it has not, or an input without a source.
         """
-        tickets = {self.input_port_ticket(self.GetInputPort(name).get_index()) for name in inputs}
-        tickets |= {self.time_ticket(), self.xd_ticket()}
+        whole = {name: port for name, port in inputs.items() if isinstance(port, OutputPort)}
+        types = cls.input_types(arguments.get("robot"))
+        for name in types.keys() & whole.keys():
+            types[name] = getattr(whole[name].get_system(), "posterior_type", types[name])
+        system = cls(**arguments, **types, clock=Clock.every(period))
+        ports = {port.get_name(): port for port in system.input_ports()}
+        with located(f"{cls.__name__}: "):
+            if inputs.keys() != ports.keys():
+                expected, found = ", ".join(ports), ", ".join(inputs)
+                raise InputError(f"expected the inputs {expected}, found {found}")
+            builder.AddSystem(system)
+            for name, port in ports.items():
+                if name in whole:
+                    builder.Connect(whole[name], port)
+                else:
+                    connect_fields(builder, port, system.record_inputs[name], inputs[name])
+        return system
+
+    def _declare_record_input(self, name: str, kind: np.dtype) -> RecordInput:
+        """Declares an input port for a posterior of this type."""
+        self.record_inputs[name] = kind
+        return RecordInput(self.DeclareVectorInputPort(name, size_of(kind)), kind)
+
+    def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
+        """Declares an input port that the posterior of the next tick depends on, not this one's."""
+        port = self.DeclareVectorInputPort(name, size)
+        self._remembered.append(RememberedInput(port, self.DeclareDiscreteState(size)))
+        return self._remembered[-1]
+
+    def _declare_posterior(self) -> None:
+        """Declares the outputs, which depend on the input ports that are declared by now."""
+        tickets = self._tickets()
         size = size_of(self.posterior_type)
         self._posterior = self.DeclareVectorOutputPort(
             "posterior",
@@ -131,6 +218,17 @@ class RecursiveEstimator(LeafSystem):
         for name, part in parts(self.posterior_type).items():
             calc = partial(self._calc_field, part)
             self.DeclareVectorOutputPort(name, part.stop - part.start, calc, tickets)
+
+    def _tickets(self) -> set[DependencyTicket]:
+        """What the posterior of a tick depends on."""
+        later = [remembered.port.get_name() for remembered in self._remembered]
+        inputs = [port for port in self.input_ports() if port.get_name() not in later]
+        tickets = {self.input_port_ticket(port.get_index()) for port in inputs}
+        return tickets | {self.time_ticket(), self.xd_ticket()}
+
+    def input_ports(self) -> list[InputPort]:
+        """All of them, in order."""
+        return [self.get_input_port(i) for i in range(self.num_input_ports())]
 
     @abstractmethod
     def _tick(
@@ -171,21 +269,39 @@ class RecursiveEstimator(LeafSystem):
 
     def _remember(self, context: Context, state: State) -> None:
         state.get_mutable_discrete_state().set_value(0, self._posterior.Eval(context))
+        for remembered in self._remembered:
+            remembered.remember(context, state)
 
 
 def connect_fields(
-    builder: DiagramBuilder, target: InputPort, kind: np.dtype, ports: Mapping[str, OutputPort]
+    builder: DiagramBuilder,
+    target: InputPort,
+    kind: np.dtype,
+    fields: Mapping[str, OutputPort | ArrayLike],
 ) -> None:
-    """Feeds an input that takes a record from plain ports, field by field.
+    """Feeds an input port that takes a record, field by field.
 
     Args:
         kind: type of the record.
-        ports: by field, flat; a field without one is zero.
+        fields: by name, each a port, flat, or a constant, one number for all or each; those that
+            are not given are zero.
+
+    Raises:
+        InputError: a field that the record has not, or of another size.
     """
     sizes = {name: part.stop - part.start for name, part in parts(kind).items()}
+    where = f"input {target.get_name()}"
+    for name in fields:
+        if name not in sizes:
+            raise InputError(f"{where}: there is no field {name} (there are: {', '.join(sizes)})")
     joined = builder.AddSystem(Multiplexer(list(sizes.values())))
     for i, (name, size) in enumerate(sizes.items()):
-        zero = None if name in ports else builder.AddSystem(ConstantVectorSource(np.zeros(size)))
-        source = ports[name] if zero is None else zero.get_output_port()
+        source = fields.get(name, 0.0)
+        if not isinstance(source, OutputPort):
+            constant = np.full(size, source) if np.ndim(source) == 0 else np.ravel(source)
+            source = builder.AddSystem(ConstantVectorSource(constant)).get_output_port()
+        if source.size() != size:
+            found = source.size()
+            raise InputError(f"{where}: field {name}: expected {size} numbers, found {found}")
         builder.Connect(source, joined.get_input_port(i))
     builder.Connect(joined.get_output_port(), target)

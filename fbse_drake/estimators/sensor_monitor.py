@@ -7,13 +7,16 @@ contradict each other, the one that jumped is had from the other.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
+from pydrake.systems.primitives import Multiplexer
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
+from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import (
     LONGEST_COMPARED_TICK,
@@ -23,12 +26,7 @@ from fbse_drake.estimators.recursive import (
     start_share,
 )
 from fbse_drake.estimators.spatial import vector
-from fbse_drake.estimators.support import (
-    MeasuredSupport,
-    PlannedSupport,
-    SupportConfig,
-    detect_support,
-)
+from fbse_drake.estimators.support import MeasuredSupport, SupportConfig, detect_support
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
 
@@ -83,6 +81,32 @@ class SensorMonitorConfig:
             found = f"{self.smallest_load_share:g}"
             raise InputError(f"smallest_load_share: expected a number in [0, 1), found {found}")
 
+    def add(
+        self, chain: Chain, support: SupportConfig | None = None, *, hears_doubt: bool = False
+    ) -> None:
+        """Adds `sensor_monitor` to a chain, which all its sensors feed.
+
+        Args:
+            support: which feet stand; measured by default.
+            hears_doubt: see `SensorMonitor`.
+
+        Raises:
+            InputError: a planned support without a plan.
+        """
+        support, robot = support or MeasuredSupport(), chain.robot
+        watch = partial(SensorMonitor, self, support, robot, beliefs=chain.sensors)
+        monitor = chain.add("sensor_monitor", partial(watch, hears_doubt=hears_doubt))
+        sizes = {
+            "measured_joint_state": 2 * len(robot.joint_names),
+            "measured_imu": 6,
+            "measured_pad_force": 3 * len(FootPads(robot).foot),
+        }
+        sensors = chain.builder.AddNamedSystem("sensors", Multiplexer(list(sizes.values())))
+        chain.builder.Connect(sensors.get_output_port(), monitor.GetInputPort("sensors"))
+        for i, signal in enumerate(sizes):
+            chain.feed(signal, sensors.get_input_port(i))
+        support.add(chain, monitor)
+
 
 def _readings(robot: Robot) -> dict[str, tuple[int, ...]]:
     """Shapes of what the sensors read, by its name."""
@@ -132,6 +156,23 @@ def _joint_watch(n: int) -> np.dtype:
     fields = ("angle", "velocity", "is_pair", "step", "mismatch", "slow_velocity", "slow_rate")
     fields += ("roughness", "doubt", "agreed", "is_mixed", "returned", "allowance", "other")
     return record_type(**dict.fromkeys(fields, (n,)))
+
+
+def measurements_type(robot: Robot) -> np.dtype:
+    """Type of the posterior of `SensorMonitor`."""
+    readings, feet = _readings(robot), len(robot.description.legs)
+    return record_type(
+        time=(),
+        status=(),
+        trust=(2 + feet,),
+        **readings,
+        mean=record_type(**{name: readings[name] for name in _MEANT}),
+        unchanged=record_type(**readings),
+        light=(),
+        support=(feet,),
+        waiting=(feet,),
+        joint=_joint_watch(len(robot.joint_names)),
+    )
 
 
 @njit(cache=True)
@@ -439,36 +480,19 @@ class SensorMonitor(RecursiveEstimator):
             beliefs: noise of the sensors; of good sensors by default.
             hears_doubt: has an input `doubt`.
         """
-        readings = _readings(robot)
-        sensors = record_type(**readings)
+        super().__init__(measurements_type(robot), clock)
         legs = robot.description.legs
-        feet = (len(legs),)
-        posterior_type = record_type(
-            time=(),
-            status=(),
-            trust=(2 + len(legs),),
-            **readings,
-            mean=record_type(**{name: readings[name] for name in _MEANT}),
-            unchanged=sensors,
-            light=(),
-            support=feet,
-            waiting=feet,
-            joint=_joint_watch(len(robot.joint_names)),
-        )
-        super().__init__(posterior_type, clock)
-        self._sensors = self._declare_record_input("sensors", sensors)
+        self._sensors = self._declare_record_input("sensors", record_type(**_readings(robot)))
         self._planned = None
-        if isinstance(support, PlannedSupport):
+        if support.by_plan:
             self._planned = self.DeclareVectorInputPort("planned_support", len(legs))
         self._no_doubt, self._doubt = np.zeros(1 + len(legs)), None
         if hears_doubt:
             self._doubt = self.DeclareVectorInputPort("doubt", 1 + len(legs))
-        inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
-        self._declare_posterior(*(port.get_name() for port in inputs))
+        self._declare_posterior()
         checks_load = bool(legs) and robot.has_floating_base
         mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-        measured = support if isinstance(support, MeasuredSupport) else MeasuredSupport()
-        weight = 9.81 * mass
+        measured, weight = support.trigger, 9.81 * mass
         self._known = record(
             limits=config,
             beliefs=beliefs,

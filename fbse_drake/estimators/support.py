@@ -2,21 +2,49 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
+from pydrake.systems.framework import System
 
 from fbse_drake.errors import InputError, require_not_negative
+from fbse_drake.estimators.chain import Chain
+from fbse_drake.sensors.errors import held_signal
 
 
 @dataclass(frozen=True)
 class PlannedSupport:
     """Feet stand when the plan says so."""
 
+    by_plan: ClassVar[bool] = True
+
+    @property
+    def trigger(self) -> "MeasuredSupport":
+        """What the foot forces are asked for all the same."""
+        return MeasuredSupport()
+
+    def add(self, chain: Chain, monitor: System) -> None:
+        """Adds what tells a chain's sensor monitor of the plan.
+
+        Raises:
+            InputError: nobody knows the plan.
+        """
+        if chain.plan is None:
+            instead = "needs a planned walk or stand (use !MeasuredSupport)"
+            raise InputError(f"estimator.support: !PlannedSupport {instead}")
+        plan, sides = chain.plan, chain.robot.description.sides
+        support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
+        signal = held_signal(support, float(plan.time[1] - plan.time[0]))
+        source = chain.builder.AddNamedSystem("planned_support", signal)
+        chain.builder.Connect(source.get_output_port(), monitor.GetInputPort("planned_support"))
+
 
 @dataclass(frozen=True)
 class MeasuredSupport:
     """Feet stand when they carry load: a Schmitt trigger with a debounce."""
+
+    by_plan: ClassVar[bool] = False
 
     # Share of the weight above which a foot begins to stand, and below which it ceases to.
     on: float = 0.10
@@ -30,6 +58,14 @@ class MeasuredSupport:
                 f"on, off: expected 0 < off <= on < 0.5, found on {self.on:g}, off {self.off:g}",
             )
         require_not_negative(self, "debounce")
+
+    @property
+    def trigger(self) -> "MeasuredSupport":
+        """Itself."""
+        return self
+
+    def add(self, chain: Chain, monitor: System) -> None:
+        """A chain's sensor monitor has all that it needs."""
 
 
 SupportConfig = PlannedSupport | MeasuredSupport

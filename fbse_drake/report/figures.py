@@ -21,7 +21,7 @@ from pydrake.common.yaml import yaml_load
 
 from fbse_drake import schema
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import FrictionConfig, ModelAided
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.zmp import zero_moment_point

@@ -19,6 +19,7 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from fbse_drake.errors import InputError, located
+from fbse_drake.library import require_new
 from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
@@ -132,21 +133,11 @@ def in_library(sensor: T) -> T:
     """
     if not getattr(sensor, "signals", ()):
         raise InputError(f"sensor {sensor.__name__}: the class variable signals is missing")
-    if sensor.__abstractmethods__:
-        missing = min(sensor.__abstractmethods__)
-        raise InputError(f"sensor {sensor.__name__}: the method {missing} is missing")
-    known = _LIBRARY.get(sensor.__name__)
-    if known is not None and _place(known) != _place(sensor):
-        other = known.__module__
-        raise InputError(f"sensor {sensor.__name__}: there is another of this name, in {other}")
+    require_new(_LIBRARY, "sensor", sensor)
     with located(f"sensor {sensor.__name__}: "):
         register(*sensor.signals)
     _LIBRARY[sensor.__name__] = sensor
     return sensor
-
-
-def _place(sensor: type[Sensor]) -> tuple[str, str]:
-    return sensor.__module__, sensor.__qualname__
 
 
 def library() -> dict[str, type[Sensor]]:

@@ -1,0 +1,152 @@
+"""Estimators wired into one diagram, each fed by what others of it estimate."""
+
+from collections.abc import Callable
+
+from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import Demultiplexer
+
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.records import parts
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.robot.plant import Robot
+from fbse_drake.signals import estimates
+from fbse_drake.walking.plan import TaskPlan
+
+
+class Chain:
+    """What an `Estimator` adds its systems to.
+
+    A system is called by the name under which it was added, and a port of it `system.port`. The one
+    that estimates the friction is called `friction`, and so is that field of its posterior, (n,)
+    [Nm].
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        clock: Clock,
+        sensors: SensorBeliefs,
+        plan: TaskPlan | None,
+        *,
+        knows_torque: bool,
+    ):
+        # The model that is believed.
+        self.robot = robot
+        self.clock = clock
+        # What is believed of the sensors.
+        self.sensors = sensors
+        # What the motion was planned from; None where nobody knows.
+        self.plan = plan
+        # Are the torque commands known?
+        self.knows_torque = knows_torque
+        self.builder = DiagramBuilder()
+        self._systems: dict[str, RecursiveEstimator] = {}
+        self._fields: dict[str, Demultiplexer] = {}
+        self._signals: dict[str, InputPort] = {}
+
+    @property
+    def is_empty(self) -> bool:
+        """Has nobody added a system?"""
+        return not self._systems
+
+    @property
+    def knows_friction(self) -> bool:
+        """Is there a system that estimates the friction?"""
+        return "friction" in self._systems
+
+    def add(
+        self, name: str, make: Callable[..., RecursiveEstimator], **sources: str
+    ) -> RecursiveEstimator:
+        """Adds a system.
+
+        Its posterior's fields become channels as the table of signals says (`Estimator.signals`).
+        Inputs that nothing is connected to take the signal of their name: what a sensor measures,
+        or `torque_command` (which has to be that of the tick before where the command may depend on
+        the estimate: a remembered input).
+
+        Args:
+            make: the system's class, or a partial call of it; gets the types of the inputs that
+                have sources as arguments of their names, and `clock`.
+            sources: by input, the system whose posterior feeds it, or another record of a system,
+                `system.port`.
+
+        Raises:
+            InputError: a source that is not there.
+        """
+        types = {port: self._system(source).posterior_type for port, source in sources.items()}
+        system = make(**types, clock=self.clock)
+        self._systems[name] = self.builder.AddNamedSystem(name, system)
+        for port, source in sources.items():
+            self.connect(source, f"{name}.{port}")
+        return system
+
+    def alias(self, system: str, name: str) -> None:
+        """Gives a system a second name, as one that does the work of two."""
+        self._systems[name] = self._systems[system]
+
+    def connect(self, source: str, target: str) -> None:
+        """Connects a posterior, or an output `system.port`, to an input `system.port`."""
+        output = source.partition(".")[2] or "posterior"
+        port = self._system(target).GetInputPort(target.partition(".")[2])
+        self.builder.Connect(self._system(source).GetOutputPort(output), port)
+
+    def feed(self, signal: str, port: InputPort) -> None:
+        """Connects an input port to a signal, an input of the whole diagram."""
+        if signal in self._signals:
+            self.builder.ConnectToSame(self._signals[signal], port)
+        else:
+            self.builder.ExportInput(port, signal)
+            self._signals[signal] = port
+
+    def finish(self) -> dict[str, tuple[int, ...]]:
+        """Makes inputs and outputs of the diagram of what is to be seen of it.
+
+        Returns:
+            The channels that outputs become, and the shape of one sample.
+
+        Raises:
+            InputError: the system that is to estimate the friction does not.
+        """
+        for system in self._systems.values():
+            for port in system.input_ports():
+                if not self.builder.IsConnectedOrExported(port):
+                    self.feed(port.get_name(), port)
+        n, channels = len(self.robot.joint_names), {}
+        if self.knows_friction:
+            if self._sizes("friction").get("friction") != n:
+                raise InputError(
+                    f"estimator: friction: expected a posterior with a field friction ({n},)"
+                )
+            self.builder.ExportOutput(self._field("friction", "friction"), "friction_estimate")
+        for row in estimates():
+            size = self._sizes(row.estimator).get(row.field)
+            if size is not None:
+                self.builder.ExportOutput(self._field(row.estimator, row.field), row.port)
+                channels[row.channel] = row.sample_shape(n, size)
+        return channels
+
+    def _system(self, source: str) -> RecursiveEstimator:
+        name = source.partition(".")[0]
+        if name not in self._systems:
+            known = ", ".join(self._systems) or "none"
+            raise InputError(f"estimator: there is no system {name} (there are: {known})")
+        return self._systems[name]
+
+    def _sizes(self, name: str) -> dict[str, int]:
+        """How many numbers the fields of a posterior have, if any: of a system that is there."""
+        if name not in self._systems:
+            return {}
+        kind = self._systems[name].posterior_type
+        return {field: part.stop - part.start for field, part in parts(kind).items()}
+
+    def _field(self, name: str, field: str) -> OutputPort:
+        """The output port of one field of a posterior."""
+        sizes = self._sizes(name)
+        if name not in self._fields:
+            # The estimator has such a port itself, which is Python's and costs more.
+            split = Demultiplexer(list(sizes.values()))
+            self._fields[name] = self.builder.AddNamedSystem(f"{name}_fields", split)
+            posterior = self._systems[name].GetOutputPort("posterior")
+            self.builder.Connect(posterior, split.get_input_port())
+        return self._fields[name].get_output_port(list(sizes).index(field))

@@ -1,0 +1,111 @@
+"""Foot base sensor estimation: the stages, wired."""
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.attitude import AttitudeConfig
+from fbse_drake.estimators.base_filter import InvariantFilter
+from fbse_drake.estimators.base_state import AdaptiveLipm, ContactAided
+from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.estimator import Estimator, in_library
+from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.friction import FrictionConfig, ModelAided
+from fbse_drake.estimators.joint_acceleration import (
+    JointAccelerationConfig,
+    JointAccelerationEstimator,
+)
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
+from fbse_drake.estimators.support import MeasuredSupport, SupportConfig
+from fbse_drake.robot.description import RobotDescription
+
+BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
+
+
+@in_library
+@dataclass(frozen=True)
+class Fbse(Estimator):
+    """Foot base sensor estimation.
+
+    It goes by attitude, base state, joint accelerations and link torque to the friction. The
+    defaults are the best variant of every stage; `scenarios/paper_walk_fbse.yaml` also has the
+    paper's.
+    """
+
+    sensor_monitor: SensorMonitorConfig = field(default_factory=SensorMonitorConfig)
+    attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
+    # !ContactAided or the paper's !AdaptiveLipm.
+    base_state: BaseStateConfig = field(default_factory=InvariantFilter)
+    # What is not given follows from the scenario's `sensors`.
+    sensors: SensorBeliefs = field(default_factory=SensorBeliefs)
+    # !MeasuredSupport or the paper's !PlannedSupport.
+    support: SupportConfig = field(default_factory=MeasuredSupport)
+    joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
+    # !ModelAided or the paper's !RecursiveLeastSquares.
+    friction: FrictionConfig = field(default_factory=ModelAided)
+
+    def believed_sensors(self, usual: SensorBeliefs) -> SensorBeliefs:
+        return self.sensors.completed(usual)
+
+    def remarks(self, sensors: SensorBeliefs) -> tuple[str, ...]:
+        return (sensors.text,)
+
+    def check(self, names: RobotDescription) -> None:
+        self.friction.model.resolve(names, key="friction.model")
+
+    def add(self, chain: Chain) -> None:
+        self.add_base(chain)
+        robot, sensors = chain.robot, chain.sensors
+        chain.add(
+            "joint_acceleration",
+            partial(JointAccelerationEstimator, self.joint_acceleration, sensors, robot),
+            measurements="sensor_monitor",
+            attitude="attitude",
+            model_over_step="model.over_step",
+        )
+        if not chain.knows_torque:
+            return
+        chain.add(
+            "link_torque",
+            partial(LinkTorqueEstimator, sensors, robot),
+            measurements="sensor_monitor",
+            model_over_step="model.over_step",
+            joint_acceleration="joint_acceleration",
+        )
+        chain.add(
+            "friction",
+            partial(self.friction.system, sensors, robot),
+            measurements="sensor_monitor",
+            link_torque="link_torque",
+        )
+
+    def add_base(self, chain: Chain) -> None:
+        """Adds `sensor_monitor`, `model`, `attitude` and `base_state`.
+
+        Raises:
+            InputError: a robot without a floating base and feet, or a planned support without a
+                plan.
+        """
+        robot = chain.robot
+        if not robot.has_floating_base or not robot.description.legs:
+            raise InputError(
+                "estimator: needs a robot with a floating base and feet (no gantry_height)"
+            )
+        feeds_back = self.base_state.feeds_back
+        self.sensor_monitor.add(chain, self.support, hears_doubt=feeds_back)
+        make_model = partial(FloatingBaseModel, robot, knows_bias=feeds_back)
+        chain.add("model", make_model, measurements="sensor_monitor")
+        self.base_state.add(chain, self.attitude, _middle_of_feet(chain))
+
+
+def _middle_of_feet(chain: Chain) -> tuple[float, float]:
+    """Where the middle of the soles is at the start, (x, y) [m]."""
+    if chain.plan is None:
+        return 0.0, 0.0
+    sides = chain.robot.description.sides
+    x, y = np.mean([chain.plan.feet[side].position[0, :2] for side in sides], axis=0)
+    return float(x), float(y)
