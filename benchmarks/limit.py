@@ -437,6 +437,8 @@ def rows_of(scenario: Scenario, log: Log) -> list[Row]:
     for phase in ("stance", "swing"):
         for number, (joint, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
             counted = settled(log) & (stands[side] == (phase == "stance"))
+            if not counted.any():
+                continue
             means = {name: np.nanmean(values[counted, number]) for name, values in squares.items()}
             rows.append(Row(joint, phase, **{name: float(mean) for name, mean in means.items()}))
     return rows
