@@ -139,7 +139,8 @@ def one_joint(rows: int, slope: float, prior: FrictionPrior, noise: float) -> Wa
 def test_constant_friction_is_known_as_well_as_the_slope_of_a_line() -> None:
     """The velocity falls linearly with the friction; so it is a regression on a straight line."""
     rows, noise, prior = 200, 5e-4, 3.0
-    limit, smoother = one_joint(rows, 0.0, FrictionPrior(prior), noise).friction_variance()
+    model = one_joint(rows, 0.0, FrictionPrior(prior), noise)
+    limit, smoother = model.filtered_variance(), model.smoothed_variance()
     regressor = np.stack([np.ones(rows - 1), -np.arange(1, rows) * PERIOD / 0.2], axis=1)
     information = np.diag([1.0, 1 / prior**2]) + regressor.T @ regressor / noise**2
     expected = np.linalg.inv(information)[1, 1]
@@ -153,9 +154,8 @@ def test_constant_friction_is_known_as_well_as_the_slope_of_a_line() -> None:
 def test_friction_that_walks_is_known_as_in_continuous_time() -> None:
     """Velocity as the integral of a random walk: the steady state of Kalman and Bucy."""
     walk, noise, inertia = 0.15, 0.05, 0.2
-    limit, smoother = one_joint(
-        1500, 0.0, FrictionPrior(1e-9, walk, 0.1), noise
-    ).friction_variance()
+    model = one_joint(1500, 0.0, FrictionPrior(1e-9, walk, 0.1), noise)
+    limit, smoother = model.filtered_variance(), model.smoothed_variance()
     density = noise * math.sqrt(PERIOD)
     steady = math.sqrt(2 * inertia * density * walk**3)
     assert limit[-1, 0] == pytest.approx(steady, rel=0.03)
@@ -225,9 +225,9 @@ def test_nobody_is_below_the_limit_and_finer_sensors_lower_it(run) -> None:
         assert 0 < row.smoother <= row.limit <= row.limit_with_walk, row.joint
         assert row.ratio > 1, row.joint
     model = walk_model(scenario, log, priors(scenario)["law"])
-    until_now = model.friction_variance()[0]
+    until_now = model.filtered_variance()
     finer = model.noise._replace(joint_velocity=0.5 * model.noise.joint_velocity)
-    lower = dataclasses.replace(model, noise=finer).friction_variance()[0]
+    lower = dataclasses.replace(model, noise=finer).filtered_variance()
     assert np.all(lower[1:] <= until_now[1:] * (1 + 1e-9))
     assert lower[-1].mean() < 0.9 * until_now[-1].mean()
 
