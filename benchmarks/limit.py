@@ -12,8 +12,7 @@ What the limit knows, and what not:
   process noise. Posture and attitude are taken as known, so inertia, Jacobians and gravity are
   exact; Coriolis terms do not change with the errors of the velocities.
 - Sensors: velocities of the encoders, gyro, accelerometer and the forces under the feet, with the
-  noise that they have, in every step. Biases are known. Rounded angles tell nothing more about
-  velocities.
+  noise that they have, in every step. Biases are known. What rounded angles tell is left out.
 - Which pads touch the ground. A foot that carries at least 5 % of the weight stands still, but for
   white noise as large as its motion in this walk under such a load. No contact law.
 - Commands are exact.
@@ -23,9 +22,12 @@ What the limit knows, and what not:
   where friction does walk so. In a simulation it follows its law, and the best filter that expects
   a walk errs less there, by up to a third.
 
-Everything that is taken as known makes the limit smaller, so an estimator that has to find it out
-is above. Of joints that move much, the limit without walk is below what simulated friction differs
-from its law (up to 1 %), and so out of reach.
+Whatever is taken as known makes the limit smaller, so an estimator that has to find it out is
+above. Two assumptions can make it too large: that angles tell nothing of velocities, and that feet
+move as white noise. With angles that have white noise instead of rounding, the hip yaw's limit in
+swing falls by 1 %; with feet that stand perfectly still, from 0.039 to 0.030 (`paper_walk_fbse`,
+first 4.3 s). Of joints that move much, the limit without walk is below what simulated friction
+differs from its law (up to 1 %), and so out of reach.
 
 The estimate is the scenario's own, in the loop. Options: [--seeds N] [--duration SECONDS]
 [--out DIR]. Prints rms values over the seeds, stance and swing as planned, and writes
@@ -362,6 +364,7 @@ def _along(robot: Robot, log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     plant, world = robot.plant, robot.plant.world_frame()
     context, origin, wrt = plant.CreateDefaultContext(), np.zeros(3), JacobianWrtVariable.kV
     soles = [robot.sole(side) for side in robot.description.sides]
+    frames = [(robot.imu, world), *((sole, sole) for sole in soles)]
     twist = np.hstack([log["truth/base/angular_velocity"], log["truth/base/velocity"]])
     rows = []
     for k in range(len(log.time)):
@@ -369,7 +372,6 @@ def _along(robot: Robot, log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
         X_WB = RigidTransform(orientation, log["truth/base/position"][k])
         q, v = (log[f"truth/joint/{name}"][k] for name in ("position", "velocity"))
         robot.set_state(context, q, v, X_WB, twist[k])
-        frames = [(robot.imu, world), *((sole, sole) for sole in soles)]
         imu, *feet = (
             plant.CalcJacobianSpatialVelocity(context, wrt, frame, origin, world, axes)
             for frame, axes in frames
@@ -447,6 +449,8 @@ def rows_of(scenario: Scenario, log: Log) -> list[Row]:
     stands, rows = stance(log), []
     for phase in ("stance", "swing"):
         for number, (joint, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
+            if side not in stands:
+                continue
             counted = settled(log) & (stands[side] == (phase == "stance"))
             if not counted.any():
                 continue
