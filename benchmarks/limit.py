@@ -53,9 +53,9 @@ from benchmarks.fbse import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError
-from fbse_drake.estimators.estimator import Fbse
+from fbse_drake.estimators.estimator import NoEstimator
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
-from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import (
