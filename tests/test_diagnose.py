@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 from fbse_drake.discrepancy.add import add, read_findings
+from fbse_drake.discrepancy.detectability import smallest_detectable
 from fbse_drake.discrepancy.diagnose import Diagnosis, _equals, diagnose, diagnosis_json
+from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.rollout import rollout
-from fbse_drake.discrepancy.search import Search
+from fbse_drake.discrepancy.selection import best_additions
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
@@ -255,18 +259,16 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
 
 
 def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_difference() -> None:
-    search = Search(
-        Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}")),
-        [JointSpring, TorqueBias],
-    )
+    predictor = Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}"))
+    fits = Fits(Dictionary(predictor, [JointSpring, TorqueBias]))
+    additions = best_additions(Proposals(fits), fits.explain([]))
     spring, bias = (
-        next(e for e in search.best_additions(search.explain([])) if e.candidates[0].effect is c)
-        for c in (JointSpring, TorqueBias)
+        next(e for e in additions if e.candidates[0].effect is c) for c in (JointSpring, TorqueBias)
     )
     for charge, equals in ((11.0, True), (60.0, False)):
-        assert _equals(search, bias, replace(spring, deviance=bias.deviance - charge)) == equals
+        assert _equals(fits, bias, replace(spring, deviance=bias.deviance - charge)) == equals
         # The other way round, parameters that are not needed are none in its favour.
-        assert not _equals(search, spring, replace(bias, deviance=spring.deviance - charge))
+        assert not _equals(fits, spring, replace(bias, deviance=spring.deviance - charge))
 
 
 @pytest.mark.parametrize(
@@ -344,7 +346,7 @@ def test_planned_motion_satisfies_the_equation_of_motion() -> None:
     residual = Predictor(wanted, planned_log(wanted)).residual
     dynamic = [k for k, row in enumerate(residual.rows) if row.kind != "kinematic"]
     assert np.sqrt((residual.value[:, dynamic] ** 2).mean()) < 0.5
-    search = Search(Predictor(wanted, planned_log(wanted)), [library()["ViscousFriction"]])
-    size = search.smallest_detectable(search.noise_alone, library()["ViscousFriction"])
+    fits = Fits(Dictionary(Predictor(wanted, planned_log(wanted)), [library()["ViscousFriction"]]))
+    size = smallest_detectable(fits, fits.noise_alone, library()["ViscousFriction"])
     # The hip yaw does not move in a straight walk.
     assert size["left_hip_yaw"] > 100 * size["left_knee_pitch"]

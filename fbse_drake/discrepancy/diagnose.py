@@ -6,11 +6,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake.discrepancy.detectability import smallest_detectable
+from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import Experiments
+from fbse_drake.discrepancy.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.refinement import added, consistent
 from fbse_drake.discrepancy.regression import WhitenedResidual
-from fbse_drake.discrepancy.search import MARGIN, Candidate, Explanation, Search
+from fbse_drake.discrepancy.selection import best_additions, select
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
@@ -24,8 +30,6 @@ _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
 # Bodies lighter than this share of the robot are not suspected.
 _LIGHT_BODY = 0.03
-# No explanation has more parts than this.
-_MOST_EFFECTS = 16
 
 
 @dataclass(frozen=True)
@@ -137,37 +141,41 @@ def diagnose(
     """
     say = progress or (lambda _: None)
     say("predicting what each effect would do")
-    search = Search(
+    dictionary = Dictionary(
         predictor,
         plausible_effects(predictor) if effects is None else effects,
         suspected_bodies(predictor),
     )
-    before = search.white.sse
-    path = select(search, say)
-    final, inertia = search.consistent(path[-1])
+    start = Fits(dictionary)
+    before = start.white.sse
+    path, proposals = select(start, say)
+    fits = proposals.fits
+    white = fits.white
+    final, inertia = consistent(fits, path[-1])
     say("looking at what is left")
-    path[-1], remaining, left = search.added(final)
+    path[-1], remaining, left = added(fits, final)
     final = path[-1]
     unexplained = leftover_structure(predictor.motion, remaining, left)
     say("finding what would have been seen")
-    rivals = _rivals(search, final)
+    rivals = _rivals(proposals, final)
     experiments = Experiments(predictor.scenario, suspected_bodies(predictor))
-    statuses = {e.__name__: _status(search, final, e, rivals, experiments) for e in search.effects}
-    if unexplained and not _well_explained(search.white, final, unexplained):
+    statuses = {
+        e.__name__: _status(fits, final, e, rivals, experiments) for e in dictionary.effects
+    }
+    if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
     elif final.candidates or (
-        inertia is not None and final.deviance < search.white.deviance(search.white.sse) - MARGIN
+        inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
     else:
         hidden = sum(status.verdict == "not_visible" for status in statuses.values())
         verdict = "not_visible" if hidden > 0.5 * len(statuses) else "nothing_missing"
-    white = search.white
     return Diagnosis(
         verdict,
         (
-            *_ranking(search, path, rivals),
-            *inertia_findings(search.white, before, path[0], inertia),
+            *_ranking(fits, path, rivals),
+            *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
         tuple(unexplained),
@@ -177,113 +185,14 @@ def diagnose(
     )
 
 
-def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[Explanation]:
-    """Explanations by forward selection, from none to the last that improves significantly."""
-    path = [search.explain([])]
-    if search.inertia is not None:
-        path.append(search.doubting(_pruned(search, search.plain_friction())))
-        say("fitted inertia and plain friction")
-    while len(path[-1].candidates) < _MOST_EFFECTS:
-        base = path[-1]
-        additions = search.best_additions(base)
-        if not additions:
-            break
-        chosen = _spread(search, additions)
-        chosen = _revise(search, chosen)
-        say(
-            "found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates)
-        )
-        if chosen.deviance > base.deviance - MARGIN:
-            break
-        path.append(search.polished(search.doubting(chosen)))
-    if search.inertia is None:
-        path[-1] = _pruned(search, path[-1])
-    return path
-
-
-def _pruned(search: Search, explanation: Explanation) -> Explanation:
-    """An explanation without the members that bring no more than chance."""
-    for member in explanation.candidates:
-        rest = search.explain([c for c in explanation.candidates if c is not member])
-        if not search.is_significant(rest, search.explain([*rest.candidates, member]), member):
-            explanation = rest
-    return explanation
-
-
-def _spread(search: Search, additions: list[Explanation]) -> Explanation:
-    """The best addition, with the same effect on all further joints where nothing else explains more.
-
-    Joints that share values get values of their own if that explains more; then a simpler effect may do as well.
-    """
-    best = _simplest(additions)
-    added, others = best.candidates[-1], best.candidates[:-1]
-    if not issubclass(added.effect, JointTorqueEffect):
-        return best
-    by_joint: dict[str, list[Explanation]] = {}
-    for explanation in additions:
-        candidate = explanation.candidates[-1]
-        if len(candidate.targets) == 1 and issubclass(candidate.effect, JointTorqueEffect):
-            by_joint.setdefault(candidate.targets[0], []).append(explanation)
-
-    def alone(effect: type[Effect], joint: str) -> list[Explanation]:
-        return [e for e in by_joint.get(joint, []) if e.candidates[-1].effect is effect]
-
-    if len(added.targets) > 1:
-        simple = [
-            _simplest(by_joint[joint]).candidates[-1].effect
-            for joint in added.targets
-            if joint in by_joint
-        ]
-        options = [best]
-        for effect in dict.fromkeys([added.effect, *simple]):
-            own = [e.candidates[-1] for joint in added.targets for e in alone(effect, joint)]
-            options += [search.explain([*others, *own])] if own else []
-        best = _simplest(sorted(options, key=lambda e: e.deviance))
-    effect = best.candidates[-1].effect
-    chosen, taken = (
-        [*best.candidates],
-        {target for c in best.candidates if c.effect is effect for target in c.targets},
-    )
-    for joint, there in by_joint.items():
-        same = alone(effect, joint)
-        if joint not in taken and same and same[0].deviance < there[0].deviance + MARGIN:
-            chosen.append(same[0].candidates[-1])
-    return search.explain(chosen) if len(chosen) > len(best.candidates) else best
-
-
-def _simplest(additions: list[Explanation]) -> Explanation:
-    """The best addition; among those that are told apart by nobody, the one with the fewest parameters."""
-    equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
-    return min(equal, key=lambda e: len(e.fit.parameters))
-
-
-def _revise(search: Search, explanation: Explanation) -> Explanation:
-    """Tries every member that shares a row with another one against all others in its place, until nothing improves."""
-    improved = True
-    while improved:
-        improved = False
-        for member in explanation.candidates:
-            others = [c for c in explanation.candidates if c is not member]
-            rows = member.signature.rows
-            if not any(np.intersect1d(rows, c.signature.rows).size for c in others):
-                continue
-            rest = search.explain(others)
-            additions = search.best_additions(rest, rows)
-            best = _simplest(additions) if additions else rest
-            if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
-                explanation, improved = best, True
-                break
-    return explanation
-
-
-def _rivals(search: Search, final: Explanation) -> dict[int, list[Explanation]]:
+def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
     """For each member: explanations with another effect in its place, best first; one for each effect and targets."""
     result = {}
     for k, member in enumerate(final.candidates):
-        rest = search.explain([c for c in final.candidates if c is not member])
+        rest = proposals.fits.explain([c for c in final.candidates if c is not member])
         additions = [
             e
-            for e in search.best_additions(rest, member.signature.rows)
+            for e in best_additions(proposals, rest, member.signature.rows)
             if len(e.candidates) == len(final.candidates)
         ]
         result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
@@ -295,18 +204,18 @@ def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = sl
 
 
 def _ranking(
-    search: Search, path: list[Explanation], rivals: dict[int, list[Explanation]]
+    fits: Fits, path: list[Explanation], rivals: dict[int, list[Explanation]]
 ) -> list[Finding]:
-    final, white = path[-1], search.white
+    final, white = path[-1], fits.white
     without = [
-        search.explain([c for c in final.candidates if c is not member])
+        fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
     ]
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
         equal = tuple(
-            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(search, e, final))
+            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(fits, e, final))
         )
         findings.append(finding_of(white, rest, final, member, equal, chosen=True))
     seen = {(f.effect, f.targets) for f in findings}
@@ -317,7 +226,7 @@ def _ranking(
         member = explanation.candidates[-1]
         if (member.name, member.targets) not in seen:
             seen.add((member.name, member.targets))
-            rest = search.explain(explanation.candidates[:-1])
+            rest = fits.explain(explanation.candidates[:-1])
             findings.append(finding_of(white, rest, explanation, member, (), chosen=False))
     return findings
 
@@ -405,21 +314,19 @@ def _well_explained(
 
 
 def _status(
-    search: Search,
+    fits: Fits,
     final: Explanation,
     effect: type[Effect],
     rivals: dict[int, list[Explanation]],
     experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
-    smallest = search.smallest_detectable(final, effect)
+    smallest = smallest_detectable(fits, final, effect)
     scenario = None
     mistaken_for = [
         final.candidates[k]
         for k, alternatives in rivals.items()
-        if any(
-            e.candidates[-1].effect is effect and _equals(search, e, final) for e in alternatives
-        )
+        if any(e.candidates[-1].effect is effect and _equals(fits, e, final) for e in alternatives)
     ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"
@@ -429,25 +336,26 @@ def _status(
         scenario = experiments.that_separates(
             member.effect, member.targets, final.values(member)[0], effect
         )
-    elif all(size > search.largest_plausible(effect, target) for target, size in smallest.items()):
+    elif all(
+        size > fits.dictionary.largest_plausible(effect, target)
+        for target, size in smallest.items()
+    ):
         verdict = "not_visible"
         scenario = experiments.that_shows(effect)
     else:
         verdict = "absent"
     units = dict.fromkeys(
-        search.parameters(effect, target)[parameter].unit for target in smallest
+        fits.dictionary.parameters(effect, target)[parameter].unit for target in smallest
     ) or [effect.parameters[parameter].unit]
     return EffectStatus(
         verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
     )
 
 
-def _equals(search: Search, rival: Explanation, final: Explanation) -> bool:
+def _equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
     """Does a rival explain as much? One with fewer parameters does also if chance may have brought what the final explanation has more."""
     more = len(final.fit.parameters) - len(rival.fit.parameters)
-    return rival.deviance < final.deviance + (
-        search.threshold[min(12, more)] if more > 0 else MARGIN
-    )
+    return rival.deviance < final.deviance + (fits.threshold[min(12, more)] if more > 0 else MARGIN)
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:

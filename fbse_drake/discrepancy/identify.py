@@ -8,9 +8,12 @@ import numpy as np
 
 from fbse_drake.discrepancy.add import add
 from fbse_drake.discrepancy.diagnose import Finding, finding_of, inertia_findings
+from fbse_drake.discrepancy.dictionary import Dictionary
+from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.search import Search
+from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.refinement import consistent
 from fbse_drake.discrepancy.study import ModelError, model_error
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
@@ -55,15 +58,15 @@ def identify(
     say = progress or (lambda _: None)
     say("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
-    search = Search(predictor, [])
-    raw, alone = search.white.sse, search.explain([])
+    fits = Fits(Dictionary(predictor, []))
+    raw, alone = fits.white.sse, fits.explain([])
     say("fitting")
-    fitted, inertia = search.consistent(search.plain_friction())
+    fitted, inertia = consistent(fits, Proposals(fits).plain_friction())
     findings = [
-        finding_of(search.white, alone, fitted, member, (), chosen=True)
+        finding_of(fits.white, alone, fitted, member, (), chosen=True)
         for member in fitted.candidates
     ]
-    findings += inertia_findings(search.white, raw, alone, inertia)
+    findings += inertia_findings(fits.white, raw, alone, inertia)
     completed = add(scenario, findings)
     logs = {"train": log} | dict(tests or {})
     errors = [
