@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fbse_drake.discrepancy.explanation import Explanation
-from fbse_drake.discrepancy.fits import Fits, project
-from fbse_drake.discrepancy.proposals import fixed_gain, grid_gain, row_moments
+from fbse_drake.discrepancy.fits import Fits
+from fbse_drake.discrepancy.proposals import grid_gain
+from fbse_drake.discrepancy.regression import columns_of
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -29,15 +30,13 @@ def smallest_detectable(fits: Fits, base: Explanation, effect: type[Effect]) -> 
 
 
 def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> dict[str, float]:
-    _, projection = fits.room(base)
-    scale = fits.white.scale(base.sse)
+    beside = fits.remainder(base)
     result = {}
     if not issubclass(effect, JointTorqueEffect):
         for candidate in (c for c in fits.fixed_candidates if c.effect is effect):
             s = candidate.signature
             power = sum(
-                (project(s.values[:, k, :1], projection.get(row)) ** 2).sum() / scale[row]
-                for k, row in enumerate(s.rows)
+                beside.moments(s, k)[0][0, 0] / beside.scale[row] for k, row in enumerate(s.rows)
             )
             result[candidate.targets[0]] = float(
                 np.sqrt(
@@ -46,10 +45,10 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
                 )
             )
         return result
-    points, columns = fits.grid(effect)
+    grid = fits.grid(effect)
     has_linear = any(parameter.linear for parameter in effect.parameters.values())
     for row, joint in enumerate(fits.dictionary.joints):
-        here = points[..., row]
+        here = grid.points[..., row]
         usual = (
             int(
                 np.abs(np.log(here / fits.dictionary.usual_at(effect, joint)[:, None]))
@@ -60,8 +59,9 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
             else 0
         )
         needed = fits.needed(len(effect.parameters)) + fits.systematic(np.array([row]))
-        first = columns[row][:, 0]
-        power = (project(first, projection.get(row)) ** 2).sum(axis=0) / scale[row]
+        sets = grid.sets[row]
+        gram, _ = beside.moments_of_sets(sets.signature, 0, sets.gram)
+        power = gram[:, 0, 0] / beside.scale[row]
         if not np.all(
             effect.shows_within(
                 fits.dictionary.travel[row], fits.dictionary.usual_at(effect, joint)
@@ -105,27 +105,22 @@ def separation(
         raw = fits.dictionary.predictor.signature(effect, target, nonlinear)
         whitened = fits.white.whiten_signature(raw)
         signal[:, whitened.rows] += whitened.values @ amounts
-    scale = np.ones(signal.shape[1])
-    if issubclass(rival, JointTorqueEffect):
-        left = 0.0
-        columns = fits.grid(rival)[1]
-        for row, joint in enumerate(fits.dictionary.joints):
-            power = float((signal[:, row] ** 2).sum())
-            if joint in targets and power > 0:
-                power -= float(
-                    grid_gain(rival, *row_moments(fits, columns[row], row, signal, {}, scale)).max()
-                )
-            left += power
-        return left + float((signal[:, len(fits.dictionary.joints) :] ** 2).sum())
     total = float((signal**2).sum())
-    return total - max(
-        (
-            fixed_gain(fits, c, signal, {}, scale)
-            for c in fits.fixed_candidates
-            if c.effect is rival
-        ),
-        default=0.0,
-    )
+    if issubclass(rival, JointTorqueEffect):
+        grid = fits.grid(rival)
+        for row, joint in enumerate(fits.dictionary.joints):
+            if joint in targets and signal[:, row].any():
+                sets = grid.sets[row]
+                right = columns_of(sets.signature)[0].T @ signal[:, row]
+                gain = grid_gain(rival, sets.gram, right.reshape(sets.gram.shape[:2]))
+                total -= float(gain.max())
+        return total
+    gains = []
+    for s in (c.signature for c in fits.fixed_candidates if c.effect is rival):
+        right = np.einsum("brp,br->p", s.values, signal[:, s.rows])
+        gram = fits.regression.products(s, s)[2].sum(axis=0)
+        gains.append(float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0]))
+    return total - max(gains, default=0.0)
 
 
 def _crossing(sizes: np.ndarray, power: np.ndarray, needed: float) -> float:

@@ -8,12 +8,16 @@ from functools import cache, cached_property
 import numpy as np
 
 from fbse_drake.discrepancy.inertial import untrusted_bodies, untrusted_inertia
+from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import Signature, WhitenedResidual
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
+
+# So many numbers are kept in columns, at most.
+_MOST_NUMBERS = 30_000_000
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Dictionary:
             self.directions = self.inertia.visible_directions(WhitenedResidual(predictor.residual))
             self.inertia_signature = self.inertia.signature(self.directions)
         self._grids: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
 
     def parameters(self, effect: type[Effect], target: str) -> Mapping[str, Parameter]:
         """An effect's parameters in the units of a target."""
@@ -152,16 +157,34 @@ class Dictionary:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """Columns for G sets of nonlinear values, (m, G) or (m, G, r), shape (B, r, p, G); see `Predictor.joint_columns`."""
+        """Columns for G sets of nonlinear values, (m, G) or (m, G, r), shape (B, r, p, G); see `Predictor.joint_columns`.
+
+        Searches come back to the same values again and again: columns are kept.
+        """
         sets = (
             nonlinear
             if nonlinear.ndim == 3
             else np.repeat(nonlinear[:, :, None], len(places), axis=2)
         )
-        # From (p, G, B, r).
-        return np.transpose(
-            self.predictor.joint_columns(effect, sets, places, noisier=noisier), (2, 3, 0, 1)
-        )
+        found = []
+        for r, place in enumerate(places):
+            keys = [(effect, int(place), values.tobytes(), noisier) for values in sets[..., r].T]
+            known = {key: self._columns[key] for key in keys if key in self._columns}
+            new = [g for g, key in enumerate(keys) if key not in known]
+            if new:
+                columns = self.predictor.joint_columns(
+                    effect, sets[:, new, r : r + 1], places[r : r + 1], noisier=noisier
+                )
+                # From (p, G, B, 1).
+                made = {
+                    keys[g]: np.ascontiguousarray(columns[:, k, :, 0]) for k, g in enumerate(new)
+                }
+                known |= made
+                for key, values in made.items():
+                    self._columns[key] = values
+            found.append([known[key] for key in keys])
+        # From (r, G, p, B).
+        return np.transpose(np.array(found), (3, 0, 2, 1))
 
     def takes_torque(self, effect: type[Effect]) -> bool:
         # The load of inertia that is not trusted is taken from the measured torque.

@@ -11,7 +11,7 @@ from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """One effect on one or more targets that share its values."""
 
@@ -46,7 +46,7 @@ class Candidate:
         return [name for name, parameter in self.effect.parameters.items() if not parameter.linear]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Explanation:
     """Effects that are fitted together; their parameters stand one candidate after the other, then those of untrusted inertia."""
 

@@ -1,19 +1,24 @@
 """Fits of explanations to one residual: how well effects explain it together, and what they leave."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.stats import chi2
 
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.discrepancy.regression import (
+    Regression,
     Signature,
     WhitenedResidual,
     bounded_least_squares,
+    leftover,
 )
+from fbse_drake.discrepancy.remainder import Remainder
 from fbse_drake.discrepancy.residual import Residual
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -27,6 +32,31 @@ COMPLEXITY = 4.0
 _SYSTEMATIC = 0.5
 # Safety on what the noise in an effect's own columns may feign.
 _SPURIOUS = 3.0
+
+
+# So many explanations are kept, and so many numbers in columns.
+_KEPT = 500
+_MOST_NUMBERS = 30_000_000
+
+
+@dataclass(frozen=True)
+class ColumnSets:
+    """Columns of a joint torque effect in one joint for G sets of its nonlinear values."""
+
+    # Whitened, p columns for each set, one set after the other.
+    signature: Signature
+    # Inner products within each set, (G, p, p).
+    gram: np.ndarray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The first sets of nonlinear values that a search tries."""
+
+    # (m, G, n).
+    points: np.ndarray
+    # For each joint.
+    sets: tuple[ColumnSets, ...]
 
 
 class Fits:
@@ -47,13 +77,22 @@ class Fits:
         self.always = (
             [] if inertia is None else [self.white.whiten_signature(dictionary.inertia_signature)]
         )
-        self._grids: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
+        self.regression = Regression(self.white)
+        self._grids: dict[str, Grid] = {}
+        self._explanations: Memory[Explanation] = Memory(_KEPT)
+        self._sets: Memory[ColumnSets] = Memory(
+            _MOST_NUMBERS, lambda sets: sets.signature.values.size
+        )
+        self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
 
     def doubting(self, explanation: Explanation) -> tuple["Fits", Explanation]:
         """Fits that weigh the residual anew, and an explanation in them: friction laws that it takes off make the residual noisier."""
         predictor = self.dictionary.predictor
         resolved = [effect.resolve(predictor.robot.description) for effect in explanation.effects]
-        fits = Fits(self.dictionary, predictor.doubted(predictor.residual, resolved))
+        residual = predictor.doubted(predictor.residual, resolved)
+        if np.array_equal(residual.variance, self.white.residual.variance):
+            return self, explanation
+        fits = Fits(self.dictionary, residual)
         moved = [
             replace(c, signature=fits.white.whiten_signature(c.raw)) for c in explanation.candidates
         ]
@@ -110,16 +149,19 @@ class Fits:
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:
         """Fits candidates together."""
+        key = tuple(candidates)
+        return self._explanations.or_made(key, lambda: self._explain(key))
+
+    def _explain(self, candidates: tuple[Candidate, ...]) -> Explanation:
+        white = self.white
         if not candidates and not self.always:
-            return Explanation(
-                (), None, self.white.sse, self.white.sse, self.white.deviance(self.white.sse)
-            )
-        fit = self.white.fit([*(c.signature for c in candidates), *self.always])
+            return Explanation((), None, white.sse, white.sse, white.deviance(white.sse))
+        fit = self.regression.fit([*(c.signature for c in candidates), *self.always])
         charge = COMPLEXITY * sum(c.signature.values.shape[2] for c in candidates)
         factor = self.torque_factor(candidates, fit.parameters)
         sse, held_out_sse = fit.sse * factor, fit.held_out_sse * factor
         return Explanation(
-            tuple(candidates), fit, sse, held_out_sse, self.white.deviance(held_out_sse) + charge
+            candidates, fit, sse, held_out_sse, white.deviance(held_out_sse) + charge
         )
 
     def torque_factor(
@@ -130,23 +172,27 @@ class Fits:
         With u = share * torque, the rest torque - u - ... is the error of the torque times 1 - share: a share near 1 would explain
         everything. As the error of the torque itself it is the larger the more is taken.
         """
-        if self.dictionary.per_step:
+        taking = [c for c in candidates if self.dictionary.takes_torque(c.effect)]
+        if self.dictionary.per_step or not taking:
             return 1.0
         torque = self.dictionary.predictor.motion.blocks.torque_command
-        taken, start = np.zeros_like(torque), 0
+        taken, start = {}, 0
         for c in candidates:
             stop = start + c.signature.values.shape[2]
-            if self.dictionary.takes_torque(c.effect):
-                taken[:, c.raw.rows] += c.raw.values @ parameters[start:stop] + c.raw.offset
+            if c in taking:
+                added = c.raw.values @ parameters[start:stop] + c.raw.offset
+                for row, values in zip(c.raw.rows, added.T, strict=True):
+                    taken[row] = taken.get(row, 0.0) + values
             start = stop
-        known = self.white.residual.known[:, : torque.shape[1]]
         factor = np.ones(self.white.y.shape[1])
-        own, rest = (
-            (np.where(known, values, 0.0) ** 2).sum(axis=0) for values in (torque, torque - taken)
-        )
-        factor[: len(own)] = np.divide(
-            own, rest, out=np.ones_like(own), where=(own > 0) & (rest > 0)
-        )
+        for row, values in taken.items():
+            known = self.white.residual.known[:, row]
+            own, rest = (
+                float((part[known] ** 2).sum())
+                for part in (torque[:, row], torque[:, row] - values)
+            )
+            if own > 0 and rest > 0:
+                factor[row] = own / rest
         return factor
 
     @property
@@ -160,23 +206,42 @@ class Fits:
             _SYSTEMATIC * float(self.white.doubt[rows].sum()) if self.dictionary.per_step else 0.0
         )
 
-    def grid(self, effect: type[JointTorqueEffect]) -> tuple[np.ndarray, list[np.ndarray]]:
-        """First grid of an effect's nonlinear values for each joint, (m, G, n), and its whitened columns, (B, p, G) for each joint."""
+    def grid(self, effect: type[JointTorqueEffect]) -> Grid:
+        """First grid of an effect's nonlinear values, in all joints."""
         if effect.__name__ not in self._grids:
             points, columns = self.dictionary.grid(effect)
-            whitened = [self.white.whiten(j, columns[:, j]) for j in range(columns.shape[1])]
-            self._grids[effect.__name__] = (points, whitened)
+            sets = (self._whitened(columns[:, j], j) for j in range(columns.shape[1]))
+            self._grids[effect.__name__] = Grid(points, tuple(sets))
         return self._grids[effect.__name__]
+
+    def sets(self, effect: type[JointTorqueEffect], place: int, points: np.ndarray) -> ColumnSets:
+        """Sets of an effect's nonlinear values, (m, G), in one joint."""
+
+        def made() -> ColumnSets:
+            columns = self.dictionary.columns(effect, np.array([place]), points)
+            return self._whitened(columns[:, 0], place)
+
+        return self._sets.or_made((effect, place, points.tobytes()), made)
+
+    def _whitened(self, columns: np.ndarray, place: int) -> ColumnSets:
+        """Of columns (B, p, G)."""
+        values = self.white.whiten(place, np.swapaxes(columns, 1, 2))
+        by_set = np.moveaxis(values, 0, 2)
+        flat = values.reshape(len(values), 1, -1)
+        return ColumnSets(Signature(np.array([place]), flat), by_set @ np.swapaxes(by_set, 1, 2))
 
     def candidate(
         self,
         effect: type[JointTorqueEffect],
         group: tuple[str, ...],
         nonlinear: np.ndarray,
-        left: np.ndarray,
-        projection: dict[int, np.ndarray],
+        beside: Remainder,
     ) -> Candidate:
-        """A joint torque effect with nonlinear values, linearised about them."""
+        """A joint torque effect with nonlinear values, linearised about them.
+
+        Args:
+            beside: what the explanation leaves that it is to be added to.
+        """
         places = np.array([self.dictionary.joints.index(joint) for joint in group])
         columns = self.dictionary.columns(effect, places, nonlinear[:, None])[..., 0]
         parameters = self.dictionary.parameters(effect, group[0])
@@ -184,18 +249,12 @@ class Fits:
         has_linear = len(names) < len(parameters)
         amounts = np.ones(1)
         if has_linear:
-            whitened = [self.white.whiten(j, columns[:, r]) for r, j in enumerate(places)]
-            X = np.concatenate(
-                [
-                    project(columns, projection.get(j))
-                    for columns, j in zip(whitened, places, strict=True)
-                ]
-            )
-            amounts = np.linalg.lstsq(X, left[:, places].T.ravel())[0]
+            plain = self.white.whiten_signature(Signature(places, columns))
+            moments = [beside.moments(plain, k) for k in range(len(places))]
+            gram, right = (sum(m) for m in zip(*moments, strict=True))
             smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
-            if np.any(amounts < smallest):
-                # A slope for an amount that cannot be would mimic just that.
-                amounts = bounded_least_squares(X.T @ X, X.T @ left[:, places].T.ravel(), smallest)
+            # A slope for an amount that cannot be would mimic just that.
+            amounts = bounded_least_squares(gram, right, smallest)
         # Slopes with respect to the nonlinear parameters, for amounts that fit best.
         slopes = []
         for k in range(len(nonlinear)):
@@ -242,58 +301,32 @@ class Fits:
         spurious = self.spurious(clean, self.white.whiten_signature(Signature(places, noisier)))
         return Candidate(effect, group, parameters, nonlinear, signature, raw, spurious)
 
-    def leftover(self, base: Explanation) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Whitened residual after an explanation, (B, R), and by row an orthonormal basis of the columns it has there."""
-        left, by_row = self.white.y.copy(), {}
-        start = 0
-        for s in self.signatures(base):
-            stop = start + s.values.shape[2]
-            left[:, s.rows] -= s.values @ base.fit.parameters[start:stop] + s.offset
-            for k, row in enumerate(s.rows):
-                by_row.setdefault(row, []).append(s.values[:, k])
-            start = stop
-        return left, {
-            row: np.linalg.qr(np.concatenate(columns, axis=1))[0] for row, columns in by_row.items()
-        }
-
-    def signatures(self, explanation: Explanation) -> list[Signature]:
+    def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
         """Whitened, in the order of the explanation's parameters."""
-        return [
+        return (
             *(c.signature for c in explanation.candidates),
             *(self.always if explanation.fit is not None else []),
-        ]
+        )
 
-    def room(self, base: Explanation) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """What further effects could explain: as `leftover`; columns of inertia however tie all rows together.
+    def leftover(self, explanation: Explanation) -> np.ndarray:
+        """Whitened residual after an explanation, (B, R)."""
+        if explanation.fit is None:
+            return self.white.y
+        return leftover(self.white, self.signatures(explanation), explanation.fit.parameters)
 
-        With an orthonormal basis Q of all columns, rows one below the other, new columns x in one row keep x^T (1 - Q_r Q_r^T) x of their
-        sum of squares, Q_r being the row's part of Q. In place of a row's basis stands the matrix B with (1 - B B^T)^2 = 1 - Q_r Q_r^T.
-        """
-        left, by_row = self.leftover(base)
-        signatures = self.signatures(base)
-        if not self.always or not signatures:
-            return left, by_row
-        scale = np.sqrt(self.white.scale(base.sse))
-        columns = []
-        for s in signatures:
-            of_all = np.zeros((*left.shape, s.values.shape[2]))
-            of_all[:, s.rows] = s.values / scale[s.rows, None]
-            columns.append(of_all)
-        X = np.concatenate(columns, axis=2)
-        lengths = np.linalg.norm(X, axis=(0, 1))
-        X /= np.where(lengths > 0, lengths, 1.0)
-        Q = np.linalg.qr(X.reshape(-1, X.shape[2]))[0].reshape(X.shape)
-        left = left - scale * (Q @ np.einsum("brp,br->p", Q, left / scale))
-        for row in range(left.shape[1]):
-            U, s, _ = np.linalg.svd(Q[:, row], full_matrices=False)
-            by_row[row] = U * np.sqrt(1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0)))
-        return left, by_row
+    def remainder(self, explanation: Explanation) -> Remainder:
+        """What further effects could take of what an explanation leaves."""
+        if explanation not in self._remainders:
+            parameters = np.zeros(0) if explanation.fit is None else explanation.fit.parameters
+            self._remainders[explanation] = Remainder(
+                self.regression,
+                self.signatures(explanation),
+                parameters,
+                self.white.scale(explanation.sse),
+                tied=bool(self.always),
+            )
+        return self._remainders[explanation]
 
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""
         return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)
-
-
-def project(X: np.ndarray, Q: np.ndarray | None) -> np.ndarray:
-    """Columns (B, ...) without what an orthonormal basis Q (B, k) has of them."""
-    return X if Q is None else X - Q @ (Q.T @ X)

@@ -235,18 +235,17 @@ class Predictor:
             }
         )
         if nonlinear.ndim == 2:
-            return np.stack(
-                [
-                    self.motion.averages(column)
-                    for column in basis_over_time(effect, motion, nonlinear)
-                ]
-            )
+            return self._averages(basis_over_time(effect, motion, nonlinear))
         sets = max(1, _CHUNK // motion.velocity.size)
-        parts = []
-        for start in range(0, nonlinear.shape[1], sets):
-            columns = basis_over_time(effect, motion, nonlinear[:, start : start + sets])
-            parts.append([[self.motion.averages(column) for column in group] for group in columns])
-        return np.concatenate([np.array(part) for part in parts], axis=1)
+        parts = [
+            self._averages(basis_over_time(effect, motion, nonlinear[:, start : start + sets]))
+            for start in range(0, nonlinear.shape[1], sets)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def _averages(self, columns: np.ndarray) -> np.ndarray:
+        """Averages over blocks of columns (..., N - 1, T), all at once."""
+        return np.moveaxis(self.motion.averages(np.moveaxis(columns, -2, 0)), 0, -2)
 
     def signature(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> Signature:
         """What an effect on one target adds to the residual per unit of each linear parameter.

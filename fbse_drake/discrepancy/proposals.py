@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fbse_drake.discrepancy.explanation import Candidate, Explanation
-from fbse_drake.discrepancy.fits import Fits, project
+from fbse_drake.discrepancy.fits import Fits
+from fbse_drake.discrepancy.remainder import Remainder
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
@@ -23,45 +24,37 @@ class Proposals:
 
     def __init__(self, fits: Fits):
         self.fits = fits
-        self._found: dict[tuple[str, tuple[str, ...], bytes], Candidate] = {}
+        self._found: dict[tuple[object, ...], Candidate] = {}
+        self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
-        """Candidates that, alone, would take off enough of what an explanation leaves over."""
-        left, projection = self.fits.room(base)
+        """Candidates that, alone, would take off enough of what an explanation leaves over.
+
+        Args:
+            rows: only those that change one of these; None for all.
+        """
+        fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
         if rows is None:
-            rows = np.arange(left.shape[1])
-        scale = self.fits.white.scale(base.sse)
-        result = []
-        for candidate in self.fits.fixed_candidates:
-            taken = any(
-                c.effect is candidate.effect and c.targets == candidate.targets
-                for c in base.candidates
-            )
-            touches = np.intersect1d(candidate.signature.rows, rows).size > 0
-            if (
-                touches
-                and not taken
-                and fixed_gain(self.fits, candidate, left, projection, scale)
-                > 0.5 * self.fits.threshold[1]
-            ):
-                result.append(candidate)
+            rows = np.arange(len(beside.scale))
+        enough = 0.5 * fits.threshold[1]
+        known = {(c.effect, c.targets) for c in base.candidates}
+        result = [
+            candidate
+            for candidate in fits.fixed_candidates
+            if (candidate.effect, candidate.targets) not in known
+            and np.intersect1d(candidate.signature.rows, rows).size
+            and fixed_gain(beside, candidate) > enough
+        ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
-            group: [] for group in self.fits.dictionary.groups
+            group: [] for group in dictionary.groups
         }
-        for effect in self.fits.dictionary.joint_effects:
+        for effect in dictionary.joint_effects:
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
-            columns = self.fits.grid(effect)[1]
-            moments = [
-                row_moments(self.fits, columns[j], j, left, projection, scale)
-                for j in range(len(self.fits.dictionary.joints))
-            ]
-            for group in self.fits.dictionary.groups:
-                places = [self.fits.dictionary.joints.index(joint) for joint in group]
+            for group in dictionary.groups:
+                places = [dictionary.joints.index(joint) for joint in group]
                 if taken & set(group) or not np.intersect1d(places, rows).size:
                     continue
-                gain = grid_gain(
-                    effect, sum(moments[j][0] for j in places), sum(moments[j][1] for j in places)
-                )
+                gain = self._gain(effect, places, beside)
                 coarse[group].append((float(gain.max()), effect, int(gain.argmax())))
         for group, found in coarse.items():
             # What the grid shows far behind the best does not catch up between its points.
@@ -69,12 +62,12 @@ class Proposals:
             honest = (
                 gain
                 for gain, effect, _ in found
-                if self.fits.dictionary.per_step or not self.fits.dictionary.takes_torque(effect)
+                if dictionary.per_step or not dictionary.takes_torque(effect)
             )
-            least = max(0.5 * self.fits.threshold[1], 0.4 * max(honest, default=0.0))
+            least = max(enough, 0.4 * max(honest, default=0.0))
             for gain, effect, best in found:
                 if gain > least:
-                    result.append(self._best_on(effect, group, best, left, projection, scale))
+                    result.append(self._best_on(effect, group, best, beside))
         return result
 
     def plain_friction(self) -> Explanation:
@@ -88,38 +81,45 @@ class Proposals:
                         for c in explanation.candidates
                         if (c.effect, c.targets) != (effect, (joint,))
                     ]
-                    explanation = self.fits.explain(
-                        [*others, self.best_beside(self.fits.explain(others), effect, joint)]
-                    )
+                    best = self._best_beside(self.fits.explain(others), effect, joint)
+                    explanation = self.fits.explain([*others, best])
         return explanation
 
-    def best_beside(
+    def _best_beside(
         self, base: Explanation, effect: type[JointTorqueEffect], joint: str
     ) -> Candidate:
         """A joint torque effect with the nonlinear values that fit best beside an explanation."""
-        left, projection = self.fits.room(base)
-        scale, row = self.fits.white.scale(base.sse), self.fits.dictionary.joints.index(joint)
-        gain = grid_gain(
-            effect,
-            *row_moments(self.fits, self.fits.grid(effect)[1][row], row, left, projection, scale),
-        )
-        return self._best_on(effect, (joint,), int(gain.argmax()), left, projection, scale)
+        beside, place = self.fits.remainder(base), self.fits.dictionary.joints.index(joint)
+        gain = self._gain(effect, [place], beside)
+        return self._best_on(effect, (joint,), int(gain.argmax()), beside)
+
+    def _gain(
+        self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
+    ) -> np.ndarray:
+        """Drop of the sum of squares for each set of an effect's first grid, in joints at these places together, (G,)."""
+        grid, moments = self.fits.grid(effect), []
+        for place in places:
+            # Found once for what an explanation has in a row.
+            key = (effect, place, *beside.beside(place).key)
+            if key not in self._moments:
+                sets = grid.sets[place]
+                self._moments[key] = beside.moments_of_sets(sets.signature, 0, sets.gram)
+            moments.append(self._moments[key])
+        return grid_gain(effect, *_weighted(moments, beside.scale[places]))
 
     def _best_on(
         self,
         effect: type[JointTorqueEffect],
         group: tuple[str, ...],
         best: int,
-        left: np.ndarray,
-        projection: dict[int, np.ndarray],
-        scale: np.ndarray,
+        beside: Remainder,
     ) -> Candidate:
         """A joint torque effect with the nonlinear values that fit best; found once for what is left in the group's rows."""
         places = [self.fits.dictionary.joints.index(joint) for joint in group]
-        key = (effect.__name__, group, left[:, places].tobytes())
+        key = (effect, group, *(part for j in places for part in beside.beside(j).key))
         if key not in self._found:
-            nonlinear = self._narrowed(effect, places, best, left, projection, scale)
-            self._found[key] = self.fits.candidate(effect, group, nonlinear, left, projection)
+            nonlinear = self._narrowed(effect, places, best, beside)
+            self._found[key] = self.fits.candidate(effect, group, nonlinear, beside)
         return self._found[key]
 
     def _narrowed(
@@ -127,20 +127,14 @@ class Proposals:
         effect: type[JointTorqueEffect],
         places: Sequence[int],
         best: int,
-        left: np.ndarray,
-        projection: dict[int, np.ndarray],
-        scale: np.ndarray,
+        beside: Remainder,
     ) -> np.ndarray:
         """Nonlinear values between the grid's points that fit best, shape (m,)."""
-        points = self.fits.grid(effect)[0][..., places[0]]
+        dictionary = self.fits.dictionary
+        points = self.fits.grid(effect).points[..., places[0]]
         chosen = points[:, best].copy()
-        ranges = [
-            p.plausible
-            for p in self.fits.dictionary.parameters(
-                effect, self.fits.dictionary.joints[places[0]]
-            ).values()
-            if not p.linear
-        ]
+        parameters = dictionary.parameters(effect, dictionary.joints[places[0]])
+        ranges = [p.plausible for p in parameters.values() if not p.linear]
         steps = []
         for axis in points:
             values = np.unique(axis)
@@ -153,57 +147,31 @@ class Proposals:
                 trial[k] = np.clip(
                     chosen[k] * np.exp(np.linspace(-steps[k], steps[k], _POINTS)), *ranges[k]
                 )
-                columns = self.fits.dictionary.columns(effect, np.array(places), trial)
-                whitened = [self.fits.white.whiten(j, columns[:, r]) for r, j in enumerate(places)]
-                moments = [
-                    row_moments(self.fits, X, j, left, projection, scale)
-                    for X, j in zip(whitened, places, strict=True)
-                ]
-                gain = grid_gain(effect, sum(m[0] for m in moments), sum(m[1] for m in moments))
+                found = [self.fits.sets(effect, place, trial) for place in places]
+                moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in found]
+                gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
                 chosen[k] = trial[k, int(gain.argmax())]
                 steps[k] *= 2.0 / (_POINTS - 1)
         return chosen
 
 
-def fixed_gain(
-    fits: Fits,
-    candidate: Candidate,
-    left: np.ndarray,
-    projection: dict[int, np.ndarray],
-    scale: np.ndarray,
-) -> float:
+def _weighted(
+    moments: Sequence[tuple[np.ndarray, np.ndarray]], scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over rows of inner products, weighted by the inverse of the rows' scales."""
+    grams, rights = zip(*moments, strict=True)
+    return (
+        sum(part / s for part, s in zip(grams, scale, strict=True)),
+        sum(part / s for part, s in zip(rights, scale, strict=True)),
+    )
+
+
+def fixed_gain(beside: Remainder, candidate: Candidate) -> float:
     """Drop of the sum of squares by a candidate that is no joint torque effect, roughly."""
     s = candidate.signature
-    X = np.concatenate(
-        [
-            project(s.values[:, k], projection.get(row)) / np.sqrt(scale[row])
-            for k, row in enumerate(s.rows)
-        ]
-    )
-    y = (left[:, s.rows] / np.sqrt(scale[s.rows])).T.ravel()
-    right = (
-        X.T @ y
-        if not fits.always
-        else np.einsum("brp,br->p", s.values / scale[s.rows, None], left[:, s.rows])
-    )
-    return float(right @ np.linalg.lstsq(X.T @ X, right, rcond=1e-10)[0])
-
-
-def row_moments(
-    fits: Fits,
-    columns: np.ndarray,
-    row: int,
-    left: np.ndarray,
-    projection: dict[int, np.ndarray],
-    scale: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gram matrices (G, p, p), right sides (G, p) of a row's columns (B, p, G)."""
-    X = project(columns.reshape(len(columns), -1), projection.get(row)).reshape(columns.shape)
-    # Beside inertia, what is left is orthogonal to the columns of an explanation in all rows together, not in each.
-    against = columns if fits.always else X
-    return np.einsum("bpg,bqg->gpq", X, X, optimize=True) / scale[row], np.einsum(
-        "bpg,b->gp", against, left[:, row]
-    ) / scale[row]
+    moments = [beside.moments(s, k) for k in range(len(s.rows))]
+    gram, right = _weighted(moments, beside.scale[s.rows])
+    return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
 
 
 def grid_gain(effect: type[Effect], gram: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -57,7 +57,7 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
         )
         nonlinear = np.clip(near, 0.5 * ranges[:, 0], 2.0 * ranges[:, 1])
         moved.append(
-            fits.candidate(candidate.effect, candidate.targets, nonlinear, *fits.room(rest))
+            fits.candidate(candidate.effect, candidate.targets, nonlinear, fits.remainder(rest))
         )
     result = fits.explain(moved)
     return result if result.deviance <= explanation.deviance + COMPLEXITY else explanation
@@ -132,7 +132,7 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
     if fits.dictionary.inertia is not None or not any(
         issubclass(c.effect, InertiaEffect | SensorEffect) for c in explanation.candidates
     ):
-        return explanation, fits.white, fits.leftover(explanation)[0]
+        return explanation, fits.white, fits.leftover(explanation)
     scenario = fits.dictionary.predictor.scenario
     found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
     believed = replace(scenario.believed, effects=scenario.believed.effects | found)
