@@ -17,7 +17,7 @@ from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
 
 # So many numbers are kept in columns, at most.
-_MOST_NUMBERS = 30_000_000
+_MOST_NUMBERS = 15_000_000
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Candidates for what is missing, and explanations: candidates that are fitted together."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,15 +23,21 @@ class Candidate:
     parameters: Mapping[str, Parameter]
     # Values of its nonlinear parameters, shape (m,).
     nonlinear: np.ndarray
-    # Whitened; columns are the linear parameters, then the change of the nonlinear ones. And as it is.
+    # Whitened; columns are the linear parameters, then the change of the nonlinear ones.
     signature: Signature
-    raw: Signature
+    # The same as it is, or what makes it: it is seldom asked for.
+    source: Signature | Callable[[], Signature]
     # Drop of the deviance that it brings because the sensors' noise is in its columns and in the residual alike.
     spurious: float = 0.0
 
     @property
     def name(self) -> str:
         return self.effect.__name__
+
+    @cached_property
+    def raw(self) -> Signature:
+        """Its signature, not whitened."""
+        return self.source if isinstance(self.source, Signature) else self.source()
 
     @property
     def has_linear(self) -> bool:

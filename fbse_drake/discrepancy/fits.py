@@ -34,9 +34,11 @@ _SYSTEMATIC = 0.5
 _SPURIOUS = 3.0
 
 
+# Slopes with respect to nonlinear values are taken over this share of them.
+_SLOPE_STEP = 0.02
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
-_MOST_NUMBERS = 30_000_000
+_MOST_NUMBERS = 15_000_000
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,11 @@ class ColumnSets:
     signature: Signature
     # Inner products within each set, (G, p, p).
     gram: np.ndarray
+
+    @property
+    def columns(self) -> np.ndarray:
+        """By set, (B, G, p)."""
+        return self.signature.values.reshape(-1, *self.gram.shape[:2])
 
 
 @dataclass(frozen=True)
@@ -107,7 +114,7 @@ class Fits:
             spurious = (
                 0.0
                 if fixed.noise is None
-                else self.spurious(signature, self.white.whiten_signature(fixed.noise))
+                else self._spurious(signature, self.white.whiten_signature(fixed.noise))
             )
             parameters = self.dictionary.parameters(fixed.effect, fixed.target)
             result.append(
@@ -123,7 +130,7 @@ class Fits:
             )
         return result
 
-    def spurious(self, signature: Signature, noise: Signature) -> float:
+    def _spurious(self, signature: Signature, noise: Signature) -> float:
         """Drop of the deviance that the noise in a signature may feign."""
         both = np.einsum("brp,br->p", noise.values, self._noise[:, signature.rows])
         power = (signature.values**2).sum(axis=(0, 1))
@@ -214,14 +221,21 @@ class Fits:
             self._grids[effect.__name__] = Grid(points, tuple(sets))
         return self._grids[effect.__name__]
 
-    def sets(self, effect: type[JointTorqueEffect], place: int, points: np.ndarray) -> ColumnSets:
-        """Sets of an effect's nonlinear values, (m, G), in one joint."""
+    def sets(
+        self,
+        effect: type[JointTorqueEffect],
+        place: int,
+        points: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> ColumnSets:
+        """Sets of an effect's nonlinear values, (m, G), in one joint; if they are to be noisier, with the sensors' noise once more."""
 
         def made() -> ColumnSets:
-            columns = self.dictionary.columns(effect, np.array([place]), points)
+            columns = self.dictionary.columns(effect, np.array([place]), points, noisier=noisier)
             return self._whitened(columns[:, 0], place)
 
-        return self._sets.or_made((effect, place, points.tobytes()), made)
+        return self._sets.or_made((effect, place, points.tobytes(), noisier), made)
 
     def _whitened(self, columns: np.ndarray, place: int) -> ColumnSets:
         """Of columns (B, p, G)."""
@@ -243,29 +257,31 @@ class Fits:
             beside: what the explanation leaves that it is to be added to.
         """
         places = np.array([self.dictionary.joints.index(joint) for joint in group])
-        columns = self.dictionary.columns(effect, places, nonlinear[:, None])[..., 0]
         parameters = self.dictionary.parameters(effect, group[0])
         names = [name for name, parameter in parameters.items() if not parameter.linear]
-        has_linear = len(names) < len(parameters)
+        smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
+        steps = _SLOPE_STEP * nonlinear
+        # The values themselves, then for each of them a bit less and a bit more.
+        stencil = np.repeat(nonlinear[:, None], 1 + 2 * len(nonlinear), axis=1)
+        for k, step in enumerate(steps):
+            stencil[k, 1 + 2 * k : 3 + 2 * k] += [-step, step]
+        sets = [self.sets(effect, place, stencil) for place in places]
         amounts = np.ones(1)
-        if has_linear:
-            plain = self.white.whiten_signature(Signature(places, columns))
-            moments = [beside.moments(plain, k) for k in range(len(places))]
-            gram, right = (sum(m) for m in zip(*moments, strict=True))
-            smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
+        if len(smallest):
+            moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in sets]
+            gram, right = (sum(part[0] for part in parts) for parts in zip(*moments, strict=True))
             # A slope for an amount that cannot be would mimic just that.
             amounts = bounded_least_squares(gram, right, smallest)
-        # Slopes with respect to the nonlinear parameters, for amounts that fit best.
-        slopes = []
-        for k in range(len(nonlinear)):
-            step = 0.02 * nonlinear[k]
-            moved = np.repeat(nonlinear[:, None], 2, axis=1)
-            moved[k] += [-step, step]
-            pair = self.dictionary.columns(effect, places, moved)
-            slopes.append((pair[..., 1] - pair[..., 0]) @ amounts / (2 * step))
-        slope_columns = (
-            np.stack(slopes, axis=2) if slopes else np.zeros((len(columns), len(places), 0))
-        )
+
+        def linearised(columns: np.ndarray) -> np.ndarray:
+            """Columns (r, B, G, p) of the stencil: those of the amounts, then slopes for amounts that fit best; (B, r, P)."""
+            slopes = [
+                (columns[:, :, 2 + 2 * k] - columns[:, :, 1 + 2 * k]) @ amounts / (2 * step)
+                for k, step in enumerate(steps)
+            ]
+            together = [columns[:, :, 0], *(slope[..., None] for slope in slopes)]
+            return np.moveaxis(np.concatenate(together, axis=2), 0, 1)
+
         # A weak belief in the plausible range keeps values that the data say nothing about from running away.
         ranges = [np.log(parameters[name].plausible) for name in names]
         belief = [
@@ -274,32 +290,32 @@ class Fits:
         ]
         # Nonlinear parameters do not fall far below their plausible range.
         lows = 0.5 * np.array([parameters[name].plausible[0] for name in names])
-        lowest = [parameters[name].bounds[0] for name in parameters if name not in names]
+        lowest = smallest.tolist()
         lowest += np.maximum(-0.6 * nonlinear, np.minimum(lows - nonlinear, 0.0)).tolist()
-        if has_linear:
-            values = np.concatenate([columns, slope_columns], axis=2)
-            raw = Signature(
-                places,
-                values,
-                prior=np.array([0.0] * columns.shape[2] + belief),
-                lowest=np.array(lowest),
-            )
-        else:
-            raw = Signature(
-                places,
-                slope_columns,
-                offset=columns[:, :, 0],
-                prior=np.array(belief),
-                lowest=np.array(lowest),
-            )
-        noisier = (
-            self.dictionary.columns(effect, places, nonlinear[:, None], noisier=True)[..., 0]
-            - columns
+        prior = np.array([0.0] * len(smallest) + belief)
+
+        def signature(columns: np.ndarray) -> Signature:
+            values = linearised(columns)
+            if len(smallest):
+                return Signature(places, values, prior=prior, lowest=np.array(lowest))
+            offset = values[:, :, 0]
+            return Signature(places, values[:, :, 1:], offset, prior=prior, lowest=np.array(lowest))
+
+        def raw() -> Signature:
+            # From (B, r, p, G).
+            columns = self.dictionary.columns(effect, places, stencil)
+            return signature(np.transpose(columns, (1, 0, 3, 2)))
+
+        whitened = np.stack([s.columns for s in sets])
+        here = nonlinear[:, None]
+        noisier = [self.sets(effect, place, here, noisier=True).columns[:, 0] for place in places]
+        both = sum(
+            (noisy - clean[:, 0]).T @ self._noise[:, place]
+            for noisy, clean, place in zip(noisier, whitened, places, strict=True)
         )
-        signature = self.white.whiten_signature(raw)
-        clean = self.white.whiten_signature(Signature(places, columns))
-        spurious = self.spurious(clean, self.white.whiten_signature(Signature(places, noisier)))
-        return Candidate(effect, group, parameters, nonlinear, signature, raw, spurious)
+        power = sum(np.diag(s.gram[0]) for s in sets)
+        spurious = _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+        return Candidate(effect, group, parameters, nonlinear, signature(whitened), raw, spurious)
 
     def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
         """Whitened, in the order of the explanation's parameters."""

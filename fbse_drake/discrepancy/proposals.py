@@ -6,6 +6,7 @@ import numpy as np
 
 from fbse_drake.discrepancy.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.fits import Fits
+from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.discrepancy.remainder import Remainder
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect
@@ -15,6 +16,8 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 # How often a grid of nonlinear values is narrowed down around its best point, and to how many points.
 _NARROWINGS = 2
 _POINTS = 9
+# So many numbers are kept in columns of candidates.
+_MOST_NUMBERS = 15_000_000
 # How often friction of all joints is fitted in turn.
 _SWEEPS = 3
 
@@ -24,7 +27,7 @@ class Proposals:
 
     def __init__(self, fits: Fits):
         self.fits = fits
-        self._found: dict[tuple[object, ...], Candidate] = {}
+        self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
         self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
@@ -117,10 +120,12 @@ class Proposals:
         """A joint torque effect with the nonlinear values that fit best; found once for what is left in the group's rows."""
         places = [self.fits.dictionary.joints.index(joint) for joint in group]
         key = (effect, group, *(part for j in places for part in beside.beside(j).key))
-        if key not in self._found:
+
+        def made() -> Candidate:
             nonlinear = self._narrowed(effect, places, best, beside)
-            self._found[key] = self.fits.candidate(effect, group, nonlinear, beside)
-        return self._found[key]
+            return self.fits.candidate(effect, group, nonlinear, beside)
+
+        return self._found.or_made(key, made)
 
     def _narrowed(
         self,

@@ -42,7 +42,7 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
             except InputError:
                 # No body has these values.
                 return explanation
-            moved.append(replace(candidate, raw=raw, signature=fits.white.whiten_signature(raw)))
+            moved.append(replace(candidate, source=raw, signature=fits.white.whiten_signature(raw)))
             continue
         if m == 0:
             moved.append(candidate)

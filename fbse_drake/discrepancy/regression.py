@@ -27,8 +27,8 @@ _REWEIGHTINGS = 3
 _COLLINEAR = 1e-4
 # Rounding of a sum of products as a share of its terms, and the share of the sum that may be rounding.
 _ROUNDING, _NEGLIGIBLE = 1e-15, 1e-7
-# Inner products of so many sets of signatures, and so many fits, are kept.
-_KEPT, _KEPT_FITS = 32, 2000
+# So many numbers are kept of columns by fold, and of inner products; and so many fits.
+_MOST_NUMBERS, _KEPT_FITS = 15_000_000, 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +265,9 @@ class Regression:
         self._of_fold = [np.flatnonzero(white.fold == fold) for fold in range(FOLDS)]
         self._y = [white.y[blocks].T for blocks in self._of_fold]
         self._square = np.array([(y**2).sum(axis=1) for y in self._y])
-        self._split: WeakKeyDictionary[Signature, list[np.ndarray]] = WeakKeyDictionary()
+        self._split: Memory[list[np.ndarray]] = Memory(
+            _MOST_NUMBERS, lambda parts: sum(part.size for part in parts)
+        )
         self._targets: WeakKeyDictionary[Signature, np.ndarray] = WeakKeyDictionary()
         self._grams: WeakKeyDictionary[
             Signature, WeakKeyDictionary[Signature, tuple[np.ndarray, ...]]
@@ -276,7 +278,7 @@ class Regression:
         self._rights: WeakKeyDictionary[Signature, np.ndarray] = WeakKeyDictionary()
         # In the order in which signatures were first seen: what is tried last stands last, and all before it are known together already.
         self._age: WeakKeyDictionary[Signature, int] = WeakKeyDictionary()
-        self._assembled: Memory[_Assembled] = Memory(_KEPT)
+        self._assembled: Memory[_Assembled] = Memory(_MOST_NUMBERS, lambda a: a.gram.size)
         self._parts: Memory[PartialFit] = Memory(_KEPT_FITS)
 
     def fit(self, signatures: Sequence[Signature]) -> Fit:
@@ -353,38 +355,54 @@ class Regression:
 
     def _by_fold(self, signature: Signature) -> list[np.ndarray]:
         """Columns of a signature, its offset the last, in the blocks of each fold, (r, B_f, p)."""
-        if signature not in self._split:
+
+        def made() -> list[np.ndarray]:
             columns = columns_of(signature)
-            self._split[signature] = [columns[:, blocks] for blocks in self._of_fold]
-        return self._split[signature]
+            return [columns[:, blocks] for blocks in self._of_fold]
+
+        return self._split.or_made(signature, made)
 
     def _together(self, signatures: tuple[Signature, ...]) -> _Assembled:
         """Of all these; those before the last are most often together already."""
         return self._assembled.or_made(signatures, lambda: self._assemble(signatures))
 
     def _assemble(self, signatures: tuple[Signature, ...]) -> _Assembled:
-        last = signatures[-1]
-        size = self.target(last).shape[2]
-        if len(signatures) == 1:
-            _, _, gram = self.gram(last, last)
-            return _Assembled(last.rows, gram, self.target(last))
-        before = self._together(signatures[:-1])
-        rows = np.union1d(before.rows, last.rows)
-        of_before, of_last = (np.searchsorted(rows, r) for r in (before.rows, last.rows))
-        start = before.target.shape[2]
-        gram = np.zeros((FOLDS, len(rows), start + size, start + size))
-        target = np.zeros((FOLDS, len(rows), start + size))
-        gram[:, of_before, :start, :start] = before.gram
-        target[:, of_before, :start] = before.target
-        target[:, of_last, start:] = self.target(last)
-        place = 0
-        for s in signatures:
-            stop = place + self.target(s).shape[2]
-            of_s, _, products = self.gram(s, last)
-            at = np.searchsorted(rows, s.rows[of_s])
-            gram[:, at, place:stop, start:] = products
-            gram[:, at, start:, place:stop] = np.swapaxes(products, 2, 3)
-            place = stop
+        # What was there before the last is asked for again and again.
+        before = (
+            self._assembled.or_made(signatures[:-1], lambda: self._join(signatures[:-1]))
+            if len(signatures) > 1
+            else None
+        )
+        return self._join(signatures[-1:], signatures[:-1], before)
+
+    def _join(
+        self,
+        added: tuple[Signature, ...],
+        known: tuple[Signature, ...] = (),
+        before: _Assembled | None = None,
+    ) -> _Assembled:
+        """Signatures put to others that are together already."""
+        signatures = known + added
+        rows = np.unique(np.concatenate([s.rows for s in signatures]))
+        stops = np.cumsum([self.target(s).shape[2] for s in signatures])
+        gram = np.zeros((FOLDS, len(rows), stops[-1], stops[-1]))
+        target = np.zeros((FOLDS, len(rows), stops[-1]))
+        if before is not None:
+            start = stops[len(known) - 1]
+            at = np.searchsorted(rows, before.rows)
+            gram[:, at, :start, :start], target[:, at, :start] = before.gram, before.target
+        parts = [
+            slice(stop - self.target(s).shape[2], stop)
+            for s, stop in zip(signatures, stops, strict=True)
+        ]
+        for k in range(len(known), len(signatures)):
+            new, part = signatures[k], parts[k]
+            target[:, np.searchsorted(rows, new.rows), part] = self.target(new)
+            for other, place in zip(signatures[: k + 1], parts, strict=False):
+                of_other, _, products = self.gram(other, new)
+                at = np.searchsorted(rows, other.rows[of_other])
+                gram[:, at, place, part] = products
+                gram[:, at, part, place] = np.swapaxes(products, 2, 3)
         return _Assembled(rows, gram, target)
 
     def _part(self, signatures: tuple[Signature, ...]) -> PartialFit:

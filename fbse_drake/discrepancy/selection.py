@@ -46,8 +46,9 @@ def select(
         )
         if chosen.deviance > base.deviance - MARGIN:
             break
-        fits, explanation = fits.doubting(chosen)
-        proposals = Proposals(fits)
+        weighed, explanation = fits.doubting(chosen)
+        if weighed is not fits:
+            fits, proposals = weighed, Proposals(weighed)
         path.append(polished(fits, explanation))
     if fits.dictionary.inertia is None:
         path[-1] = _pruned(fits, path[-1])
@@ -139,17 +140,14 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     names = added.linear_names if added.has_linear else added.nonlinear_names
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
     part = slice(start, start + len(names))
-    values, deviations, intervals = (
-        wider.fit.parameters[part] + offsets,
-        wider.fit.deviation[part],
-        wider.fit.interval()[part],
-    )
-    for name, value, deviation, (least, most) in zip(
-        names, values, deviations, intervals, strict=True
-    ):
+    values = wider.fit.parameters[part] + offsets
+    for k, (name, value) in enumerate(zip(names, values, strict=True)):
         low, high = added.parameters[name].bounds
         plausible = added.parameters[name].plausible
         widest = max(abs(bound) for bound in plausible)
+        if low <= value <= high and abs(value) <= widest:
+            continue
+        deviation, (least, most) = wider.fit.deviation[part][k], wider.fit.interval()[part][k]
         if (
             value < low
             or value > high + 3 * deviation
