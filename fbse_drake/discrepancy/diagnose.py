@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake.discrepancy.bandwidth import Averaging, averaged_to_bandwidth
 from fbse_drake.discrepancy.detectability import smallest_detectable
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import Experiments
@@ -96,6 +97,8 @@ class Diagnosis:
     train_after: float
     # Inertial parameters that were identified along, of bodies whose own are not trusted; see `IdentifyConfig`.
     inertia: IdentifiedInertia | None = None
+    # Over what the log was averaged.
+    averaging: Averaging | None = None
 
     @property
     def chosen(self) -> list[Finding]:
@@ -140,6 +143,7 @@ def diagnose(
         progress: called with a word on what is being done.
     """
     say = progress or (lambda _: None)
+    predictor, averaging = averaged_to_bandwidth(predictor)
     say("predicting what each effect would do")
     dictionary = Dictionary(
         predictor,
@@ -182,6 +186,7 @@ def diagnose(
         tuple(path),
         *(_rms(white, sse) for sse in (before, final.held_out_sse, final.sse)),
         inertia,
+        averaging,
     )
 
 
@@ -366,6 +371,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "held_out_after": diagnosis.held_out_after,
         "train_after": diagnosis.train_after,
         "noise_floor": 1.0,
+        "block": None if diagnosis.averaging is None else diagnosis.averaging.block,
         "ranking": [
             {
                 "effect": f.effect,

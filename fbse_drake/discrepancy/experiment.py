@@ -11,6 +11,7 @@ from fbse_drake.discrepancy.detectability import separation, smallest_detectable
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual import EquationOfMotion, Instants
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError, located
@@ -134,9 +135,13 @@ class Experiments:
                 continue  # A motion that this robot cannot make shows nothing.
         return found
 
+    @cached_property
+    def _whitened(self) -> dict[str, WhitenedResidual]:
+        return {name: WhitenedResidual(p.residual) for name, p in self._predictors.items()}
+
     def _fits(self, effect: type[Effect]) -> dict[str, Fits]:
         return {
-            name: Fits(Dictionary(predictor, [effect], self._bodies))
+            name: Fits(Dictionary(predictor, [effect], self._bodies), self._whitened[name])
             for name, predictor in self._predictors.items()
         }
 

@@ -19,7 +19,6 @@ from fbse_drake.discrepancy.regression import (
     leftover,
 )
 from fbse_drake.discrepancy.remainder import Remainder
-from fbse_drake.discrepancy.residual import Residual
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Probability of any false alarm on a log that hides nothing.
@@ -69,16 +68,14 @@ class Grid:
 class Fits:
     """Explanations of one residual by one dictionary, weighted by the residual's noise."""
 
-    def __init__(self, dictionary: Dictionary, residual: Residual | None = None):
-        """Whitens the residual.
+    def __init__(self, dictionary: Dictionary, white: WhitenedResidual | None = None):
+        """Nothing is fitted yet.
 
         Args:
-            residual: with the noise to weigh by; by default the predictor's.
+            white: the residual with the noise to weigh by; by default the predictor's.
         """
         self.dictionary = dictionary
-        self.white = WhitenedResidual(
-            dictionary.predictor.residual if residual is None else residual
-        )
+        self.white = WhitenedResidual(dictionary.predictor.residual) if white is None else white
         inertia = dictionary.inertia
         # Whitened columns of inertia that is not trusted.
         self.always = (
@@ -99,7 +96,7 @@ class Fits:
         residual = predictor.doubted(predictor.residual, resolved)
         if np.array_equal(residual.variance, self.white.residual.variance):
             return self, explanation
-        fits = Fits(self.dictionary, residual)
+        fits = Fits(self.dictionary, WhitenedResidual(residual))
         moved = [
             replace(c, signature=fits.white.whiten_signature(c.raw)) for c in explanation.candidates
         ]
