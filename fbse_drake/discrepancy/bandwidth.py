@@ -10,8 +10,8 @@ from fbse_drake.discrepancy.residual import RecordedMotion
 
 # A log of no more blocks than this is not averaged further.
 _MOST_BLOCKS = 2500
-# Length of a block times bandwidth: an average takes a tenth off what is as fast as that.
-_SHARE = 0.25
+# Most bandwidth times length of a block: two blocks in the period of what is fastest (Nyquist).
+_SHARE = 0.5
 # Length of the windows of a spectrum [s].
 _WINDOW = 4.0
 # The bandwidth holds this share of a signal's power.

@@ -1,6 +1,6 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.progress import Interrupted, Progress, silent
 
 Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
 EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
@@ -99,6 +100,8 @@ class Diagnosis:
     inertia: IdentifiedInertia | None = None
     # Over what the log was averaged.
     averaging: Averaging | None = None
+    # Why the search ended before it was through; None if it was. What a partial diagnosis does not name was not ruled out.
+    partial: str | None = None
 
     @property
     def chosen(self) -> list[Finding]:
@@ -131,7 +134,7 @@ def diagnose(
     predictor: Predictor,
     effects: Iterable[type[Effect]] | None = None,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
@@ -140,41 +143,48 @@ def diagnose(
 
     Args:
         effects: what is tried; by default `plausible_effects`.
-        progress: called with a word on what is being done.
+        progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
     """
-    say = progress or (lambda _: None)
     predictor, averaging = averaged_to_bandwidth(predictor)
-    say("predicting what each effect would do")
-    dictionary = Dictionary(
-        predictor,
-        plausible_effects(predictor) if effects is None else effects,
-        suspected_bodies(predictor),
-    )
-    start = Fits(dictionary)
-    before = start.white.sse
-    path, proposals = select(start, say)
+    suspected = suspected_bodies(predictor)
+    tried = plausible_effects(predictor) if effects is None else effects
+    dictionary = Dictionary(predictor, tried, suspected, progress)
+    first, partial = Fits(dictionary), None
+    before = first.white.sse
+    path, proposals = [first.explain([])], Proposals(first)
+    try:
+        for path, proposals in select(first):  # noqa: B007 - the last one counts.
+            progress("looking for what explains more")
+    except Interrupted as stop:
+        partial = str(stop)
     fits = proposals.fits
     white = fits.white
     final, inertia = consistent(fits, path[-1])
-    say("looking at what is left")
     path[-1], remaining, left = added(fits, final)
     final = path[-1]
     unexplained = leftover_structure(predictor.motion, remaining, left)
-    say("finding what would have been seen")
-    rivals = _rivals(proposals, final)
-    experiments = Experiments(predictor.scenario, suspected_bodies(predictor))
-    statuses = {
-        e.__name__: _status(fits, final, e, rivals, experiments) for e in dictionary.effects
-    }
+    rivals: dict[int, list[Explanation]] = {}
+    statuses: dict[str, EffectStatus] = {}
+    try:
+        if partial is None:
+            rivals = _rivals(proposals, final)
+            experiments = Experiments(predictor.scenario, suspected)
+            for k, effect in enumerate(dictionary.effects):
+                progress("finding what would have been seen", k / len(dictionary.effects))
+                statuses[effect.__name__] = _status(fits, final, effect, rivals, experiments)
+    except Interrupted as stop:
+        partial = str(stop)
+    hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
     elif final.candidates or (
         inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
+    elif partial is not None or hidden > 0.5 * len(statuses):
+        verdict = "not_visible"
     else:
-        hidden = sum(status.verdict == "not_visible" for status in statuses.values())
-        verdict = "not_visible" if hidden > 0.5 * len(statuses) else "nothing_missing"
+        verdict = "nothing_missing"
     return Diagnosis(
         verdict,
         (
@@ -187,6 +197,7 @@ def diagnose(
         *(_rms(white, sse) for sse in (before, final.held_out_sse, final.sse)),
         inertia,
         averaging,
+        partial,
     )
 
 
@@ -367,6 +378,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Contents of diagnosis.json."""
     return {
         "verdict": diagnosis.verdict,
+        "partial": diagnosis.partial is not None,
+        "interrupted_because": diagnosis.partial,
         "held_out_before": diagnosis.held_out_before,
         "held_out_after": diagnosis.held_out_after,
         "train_after": diagnosis.train_after,

@@ -15,9 +15,10 @@ from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
+from fbse_drake.progress import Progress, silent
 
 # So many numbers are kept in columns, at most.
-_MOST_NUMBERS = 15_000_000
+_MOST_NUMBERS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -37,15 +38,20 @@ class Dictionary:
     """The effects that could explain one residual; see the module."""
 
     def __init__(
-        self, predictor: Predictor, effects: Collection[type[Effect]], bodies: Sequence[str] = ()
+        self,
+        predictor: Predictor,
+        effects: Collection[type[Effect]],
+        bodies: Sequence[str] = (),
+        progress: Progress = silent,
     ):
         """Nothing is predicted before it is asked for.
 
         Args:
             effects: what is tried.
             bodies: whose masses are tried.
+            progress: is told what is being done with the dictionary, too.
         """
-        self.predictor = predictor
+        self.predictor, self.progress = predictor, progress
         self.effects = [effect for effect in effects if not effect.composite]
         # In a log per step it is not known at which velocity within the step a law holds: what such a law leaves is weak evidence.
         self.per_step = predictor.scenario.recording.rows == "per_step"
@@ -99,7 +105,8 @@ class Dictionary:
             "robot": ["robot"],
         }
         result = []
-        for effect in self.effects:
+        for k, effect in enumerate(self.effects):
+            self.progress("predicting what each effect would do", k / len(self.effects))
             if issubclass(effect, JointTorqueEffect):
                 continue
             # Their nonlinear parameters keep the default.
@@ -120,6 +127,7 @@ class Dictionary:
     def grid(self, effect: type[JointTorqueEffect]) -> tuple[np.ndarray, np.ndarray]:
         """First grid of an effect's nonlinear values for each joint, (m, G, n), and its columns, (B, n, p, G)."""
         if effect.__name__ not in self._grids:
+            self.progress("predicting what each joint effect would do", self._predicted)
             searched = [p for p in effect.parameters.values() if not p.linear]
             most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
             axes = [np.geomspace(*p.plausible, min(most, p.grid)) for p in searched]
@@ -130,9 +138,17 @@ class Dictionary:
             )
             factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
             points = points[:, :, None] * factors[:, None]
-            columns = self.columns(effect, np.arange(len(self.joints)), points)
+            columns = np.transpose(
+                self.predictor.joint_columns(effect, points, np.arange(len(self.joints))),
+                (2, 3, 0, 1),
+            )
             self._grids[effect.__name__] = (points, columns)
         return self._grids[effect.__name__]
+
+    @property
+    def _predicted(self) -> float:
+        """Share of the joint effects whose grids are there."""
+        return len(self._grids) / max(1, len(self.joint_effects))
 
     def _factors(self, effect: type[Effect], target: str) -> np.ndarray:
         """What values of the nonlinear parameters at a revolute joint are multiplied with for a target, shape (m,)."""

@@ -37,7 +37,7 @@ _SPURIOUS = 3.0
 _SLOPE_STEP = 0.02
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
-_MOST_NUMBERS = 15_000_000
+_MOST_NUMBERS = 30_000_000
 
 
 @dataclass(frozen=True)
@@ -339,6 +339,13 @@ class Fits:
                 tied=bool(self.always),
             )
         return self._remainders[explanation]
+
+    def required(self, candidate: Candidate) -> float:
+        """Drop of the deviance that a candidate must bring before it counts."""
+        rows, parameters = candidate.signature.rows, candidate.signature.values.shape[2]
+        return float(
+            self.threshold[min(12, parameters)] + self.systematic(rows) + candidate.spurious
+        )
 
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""

@@ -22,6 +22,10 @@ _MOST_NUMBERS = 15_000_000
 _SWEEPS = 3
 
 
+# What is said meanwhile.
+LOOKING = "looking for what explains more"
+
+
 class Proposals:
     """Candidates that are worth a fit; see the module."""
 
@@ -46,12 +50,13 @@ class Proposals:
             for candidate in fits.fixed_candidates
             if (candidate.effect, candidate.targets) not in known
             and np.intersect1d(candidate.signature.rows, rows).size
-            and fixed_gain(beside, candidate) > enough
+            and fixed_gain(beside, candidate) > 0.5 * fits.required(candidate)
         ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
             group: [] for group in dictionary.groups
         }
-        for effect in dictionary.joint_effects:
+        for k, effect in enumerate(dictionary.joint_effects):
+            dictionary.progress(LOOKING, 0.3 * k / len(dictionary.joint_effects))
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
             for group in dictionary.groups:
                 places = [dictionary.joints.index(joint) for joint in group]
@@ -70,14 +75,16 @@ class Proposals:
             least = max(enough, 0.4 * max(honest, default=0.0))
             for gain, effect, best in found:
                 if gain > least:
+                    dictionary.progress(LOOKING, 0.3)
                     result.append(self._best_on(effect, group, best, beside))
         return result
 
     def plain_friction(self) -> Explanation:
         """Coulomb and viscous friction and a bias in every joint, fitted together; what identification of inertia begins with."""
         explanation = self.fits.explain([])
-        for _ in range(_SWEEPS):
+        for k in range(_SWEEPS):
             for effect in (CoulombViscousFriction, TorqueBias):
+                self.fits.dictionary.progress("fitting plain friction", k / _SWEEPS)
                 for joint in self.fits.dictionary.joints:
                     others = [
                         c

@@ -1,6 +1,7 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-from collections.abc import Callable, Mapping
+import multiprocessing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,10 +14,11 @@ from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.reference_methods import NoEstimator
 from fbse_drake.log import Log
+from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RobotConfig, Scenario
 from fbse_drake.signals import channels_of
-from fbse_drake.simulate import add_record, simulate
+from fbse_drake.simulate import INTERRUPTED, add_record, simulate
 from fbse_drake.station import build_station
 from fbse_drake.walking.reference import Recorded, RecordedReference
 from fbse_drake.wiring import release
@@ -26,6 +28,9 @@ _STARTING_SAMPLES = 10
 # A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and then noise alone lets a foot land or a
 # joint slip otherwise, and the rest of the walk is another.
 _DRAWS = 3
+# How often runs in other processes are looked at [s].
+_LOOK_PERIOD = 0.2
+_SIMULATING = "simulating the model against the log"
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,8 @@ def rollout(
     log: Log,
     *,
     planned_with: RobotConfig | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = silent,
+    jobs: int = 1,
 ) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
@@ -74,6 +80,8 @@ def rollout(
     is not stable in itself falls.
 
     Args:
+        progress: is told what is being done.
+        jobs: how many simulations run side by side, each in a process of its own.
         planned_with: the model that reference and feed-forward were planned with, and that the
             estimator believed, when the log was made, which did not know what has been added since;
             by default the scenario's.
@@ -91,10 +99,29 @@ def rollout(
         return _recorded_rollout(believed, scenario.reference, log, progress)
     believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
     seeds = range(scenario.seed + 1, scenario.seed + 1 + _DRAWS)
-    draws = [_simulated_error(replace(believed, seed=seed), log, progress) for seed in seeds]
+    drawn = [replace(believed, seed=seed) for seed in seeds]
+    draws = (
+        _side_by_side(drawn, log, progress, jobs)
+        if jobs > 1
+        else [_simulated_error(one, log, progress) for one in drawn]
+    )
     return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[
         _DRAWS // 2
     ]
+
+
+def _side_by_side(
+    scenarios: Sequence[Scenario], log: Log, progress: Progress, jobs: int
+) -> list[RolloutError]:
+    """The errors of several scenarios, so many at a time."""
+    # Drake has threads, which a forked process would lack.
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(jobs, len(scenarios))) as pool:
+        runs = [pool.apply_async(_simulated_error, (one, log, silent)) for one in scenarios]
+        while waiting := [run for run in runs if not run.ready()]:
+            progress(_SIMULATING, 1 - len(waiting) / len(runs))
+            waiting[0].wait(_LOOK_PERIOD)
+        return [run.get() for run in runs]
 
 
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
@@ -106,11 +133,15 @@ def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
     return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
 
 
-def _simulated_error(
-    scenario: Scenario, log: Log, progress: Callable[[float], None] | None
-) -> RolloutError:
+def _simulated_error(scenario: Scenario, log: Log, progress: Progress) -> RolloutError:
     """The error of a scenario's robot as it is simulated."""
-    result = simulate(scenario, progress=progress)
+
+    def tell(time: float) -> None:
+        progress(_SIMULATING, time / scenario.duration)
+
+    result = simulate(scenario, progress=tell)
+    if result.failure == INTERRUPTED:
+        raise Interrupted("it was interrupted")
     simulated = result.log
     rows = np.searchsorted(simulated.time, log.time - 1e-9)
     shared = (rows < len(simulated.time)) & (
@@ -156,7 +187,7 @@ def _rollout_error(
 
 
 def _recorded_rollout(
-    scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None
+    scenario: Scenario, recorded: Recorded, log: Log, progress: Progress
 ) -> RolloutError:
     rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
     for stretch, constants in stretches(log):
@@ -168,8 +199,7 @@ def _recorded_rollout(
         channels.append(done)
         if count:
             simulated_time += float(log.time[stretch.start + count - 1] - log.time[stretch.start])
-        if progress is not None:
-            progress(simulated_time)
+        progress(_SIMULATING, float(rows.mean()))
         if failure is not None:
             break
     names = [name for name in _COMPARED if name in log]

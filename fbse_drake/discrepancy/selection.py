@@ -1,12 +1,12 @@
 """Selection of effects: which additions to an explanation are significant, and forward selection among them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from fbse_drake.discrepancy.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.fits import MARGIN, Fits
-from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.refinement import polished
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import BodyMass
@@ -21,38 +21,38 @@ _MISFIT = 0.02
 _IMPLAUSIBLE = 3.0
 
 
-def select(
-    fits: Fits, say: Callable[[str], None] = lambda _: None
-) -> tuple[list[Explanation], Proposals]:
-    """Explanations by forward selection, from none to the last that improves significantly; and the proposals for it.
+def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
+    """Explanations by forward selection, from none to the last that improves significantly.
 
     The residual is weighed anew with every addition.
+
+    Yields:
+        After every addition all explanations so far, and the proposals for the last.
     """
     proposals = Proposals(fits)
     path = [fits.explain([])]
+    yield [*path], proposals
     if fits.dictionary.inertia is not None:
         fits, explanation = fits.doubting(_pruned(fits, proposals.plain_friction()))
         proposals = Proposals(fits)
         path.append(explanation)
-        say("fitted inertia and plain friction")
+        yield [*path], proposals
     while len(path[-1].candidates) < _MOST_EFFECTS:
         base = path[-1]
         additions = best_additions(proposals, base)
         if not additions:
             break
         chosen = _revise(proposals, _spread(fits, additions))
-        say(
-            "found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates)
-        )
         if chosen.deviance > base.deviance - MARGIN:
             break
         weighed, explanation = fits.doubting(chosen)
         if weighed is not fits:
             fits, proposals = weighed, Proposals(weighed)
         path.append(polished(fits, explanation))
+        yield [*path], proposals
     if fits.dictionary.inertia is None:
         path[-1] = _pruned(fits, path[-1])
-    return path, proposals
+        yield [*path], proposals
 
 
 def best_additions(
@@ -67,7 +67,9 @@ def best_additions(
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows), []
-    for added in [*([candidate] for candidate in promising), *_pairs(fits, promising)]:
+    tried = [*([candidate] for candidate in promising), *_pairs(fits, promising)]
+    for k, added in enumerate(tried):
+        fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
         everything = [*base.candidates, *added]
         if _loses_scale(fits, everything):
             continue
@@ -122,13 +124,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         added.effect.shows_within(fits.dictionary.travel[rows], added.nonlinear)
     ):
         return False
-    drop = base.deviance - wider.deviance
-    if (
-        drop
-        < fits.threshold[min(12, added.signature.values.shape[2])]
-        + fits.systematic(rows)
-        + added.spurious
-    ):
+    if base.deviance - wider.deviance < fits.required(added):
         return False
     taken, gained = (
         float(np.maximum(a[rows] - b[rows], 0.0).sum())
@@ -221,7 +217,10 @@ def _revise(proposals: Proposals, explanation: Explanation) -> Explanation:
     improved = True
     while improved:
         improved = False
-        for member in explanation.candidates:
+        for k, member in enumerate(explanation.candidates):
+            proposals.fits.dictionary.progress(
+                "checking what was found", k / len(explanation.candidates)
+            )
             others = [c for c in explanation.candidates if c is not member]
             rows = member.signature.rows
             if not any(np.intersect1d(rows, c.signature.rows).size for c in others):

@@ -201,6 +201,21 @@ def compare_outcome(comparison: Comparison) -> str:
 
 def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     """The verdict in one or two sentences."""
+    if diagnosis.partial is not None:
+        return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
+    if diagnosis.averaging is not None and diagnosis.averaging.text:
+        return f"{_verdict(diagnosis)} {diagnosis.averaging.text}"
+    return _verdict(diagnosis)
+
+
+def _partly(diagnosis: Diagnosis) -> str:
+    """What is known of a search that ended early."""
+    if not diagnosis.chosen:
+        return "Nothing was found until then; that rules nothing out."
+    return f"Until then it seems that the model lacks {_listed(diagnosis.chosen)}; rivals were not compared."
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
     found = _listed(diagnosis.chosen)
     if diagnosis.verdict == "effect_found":
         doubtful = dict.fromkeys(
@@ -226,6 +241,14 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def study_outcome(study: Study) -> str:
     """The result of a study in one or two sentences."""
+    if study.partial and not study.diagnoses[-1].partial:
+        return f"Partial: {study.stopped_because}. {_study_result(study)}"
+    if study.partial and study.found:
+        return f"Partial: {study.stopped_because} before the search was through. {_study_result(study)}"
+    return _study_result(study)
+
+
+def _study_result(study: Study) -> str:
     if not study.found:
         return diagnosis_outcome(study.diagnoses[-1])
     first, last = study.steps[0], study.steps[-1]
