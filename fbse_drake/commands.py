@@ -306,7 +306,9 @@ def _told(console: Console, limit: float | None = None) -> Iterator[Progress]:
             with lines.stopped_by_keyboard():
                 yield lines
         return
-    lines = ProgressLines(lambda line: console.print(line, highlight=False, markup=False), limit)
+    lines = ProgressLines(
+        lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True), limit
+    )
     with lines.stopped_by_keyboard():
         yield lines
 

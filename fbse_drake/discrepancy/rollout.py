@@ -1,8 +1,11 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
 import multiprocessing
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -113,15 +116,44 @@ def rollout(
 def _side_by_side(
     scenarios: Sequence[Scenario], log: Log, progress: Progress, jobs: int
 ) -> list[RolloutError]:
-    """The errors of several scenarios, so many at a time."""
-    # Drake has threads, which a forked process would lack.
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(jobs, len(scenarios))) as pool:
-        runs = [pool.apply_async(_simulated_error, (one, log, silent)) for one in scenarios]
-        while waiting := [run for run in runs if not run.ready()]:
-            progress(_SIMULATING, 1 - len(waiting) / len(runs))
-            waiting[0].wait(_LOOK_PERIOD)
-        return [run.get() for run in runs]
+    """The errors of several scenarios, so many at a time.
+
+    Processes are forked: a plant's configuration does not go through a pipe, and a user's own effects are known here only.
+    """
+    context = multiprocessing.get_context("fork")
+    waiting = dict(enumerate(scenarios))
+    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    found: dict[int, RolloutError] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                place = min(waiting)
+                receiver, sender = context.Pipe(duplex=False)
+                run = context.Process(target=_send_error, args=(sender, waiting.pop(place), log))
+                run.start()
+                sender.close()
+                running[receiver] = place, run
+            progress(_SIMULATING, len(found) / len(scenarios))
+            for receiver in wait(list(running), timeout=_LOOK_PERIOD):
+                place, run = running.pop(receiver)
+                result = receiver.recv()
+                run.join()
+                if isinstance(result, Exception):
+                    raise result
+                found[place] = result
+    finally:
+        for _, run in running.values():
+            run.terminate()
+    return [found[place] for place in range(len(scenarios))]
+
+
+def _send_error(sender: Connection, scenario: Scenario, log: Log) -> None:
+    """In a process of its own; who started it decides about its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        sender.send(_simulated_error(scenario, log, silent))
+    except Exception as error:
+        sender.send(error)
 
 
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:

@@ -27,7 +27,8 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
     The residual is weighed anew with every addition.
 
     Yields:
-        After every addition all explanations so far, and the proposals for the last.
+        After every addition, before and after what was there already is checked beside it: all explanations so far, and the
+        proposals for the last.
     """
     proposals = Proposals(fits)
     path = [fits.explain([])]
@@ -42,8 +43,11 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
         additions = best_additions(proposals, base)
         if not additions:
             break
-        chosen = _revise(proposals, _spread(fits, additions))
+        chosen = _spread(fits, additions)
+        yield [*path, chosen], proposals
+        chosen = _revise(proposals, chosen)
         if chosen.deviance > base.deviance - MARGIN:
+            yield [*path], proposals
             break
         weighed, explanation = fits.doubting(chosen)
         if weighed is not fits:
