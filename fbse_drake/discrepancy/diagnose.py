@@ -1,7 +1,7 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import added, consistent
 from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.selection import best_additions, select
+from fbse_drake.discrepancy.significance import Significance
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
@@ -56,8 +57,11 @@ class Finding:
     parameters: dict[str, Estimate]
     # Other effects that explain the residual as well.
     confusable_with: tuple[str, ...]
-    # Is it part of the explanation, or only an alternative?
+    # Is it part of the explanation, or only an alternative, or too small to matter?
     chosen: bool
+    # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is measured, NaN where it is not known.
+    too_small: bool = False
+    share: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Diagnosis:
     # Chosen effects, those that explain most first, then alternatives, best first.
     ranking: tuple[Finding, ...]
     effects: dict[str, EffectStatus]
-    # What no effect of the library explains: by row.
+    # What no effect of the library explains: by row, as far as it is large enough to matter.
     unexplained: tuple[Structure, ...]
     # Explanations in the order in which they were found; the first has no effects.
     path: tuple[Explanation, ...]
@@ -106,6 +110,11 @@ class Diagnosis:
     @property
     def chosen(self) -> list[Finding]:
         return [finding for finding in self.ranking if finding.chosen]
+
+    @property
+    def too_small(self) -> list[Finding]:
+        """What is there, but too small to matter."""
+        return [finding for finding in self.ranking if finding.too_small]
 
 
 def suspected_bodies(predictor: Predictor) -> list[str]:
@@ -162,7 +171,13 @@ def diagnose(
     final, inertia = consistent(fits, path[-1])
     path[-1], remaining, left = added(fits, final)
     final = path[-1]
-    unexplained = leftover_structure(predictor.motion, remaining, left)
+    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    unexplained = [
+        structure
+        for structure in leftover_structure(predictor.motion, remaining, left)
+        if not significance.left_share(structure, remaining) < tolerance
+    ]
+    shares = {c: significance.share(final, c) for c in final.candidates}
     rivals: dict[int, list[Explanation]] = {}
     statuses: dict[str, EffectStatus] = {}
     try:
@@ -177,7 +192,7 @@ def diagnose(
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif final.candidates or (
+    elif any(not share < tolerance for share in shares.values()) or (
         inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
@@ -188,7 +203,7 @@ def diagnose(
     return Diagnosis(
         verdict,
         (
-            *_ranking(fits, path, rivals),
+            *(_sized(f, tolerance) for f in _ranking(fits, path, rivals, shares)),
             *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
@@ -215,12 +230,21 @@ def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanat
     return result
 
 
+def _sized(finding: Finding, tolerance: float) -> Finding:
+    """A finding that is chosen only if it is large enough to matter."""
+    small = finding.chosen and finding.share < tolerance
+    return replace(finding, chosen=finding.chosen and not small, too_small=small)
+
+
 def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)) -> float:
     return float(np.sqrt(sse[rows].sum() / max(1, white.count[rows].sum())))
 
 
 def _ranking(
-    fits: Fits, path: list[Explanation], rivals: dict[int, list[Explanation]]
+    fits: Fits,
+    path: list[Explanation],
+    rivals: dict[int, list[Explanation]],
+    shares: Mapping[Candidate, float],
 ) -> list[Finding]:
     final, white = path[-1], fits.white
     without = [
@@ -233,7 +257,8 @@ def _ranking(
         equal = tuple(
             dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(fits, e, final))
         )
-        findings.append(finding_of(white, rest, final, member, equal, chosen=True))
+        finding = finding_of(white, rest, final, member, equal, chosen=True)
+        findings.append(replace(finding, share=shares[member]))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
         (e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance
@@ -397,6 +422,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 },
                 "confusable_with": list(f.confusable_with),
                 "chosen": f.chosen,
+                "too_small": f.too_small,
+                "share": f.share,
             }
             for f in diagnosis.ranking
         ],

@@ -323,6 +323,13 @@ class EquationOfMotion:
             for part, G in zip(parts, self.robot.grasp_maps, strict=True)
         ]
 
+    def feet_wrench(self, at: Instants) -> np.ndarray:
+        """What the feet give, [moment, force] on the base in its axes, (M, 6)."""
+        unloaded = replace(at, pad_force=np.zeros_like(at.pad_force))
+        n = len(self.robot.joint_names)
+        with_feet, without = (self.residual(one, kinematic=False)[:, n:] for one in (at, unloaded))
+        return with_feet - without
+
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
         result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)

@@ -117,6 +117,7 @@ def write_diagnosis_report(
             ),
         ),
         ("What else it could be", _what_else(diagnosis.chosen)),
+        *_too_small(diagnosis.too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", next_step(diagnosis, inputs)),
     )
@@ -159,6 +160,7 @@ def write_study_report(
             how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse),
         ),
         ("What else it could be", _what_else(study.found)),
+        *_too_small(study.diagnoses[-1].too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", _after_study(study, inputs)),
     )
@@ -206,6 +208,17 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     if diagnosis.averaging is not None and diagnosis.averaging.text:
         return f"{_verdict(diagnosis)} {diagnosis.averaging.text}"
     return _verdict(diagnosis)
+
+
+def _too_small(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    if not findings:
+        return []
+    return [
+        (
+            "Too small to matter",
+            f"{_listed(findings)}: at most {100 * max(f.share for f in findings):.2g} % of what these rows are made of.",
+        )
+    ]
 
 
 def _partly(diagnosis: Diagnosis) -> str:
