@@ -1,5 +1,6 @@
 """What is put into a log is found, with intervals that hold it; what is not is not; and what cannot be seen is said to be so."""
 
+import json
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import ClassVar
@@ -24,6 +25,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.progress import Interrupted
 from fbse_drake.scenario import Scenario, load_scenario
 from fbse_drake.simulate import simulate
 
@@ -256,6 +258,49 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
     errors = sorted(float(np.sqrt(np.mean((walk - log["joint/position"]) ** 2))) for walk in walks)
     assert errors[0] < errors[1] < errors[2]
     assert rollout(replace(walk, model=walk.robot), log).mean_position == pytest.approx(errors[1])
+
+
+@pytest.mark.parametrize("calls", [1, 40, 150])
+def test_an_interrupted_diagnosis_says_what_is_known(calls: int) -> None:
+    """It never says that nothing is missing, rules nothing out, and its JSON is whole."""
+    count = 0
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        nonlocal count
+        count += 1
+        if count == calls:
+            raise Interrupted("time is up")
+
+    hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
+    few = [library()[name] for name in ("TorqueGain", "TorqueBias", "ViscousFriction", "BodyMass")]
+    partial = diagnose(Predictor(scenario(), log_with(hidden)), few, progress=progress)
+    assert partial.partial == "time is up"
+    assert count >= calls
+    found = [finding.effect for finding in partial.chosen]
+    assert found in ([], ["TorqueGain"])
+    if not found:
+        assert partial.verdict in ("unknown_effect", "not_visible")
+    content = json.loads(json.dumps(diagnosis_json(partial)))
+    assert content["partial"]
+    assert content["interrupted_because"] == "time is up"
+    assert not any(status["verdict"] == "absent" for status in content["effects"].values()) or found
+    assert len(read_findings(content)) == len(found) if found else True
+
+
+def test_an_interrupted_study_keeps_what_was_found() -> None:
+    """The simulation of the model is left out."""
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        if text.startswith("simulating"):
+            raise Interrupted("time is up")
+
+    hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
+    result = study(scenario(), log_with(hidden), [library()["TorqueGain"]], progress=progress)
+    assert result.partial
+    assert result.stopped_because == "time is up"
+    assert [finding.effect for finding in result.found] == ["TorqueGain"]
+    assert all(step.rollout is None for step in result.steps)
+    assert study_json(result)["partial"]
 
 
 def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_difference() -> None:
