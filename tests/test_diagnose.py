@@ -26,7 +26,7 @@ from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted
-from fbse_drake.scenario import Scenario, load_scenario
+from fbse_drake.scenario import IdentifyConfig, Scenario, load_scenario
 from fbse_drake.simulate import simulate
 
 # Effects that look alike, and some that do not; the whole library is tried by `make hidden`.
@@ -156,7 +156,9 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
     found = {}
     for factor in (0.5, 2.0):
         weak = viscous.from_values([joint], {"viscous": [factor * size]})
-        found[factor] = diagnose(Predictor(scenario(), injected(log, weak)), effects()).chosen
+        # However small a size is.
+        exact = replace(scenario(), identify=IdentifyConfig(tolerance=0.0))
+        found[factor] = diagnose(Predictor(exact, injected(log, weak)), effects()).chosen
     assert not found[0.5]
     assert found[2.0]
     assert all(finding.targets == (joint,) for finding in found[2.0])
@@ -260,31 +262,34 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
     assert rollout(replace(walk, model=walk.robot), log).mean_position == pytest.approx(errors[1])
 
 
-@pytest.mark.parametrize("calls", [1, 40, 150])
-def test_an_interrupted_diagnosis_says_what_is_known(calls: int) -> None:
+@pytest.mark.parametrize(
+    ("step", "found"),
+    [
+        ("predicting", []),
+        ("looking", []),
+        ("finding what would", ["TorqueGain"]),
+    ],
+)
+def test_an_interrupted_diagnosis_says_what_is_known(step: str, found: list[str]) -> None:
     """It never says that nothing is missing, rules nothing out, and its JSON is whole."""
-    count = 0
 
     def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
-        nonlocal count
-        count += 1
-        if count == calls:
+        nonlocal interrupted
+        if text.startswith(step) and not interrupted:
+            interrupted = True
             raise Interrupted("time is up")
 
+    interrupted = False
     hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
-    few = [library()[name] for name in ("TorqueGain", "TorqueBias", "ViscousFriction", "BodyMass")]
+    few = [library()[name] for name in ("TorqueGain", "TorqueBias", "ViscousFriction")]
     partial = diagnose(Predictor(scenario(), log_with(hidden)), few, progress=progress)
     assert partial.partial == "time is up"
-    assert count >= calls
-    found = [finding.effect for finding in partial.chosen]
-    assert found in ([], ["TorqueGain"])
-    if not found:
-        assert partial.verdict in ("unknown_effect", "not_visible")
+    assert [finding.effect for finding in partial.chosen] == found
+    assert partial.verdict in (("effect_found",) if found else ("unknown_effect", "not_visible"))
     content = json.loads(json.dumps(diagnosis_json(partial)))
     assert content["partial"]
     assert content["interrupted_because"] == "time is up"
-    assert not any(status["verdict"] == "absent" for status in content["effects"].values()) or found
-    assert len(read_findings(content)) == len(found) if found else True
+    assert not any(status["verdict"] == "absent" for status in content["effects"].values())
 
 
 def test_an_interrupted_study_keeps_what_was_found() -> None:

@@ -206,7 +206,7 @@ class PartialFit:
             )
             start = stop
         # Units must not decide what counts as singular.
-        norm = np.sqrt(information.sum(axis=0))
+        norm = np.sqrt(np.diag(self._gram))
         norm[norm == 0] = 1.0
         bread = np.linalg.pinv(self._gram / np.outer(norm, norm), hermitian=True)
         bread /= np.outer(norm, norm)

@@ -130,7 +130,7 @@ def write_diagnosis_report(
         _hygiene(predictor, inputs),
         _reproduce("diagnose", predictor, inputs),
     ]
-    passed = diagnosis.verdict in ("effect_found", "nothing_missing")
+    passed = diagnosis.partial is None and diagnosis.verdict in _PASSED
     write_report(
         path,
         Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)),
@@ -178,7 +178,7 @@ def write_study_report(
         _hygiene(before[0], inputs),
         _reproduce("study", before[0], inputs, completed),
     ]
-    passed = study.diagnoses[-1].verdict in ("effect_found", "nothing_missing")
+    passed = not study.partial and study.diagnoses[-1].verdict in _PASSED
     write_report(
         path,
         Report(
@@ -464,6 +464,8 @@ def _statuses(study: Study) -> dict[str, EffectStatus]:
 
 def _verdicts(statuses: Mapping[str, EffectStatus]) -> str:
     """How many effects of the library have each verdict."""
+    if not statuses:
+        return "The search ended before it could say what else there is."
     verdicts = [status.verdict for status in statuses.values()]
     counts = ", ".join(
         f"{verdicts.count(name)} {words(name)}"
@@ -516,6 +518,8 @@ def _worst(comparison: Comparison) -> list[Channel]:
     ][:_CHANNELS]
 
 
+# Verdicts that a report calls a success.
+_PASSED = ("effect_found", "nothing_missing")
 _METHOD = (
     "The recorded motion is put into the model's equation of motion. What it leaves over, the residual, is what the model does not "
     "explain; it stands beside the noise that the sensors must put into it."
