@@ -17,7 +17,7 @@ from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.discrepancy.study import model_error, train_and_rest
-from fbse_drake.effects.actuation import TorqueBias
+from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.estimators.reference_methods import FixedFriction
@@ -178,6 +178,28 @@ def test_what_is_too_small_to_matter_is_said_to_be_so(folder: Path):
         assert finding.share == pytest.approx(0.05 / force, rel=0.3)
         assert diagnosis.verdict == ("effect_found" if matters else "nothing_missing")
         assert len(diagnosis.chosen) == matters
+
+
+@pytest.mark.parametrize("shortfall", [0.0, 0.1])
+def test_noise_of_the_torque_is_no_lag(folder: Path, shortfall: float):
+    """White noise is in the residual and in the columns of what depends on the torque alike: a lag would seem to take it off."""
+    hidden = {"gain": TorqueGain({"swing": shortfall})} if shortfall else {}
+    robot = dataclasses.replace(crane(folder, **hidden), duration=4.0)
+    log = simulate(robot).log
+    noise = np.random.default_rng(1).normal(size=log["joint/torque_command"].shape)
+    channels = {"joint/torque_command": log["joint/torque_command"] + 2.0 * noise}
+    scenario = dataclasses.replace(
+        robot,
+        model=RobotConfig(described(folder)),
+        recording=RecordingConfig(torque_noise={"all": 2.0}),
+    )
+    effects = [TorqueLag, TorqueDelay, TorqueGain, TorqueBias]
+    diagnosis = diagnose(
+        Predictor(scenario, dataclasses.replace(log, channels=log.channels | channels)), effects
+    )
+    found = [(f.effect, *f.targets) for f in diagnosis.chosen]
+    assert found == ([("TorqueGain", "swing")] if shortfall else [])
+    assert diagnosis.verdict == ("effect_found" if shortfall else "nothing_missing")
 
 
 def test_limits_and_damping_of_the_model_file_are_not_taken(

@@ -332,7 +332,10 @@ class Predictor:
         noisy_force = motion.signals.pad_force + force_noise(
             sensors.foot_force, self.robot, len(motion.signals.pad_force), random
         )
-        return replace(motion.signals, pad_force=noisy_force, **added)
+        torque = motion.signals.torque_command
+        deviation = np.sqrt(motion.torque_variance(torque))
+        noisy_torque = torque + deviation * random.standard_normal(torque.shape)
+        return replace(motion.signals, pad_force=noisy_force, torque_command=noisy_torque, **added)
 
     @cached_property
     def _noisier_blocks(self) -> Instants:
