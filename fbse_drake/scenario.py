@@ -193,8 +193,12 @@ class IdentifyConfig:
     inertia: list[str] = field(default_factory=list)
     # Effects that are not tried, for the recording itself shows that they are not there (see its data hygiene).
     ruled_out: list[str] = field(default_factory=list)
+    # Effects that add less than this share to the torque (root mean square) of every joint that they act in are too small to matter; of the
+    # base and of soles likewise to their forces and motions.
+    tolerance: float = 0.005
 
     def __post_init__(self) -> None:
+        require_not_negative(self, "tolerance")
         for name in self.ruled_out:
             if name not in library():
                 raise InputError(

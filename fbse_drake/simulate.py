@@ -26,6 +26,8 @@ from fbse_drake.station import Station, build_station
 from fbse_drake.walking.reference import Reference
 from fbse_drake.wiring import release
 
+# Why a run failed that was stopped by Ctrl-C.
+INTERRUPTED = "interrupted"
 # The run is looked at (fall, progress, interruption) this often in simulated time [s].
 _LOOK_PERIOD = 0.01
 
@@ -118,7 +120,7 @@ def _simulate(
             if interrupted.is_set():
                 raise KeyboardInterrupt
     except KeyboardInterrupt:
-        failure = "interrupted"
+        failure = INTERRUPTED
     except RuntimeError as error:
         fell = True
         failure = f"the solver failed: {str(error).splitlines()[0]}"

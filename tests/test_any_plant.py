@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,16 +11,18 @@ import yaml
 from fbse_drake import InputError, Log, Scenario, simulate
 from fbse_drake.control.compensation import FeedforwardCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
+from fbse_drake.discrepancy.bandwidth import bandwidth
 from fbse_drake.discrepancy.compare import compare
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.discrepancy.study import model_error, train_and_rest
+from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.robot.plant import make_robot
-from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
+from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.walking.reference import JointSines, Recorded
 
@@ -123,6 +126,80 @@ def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(
     found = Predictor(rigid, log).motion.equation.residual(blocks)
     # Drake's g has more digits.
     np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_a_long_log_of_slow_motion_is_averaged_and_says_the_same(
+    folder: Path, rubbing: tuple[Scenario, Log]
+):
+    scenario, log = rubbing
+    bare = dataclasses.replace(scenario, model=RobotConfig(described(folder)))
+    fine, coarse = (
+        dataclasses.replace(bare, recording=RecordingConfig(block=block)) for block in (0.002, 0.01)
+    )
+    effects = [CoulombFriction, ViscousFriction]
+    found = diagnose(Predictor(fine, log), effects)
+    assert found.averaging.block == pytest.approx(0.004)
+    assert found.averaging.block * found.averaging.bandwidth <= 0.5
+    assert "averaged over 4 ms, not 2 ms" in found.averaging.text
+    as_it_is = diagnose(Predictor(coarse, log), effects)
+    assert as_it_is.averaging.text == ""
+    for diagnosis in (found, as_it_is):
+        named = {(f.effect, *f.targets): f.parameters for f in diagnosis.chosen}
+        assert named.keys() == {("CoulombFriction", "slide"), ("ViscousFriction", "swing")}
+        estimate = named["ViscousFriction", "swing"]["viscous"]
+        assert estimate.interval[0] < 1.5 < estimate.interval[1]
+
+
+def test_the_bandwidth_of_a_log_is_that_of_its_motion():
+    rng, time = np.random.default_rng(0), np.arange(20_000) / 1000
+    nothing = np.zeros((len(time), 0))
+    motion = np.sin(2 * np.pi * 3.0 * time) + 0.1 * np.sin(2 * np.pi * 11.0 * time)
+    signals = SimpleNamespace(
+        joint_position=motion[:, None],
+        joint_velocity=motion[:, None] + 1e-3 * rng.normal(size=(len(time), 1)),
+        torque_command=0.1 * rng.normal(size=(len(time), 1)),
+        **dict.fromkeys(("specific_force", "angular_velocity", "pad_force"), nothing),
+    )
+    signals.torque_command[:, 0] += 5.0 * np.sin(2 * np.pi * 3.0 * time)
+    assert bandwidth(SimpleNamespace(signals=signals, period=1e-3)) == pytest.approx(11.0, abs=0.5)
+
+
+def test_what_is_too_small_to_matter_is_said_to_be_so(folder: Path):
+    """A bias that is eleven times as large as its uncertainty, and a third of a percent of the force."""
+    biased = dataclasses.replace(crane(folder, bias=TorqueBias({"slide": 0.05})), duration=5.0)
+    log = simulate(biased).log
+    bare = dataclasses.replace(biased, model=RobotConfig(described(folder)))
+    force = np.sqrt((log["joint/torque_command"][:, 1] ** 2).mean())
+    for tolerance, matters in ((0.005, False), (0.001, True)):
+        scenario = dataclasses.replace(bare, identify=IdentifyConfig(tolerance=tolerance))
+        diagnosis = diagnose(Predictor(scenario, log), [TorqueBias, ViscousFriction])
+        (finding,) = diagnosis.chosen if matters else diagnosis.too_small
+        assert (finding.effect, finding.targets) == ("TorqueBias", ("slide",))
+        assert finding.share == pytest.approx(0.05 / force, rel=0.3)
+        assert diagnosis.verdict == ("effect_found" if matters else "nothing_missing")
+        assert len(diagnosis.chosen) == matters
+
+
+@pytest.mark.parametrize("shortfall", [0.0, 0.1])
+def test_noise_of_the_torque_is_no_lag(folder: Path, shortfall: float):
+    """White noise is in the residual and in the columns of what depends on the torque alike: a lag would seem to take it off."""
+    hidden = {"gain": TorqueGain({"swing": shortfall})} if shortfall else {}
+    robot = dataclasses.replace(crane(folder, **hidden), duration=4.0)
+    log = simulate(robot).log
+    noise = np.random.default_rng(1).normal(size=log["joint/torque_command"].shape)
+    channels = {"joint/torque_command": log["joint/torque_command"] + 2.0 * noise}
+    scenario = dataclasses.replace(
+        robot,
+        model=RobotConfig(described(folder)),
+        recording=RecordingConfig(torque_noise={"all": 2.0}),
+    )
+    effects = [TorqueLag, TorqueDelay, TorqueGain, TorqueBias]
+    diagnosis = diagnose(
+        Predictor(scenario, dataclasses.replace(log, channels=log.channels | channels)), effects
+    )
+    found = [(f.effect, *f.targets) for f in diagnosis.chosen]
+    assert found == ([("TorqueGain", "swing")] if shortfall else [])
+    assert diagnosis.verdict == ("effect_found" if shortfall else "nothing_missing")
 
 
 def test_limits_and_damping_of_the_model_file_are_not_taken(

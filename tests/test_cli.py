@@ -201,7 +201,7 @@ def test_a_copied_scenario_does_not_overwrite_the_original(
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports are empty, which saves the time to draw them."""
     monkeypatch.setattr(
-        "fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report")
+        "fbse_drake.commands.write_run_report", lambda path, *_, **__: path.write_text("report")
     )
 
 
@@ -211,7 +211,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "fbse_drake.cli.write_run_report", lambda path, *_, **__: path.write_text("report")
+            "fbse_drake.commands.write_run_report", lambda path, *_, **__: path.write_text("report")
         )
         assert main(["simulate", *WALK, "--out", str(folder), "--quiet"]) == DONE
     return folder
@@ -471,7 +471,8 @@ def undrawn_findings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of compare, diagnose and study are empty."""
     for kind in ("compare", "diagnosis", "study"):
         monkeypatch.setattr(
-            f"fbse_drake.cli.write_{kind}_report", lambda path, *_, **__: path.write_text("report")
+            f"fbse_drake.commands.write_{kind}_report",
+            lambda path, *_, **__: path.write_text("report"),
         )
 
 
@@ -514,7 +515,7 @@ def test_diagnose_then_add_then_compare(
 ):
     """From a log to a model that fits it."""
     few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
-    monkeypatch.setattr("fbse_drake.cli.diagnose", functools.partial(diagnose, effects=few))
+    monkeypatch.setattr("fbse_drake.commands.diagnose", functools.partial(diagnose, effects=few))
     found = tmp_path / "found"
     assert main(["diagnose", *BIASED, str(biased), "--out", str(found)]) == DONE
     assert sorted(path.name for path in found.iterdir()) == sorted([*FOUND, "diagnosis.json"])
@@ -592,7 +593,7 @@ def test_study_writes_the_completed_scenario(
     biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
     few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
-    monkeypatch.setattr("fbse_drake.cli.study", functools.partial(study, effects=few))
+    monkeypatch.setattr("fbse_drake.commands.study", functools.partial(study, effects=few))
     assert main(["study", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         [*FOUND, "study.json", "completed.yaml"]

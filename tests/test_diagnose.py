@@ -1,5 +1,6 @@
 """What is put into a log is found, with intervals that hold it; what is not is not; and what cannot be seen is said to be so."""
 
+import json
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import ClassVar
@@ -8,11 +9,15 @@ import numpy as np
 import pytest
 
 from fbse_drake.discrepancy.add import add, read_findings
+from fbse_drake.discrepancy.detectability import smallest_detectable
 from fbse_drake.discrepancy.diagnose import Diagnosis, _equals, diagnose, diagnosis_json
+from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.rollout import rollout
-from fbse_drake.discrepancy.search import Search
+from fbse_drake.discrepancy.selection import best_additions
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
@@ -20,7 +25,8 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
-from fbse_drake.scenario import Scenario, load_scenario
+from fbse_drake.progress import Interrupted
+from fbse_drake.scenario import IdentifyConfig, Scenario, load_scenario
 from fbse_drake.simulate import simulate
 
 # Effects that look alike, and some that do not; the whole library is tried by `make hidden`.
@@ -150,7 +156,9 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
     found = {}
     for factor in (0.5, 2.0):
         weak = viscous.from_values([joint], {"viscous": [factor * size]})
-        found[factor] = diagnose(Predictor(scenario(), injected(log, weak)), effects()).chosen
+        # However small a size is.
+        exact = replace(scenario(), identify=IdentifyConfig(tolerance=0.0))
+        found[factor] = diagnose(Predictor(exact, injected(log, weak)), effects()).chosen
     assert not found[0.5]
     assert found[2.0]
     assert all(finding.targets == (joint,) for finding in found[2.0])
@@ -254,19 +262,63 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
     assert rollout(replace(walk, model=walk.robot), log).mean_position == pytest.approx(errors[1])
 
 
+@pytest.mark.parametrize(
+    ("step", "found"),
+    [
+        ("predicting", []),
+        ("looking", []),
+        ("finding what would", ["TorqueGain"]),
+    ],
+)
+def test_an_interrupted_diagnosis_says_what_is_known(step: str, found: list[str]) -> None:
+    """It never says that nothing is missing, rules nothing out, and its JSON is whole."""
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        nonlocal interrupted
+        if text.startswith(step) and not interrupted:
+            interrupted = True
+            raise Interrupted("time is up")
+
+    interrupted = False
+    hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
+    few = [library()[name] for name in ("TorqueGain", "TorqueBias", "ViscousFriction")]
+    partial = diagnose(Predictor(scenario(), log_with(hidden)), few, progress=progress)
+    assert partial.partial == "time is up"
+    assert [finding.effect for finding in partial.chosen] == found
+    assert partial.verdict in (("effect_found",) if found else ("unknown_effect", "not_visible"))
+    content = json.loads(json.dumps(diagnosis_json(partial)))
+    assert content["partial"]
+    assert content["interrupted_because"] == "time is up"
+    assert not any(status["verdict"] == "absent" for status in content["effects"].values())
+
+
+def test_an_interrupted_study_keeps_what_was_found() -> None:
+    """The simulation of the model is left out."""
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        if text.startswith("simulating"):
+            raise Interrupted("time is up")
+
+    hidden = "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}"
+    result = study(scenario(), log_with(hidden), [library()["TorqueGain"]], progress=progress)
+    assert result.partial
+    assert result.stopped_because == "time is up"
+    assert [finding.effect for finding in result.found] == ["TorqueGain"]
+    assert all(step.rollout is None for step in result.steps)
+    assert study_json(result)["partial"]
+
+
 def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_difference() -> None:
-    search = Search(
-        Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}")),
-        [JointSpring, TorqueBias],
-    )
+    predictor = Predictor(scenario(), log_with("!TorqueBias {bias: {left_knee_pitch: 5.0}}"))
+    fits = Fits(Dictionary(predictor, [JointSpring, TorqueBias]))
+    additions = best_additions(Proposals(fits), fits.explain([]))
     spring, bias = (
-        next(e for e in search.best_additions(search.explain([])) if e.candidates[0].effect is c)
-        for c in (JointSpring, TorqueBias)
+        next(e for e in additions if e.candidates[0].effect is c) for c in (JointSpring, TorqueBias)
     )
     for charge, equals in ((11.0, True), (60.0, False)):
-        assert _equals(search, bias, replace(spring, deviance=bias.deviance - charge)) == equals
+        assert _equals(fits, bias, replace(spring, deviance=bias.deviance - charge)) == equals
         # The other way round, parameters that are not needed are none in its favour.
-        assert not _equals(search, spring, replace(bias, deviance=spring.deviance - charge))
+        assert not _equals(fits, spring, replace(bias, deviance=spring.deviance - charge))
 
 
 @pytest.mark.parametrize(
@@ -344,7 +396,7 @@ def test_planned_motion_satisfies_the_equation_of_motion() -> None:
     residual = Predictor(wanted, planned_log(wanted)).residual
     dynamic = [k for k, row in enumerate(residual.rows) if row.kind != "kinematic"]
     assert np.sqrt((residual.value[:, dynamic] ** 2).mean()) < 0.5
-    search = Search(Predictor(wanted, planned_log(wanted)), [library()["ViscousFriction"]])
-    size = search.smallest_detectable(search.noise_alone, library()["ViscousFriction"])
+    fits = Fits(Dictionary(Predictor(wanted, planned_log(wanted)), [library()["ViscousFriction"]]))
+    size = smallest_detectable(fits, fits.noise_alone, library()["ViscousFriction"])
     # The hip yaw does not move in a straight walk.
     assert size["left_hip_yaw"] > 100 * size["left_knee_pitch"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.regression import Signature, WhitenedResidual
+from fbse_drake.discrepancy.regression import Regression, Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual import Residual, Row, block_means, rms
 from fbse_drake.discrepancy.sanity import check_sensors
 from fbse_drake.errors import InputError
@@ -188,7 +188,9 @@ def test_intervals_cover_the_truth_also_where_errors_are_correlated() -> None:
             signals=None,
         )
         white = WhitenedResidual(residual)
-        fit = white.fit([white.whiten_signature(Signature(np.array([0]), column[:, None, None]))])
+        fit = Regression(white).fit(
+            [white.whiten_signature(Signature(np.array([0]), column[:, None, None]))]
+        )
         low, high = fit.interval()[0]
         covered += low < 0.7 < high
         naive += abs(fit.parameters[0] - 0.7) < 1.96 * np.sqrt(2.0 / (column**2).sum())
@@ -211,7 +213,7 @@ def test_a_column_of_noise_explains_nothing_on_held_out_data() -> None:
         signals=None,
     )
     white = WhitenedResidual(residual)
-    fit = white.fit([Signature(np.array([0]), rng.normal(size=(blocks, 1, 20)))])
+    fit = Regression(white).fit([Signature(np.array([0]), rng.normal(size=(blocks, 1, 20)))])
     assert fit.sse[0] < white.sse[0] < fit.held_out_sse[0]
 
 

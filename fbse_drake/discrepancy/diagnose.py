@@ -1,20 +1,29 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake.discrepancy.bandwidth import Averaging, averaged_to_bandwidth
+from fbse_drake.discrepancy.detectability import smallest_detectable
+from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import Experiments
+from fbse_drake.discrepancy.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.refinement import added, consistent
 from fbse_drake.discrepancy.regression import WhitenedResidual
-from fbse_drake.discrepancy.search import MARGIN, Candidate, Explanation, Search
+from fbse_drake.discrepancy.selection import best_additions, select
+from fbse_drake.discrepancy.significance import Significance
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.progress import Interrupted, Progress, silent
 
 Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
 EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
@@ -24,8 +33,6 @@ _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
 # Bodies lighter than this share of the robot are not suspected.
 _LIGHT_BODY = 0.03
-# No explanation has more parts than this.
-_MOST_EFFECTS = 16
 
 
 @dataclass(frozen=True)
@@ -50,8 +57,11 @@ class Finding:
     parameters: dict[str, Estimate]
     # Other effects that explain the residual as well.
     confusable_with: tuple[str, ...]
-    # Is it part of the explanation, or only an alternative?
+    # Is it part of the explanation, or only an alternative, or too small to matter?
     chosen: bool
+    # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is measured, NaN where it is not known.
+    too_small: bool = False
+    share: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,7 @@ class Diagnosis:
     # Chosen effects, those that explain most first, then alternatives, best first.
     ranking: tuple[Finding, ...]
     effects: dict[str, EffectStatus]
-    # What no effect of the library explains: by row.
+    # What no effect of the library explains: by row, as far as it is large enough to matter.
     unexplained: tuple[Structure, ...]
     # Explanations in the order in which they were found; the first has no effects.
     path: tuple[Explanation, ...]
@@ -92,10 +102,19 @@ class Diagnosis:
     train_after: float
     # Inertial parameters that were identified along, of bodies whose own are not trusted; see `IdentifyConfig`.
     inertia: IdentifiedInertia | None = None
+    # Over what the log was averaged.
+    averaging: Averaging | None = None
+    # Why the search ended before it was through; None if it was. What a partial diagnosis does not name was not ruled out.
+    partial: str | None = None
 
     @property
     def chosen(self) -> list[Finding]:
         return [finding for finding in self.ranking if finding.chosen]
+
+    @property
+    def too_small(self) -> list[Finding]:
+        """What is there, but too small to matter."""
+        return [finding for finding in self.ranking if finding.too_small]
 
 
 def suspected_bodies(predictor: Predictor) -> list[str]:
@@ -124,7 +143,7 @@ def diagnose(
     predictor: Predictor,
     effects: Iterable[type[Effect]] | None = None,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
@@ -133,161 +152,88 @@ def diagnose(
 
     Args:
         effects: what is tried; by default `plausible_effects`.
-        progress: called with a word on what is being done.
+        progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
     """
-    say = progress or (lambda _: None)
-    say("predicting what each effect would do")
-    search = Search(
-        predictor,
-        plausible_effects(predictor) if effects is None else effects,
-        suspected_bodies(predictor),
-    )
-    before = search.white.sse
-    path = select(search, say)
-    final, inertia = search.consistent(path[-1])
-    say("looking at what is left")
-    path[-1], remaining, left = search.added(final)
+    predictor, averaging = averaged_to_bandwidth(predictor)
+    suspected = suspected_bodies(predictor)
+    tried = plausible_effects(predictor) if effects is None else effects
+    dictionary = Dictionary(predictor, tried, suspected, progress)
+    first, partial = Fits(dictionary), None
+    before = first.white.sse
+    path, proposals = [first.explain([])], Proposals(first)
+    try:
+        for path, proposals in select(first):  # noqa: B007 - the last one counts.
+            progress("looking for what explains more")
+    except Interrupted as stop:
+        partial = str(stop)
+    fits = proposals.fits
+    white = fits.white
+    final, inertia = consistent(fits, path[-1])
+    path[-1], remaining, left = added(fits, final)
     final = path[-1]
-    unexplained = leftover_structure(predictor.motion, remaining, left)
-    say("finding what would have been seen")
-    rivals = _rivals(search, final)
-    experiments = Experiments(predictor.scenario, suspected_bodies(predictor))
-    statuses = {e.__name__: _status(search, final, e, rivals, experiments) for e in search.effects}
-    if unexplained and not _well_explained(search.white, final, unexplained):
+    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    unexplained = [
+        structure
+        for structure in leftover_structure(predictor.motion, remaining, left)
+        if not significance.left_share(structure, remaining) < tolerance
+    ]
+    shares = {c: significance.share(final, c) for c in final.candidates}
+    rivals: dict[int, list[Explanation]] = {}
+    statuses: dict[str, EffectStatus] = {}
+    try:
+        if partial is None:
+            rivals = _rivals(proposals, final)
+            experiments = Experiments(predictor.scenario, suspected)
+            for k, effect in enumerate(dictionary.effects):
+                progress("finding what would have been seen", k / len(dictionary.effects))
+                statuses[effect.__name__] = _status(fits, final, effect, rivals, experiments)
+    except Interrupted as stop:
+        partial = str(stop)
+    hidden = sum(status.verdict == "not_visible" for status in statuses.values())
+    if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif final.candidates or (
-        inertia is not None and final.deviance < search.white.deviance(search.white.sse) - MARGIN
+    elif any(not share < tolerance for share in shares.values()) or (
+        inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
+    elif partial is not None or hidden > 0.5 * len(statuses):
+        verdict = "not_visible"
     else:
-        hidden = sum(status.verdict == "not_visible" for status in statuses.values())
-        verdict = "not_visible" if hidden > 0.5 * len(statuses) else "nothing_missing"
-    white = search.white
+        verdict = "nothing_missing"
     return Diagnosis(
         verdict,
         (
-            *_ranking(search, path, rivals),
-            *inertia_findings(search.white, before, path[0], inertia),
+            *(_sized(f, tolerance) for f in _ranking(fits, path, rivals, shares)),
+            *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
         tuple(unexplained),
         tuple(path),
         *(_rms(white, sse) for sse in (before, final.held_out_sse, final.sse)),
         inertia,
+        averaging,
+        partial,
     )
 
 
-def select(search: Search, say: Callable[[str], None] = lambda _: None) -> list[Explanation]:
-    """Explanations by forward selection, from none to the last that improves significantly."""
-    path = [search.explain([])]
-    if search.inertia is not None:
-        path.append(search.doubting(_pruned(search, search.plain_friction())))
-        say("fitted inertia and plain friction")
-    while len(path[-1].candidates) < _MOST_EFFECTS:
-        base = path[-1]
-        additions = search.best_additions(base)
-        if not additions:
-            break
-        chosen = _spread(search, additions)
-        chosen = _revise(search, chosen)
-        say(
-            "found " + ", ".join(f"{c.name} ({' and '.join(c.targets)})" for c in chosen.candidates)
-        )
-        if chosen.deviance > base.deviance - MARGIN:
-            break
-        path.append(search.polished(search.doubting(chosen)))
-    if search.inertia is None:
-        path[-1] = _pruned(search, path[-1])
-    return path
-
-
-def _pruned(search: Search, explanation: Explanation) -> Explanation:
-    """An explanation without the members that bring no more than chance."""
-    for member in explanation.candidates:
-        rest = search.explain([c for c in explanation.candidates if c is not member])
-        if not search.is_significant(rest, search.explain([*rest.candidates, member]), member):
-            explanation = rest
-    return explanation
-
-
-def _spread(search: Search, additions: list[Explanation]) -> Explanation:
-    """The best addition, with the same effect on all further joints where nothing else explains more.
-
-    Joints that share values get values of their own if that explains more; then a simpler effect may do as well.
-    """
-    best = _simplest(additions)
-    added, others = best.candidates[-1], best.candidates[:-1]
-    if not issubclass(added.effect, JointTorqueEffect):
-        return best
-    by_joint: dict[str, list[Explanation]] = {}
-    for explanation in additions:
-        candidate = explanation.candidates[-1]
-        if len(candidate.targets) == 1 and issubclass(candidate.effect, JointTorqueEffect):
-            by_joint.setdefault(candidate.targets[0], []).append(explanation)
-
-    def alone(effect: type[Effect], joint: str) -> list[Explanation]:
-        return [e for e in by_joint.get(joint, []) if e.candidates[-1].effect is effect]
-
-    if len(added.targets) > 1:
-        simple = [
-            _simplest(by_joint[joint]).candidates[-1].effect
-            for joint in added.targets
-            if joint in by_joint
-        ]
-        options = [best]
-        for effect in dict.fromkeys([added.effect, *simple]):
-            own = [e.candidates[-1] for joint in added.targets for e in alone(effect, joint)]
-            options += [search.explain([*others, *own])] if own else []
-        best = _simplest(sorted(options, key=lambda e: e.deviance))
-    effect = best.candidates[-1].effect
-    chosen, taken = (
-        [*best.candidates],
-        {target for c in best.candidates if c.effect is effect for target in c.targets},
-    )
-    for joint, there in by_joint.items():
-        same = alone(effect, joint)
-        if joint not in taken and same and same[0].deviance < there[0].deviance + MARGIN:
-            chosen.append(same[0].candidates[-1])
-    return search.explain(chosen) if len(chosen) > len(best.candidates) else best
-
-
-def _simplest(additions: list[Explanation]) -> Explanation:
-    """The best addition; among those that are told apart by nobody, the one with the fewest parameters."""
-    equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
-    return min(equal, key=lambda e: len(e.fit.parameters))
-
-
-def _revise(search: Search, explanation: Explanation) -> Explanation:
-    """Tries every member that shares a row with another one against all others in its place, until nothing improves."""
-    improved = True
-    while improved:
-        improved = False
-        for member in explanation.candidates:
-            others = [c for c in explanation.candidates if c is not member]
-            rows = member.signature.rows
-            if not any(np.intersect1d(rows, c.signature.rows).size for c in others):
-                continue
-            rest = search.explain(others)
-            additions = search.best_additions(rest, rows)
-            best = _simplest(additions) if additions else rest
-            if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
-                explanation, improved = best, True
-                break
-    return explanation
-
-
-def _rivals(search: Search, final: Explanation) -> dict[int, list[Explanation]]:
+def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
     """For each member: explanations with another effect in its place, best first; one for each effect and targets."""
     result = {}
     for k, member in enumerate(final.candidates):
-        rest = search.explain([c for c in final.candidates if c is not member])
+        rest = proposals.fits.explain([c for c in final.candidates if c is not member])
         additions = [
             e
-            for e in search.best_additions(rest, member.signature.rows)
+            for e in best_additions(proposals, rest, member.signature.rows)
             if len(e.candidates) == len(final.candidates)
         ]
         result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
     return result
+
+
+def _sized(finding: Finding, tolerance: float) -> Finding:
+    """A finding that is chosen only if it is large enough to matter."""
+    small = finding.chosen and finding.share < tolerance
+    return replace(finding, chosen=finding.chosen and not small, too_small=small)
 
 
 def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)) -> float:
@@ -295,20 +241,24 @@ def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = sl
 
 
 def _ranking(
-    search: Search, path: list[Explanation], rivals: dict[int, list[Explanation]]
+    fits: Fits,
+    path: list[Explanation],
+    rivals: dict[int, list[Explanation]],
+    shares: Mapping[Candidate, float],
 ) -> list[Finding]:
-    final, white = path[-1], search.white
+    final, white = path[-1], fits.white
     without = [
-        search.explain([c for c in final.candidates if c is not member])
+        fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
     ]
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
         equal = tuple(
-            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(search, e, final))
+            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(fits, e, final))
         )
-        findings.append(finding_of(white, rest, final, member, equal, chosen=True))
+        finding = finding_of(white, rest, final, member, equal, chosen=True)
+        findings.append(replace(finding, share=shares[member]))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
         (e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance
@@ -317,7 +267,7 @@ def _ranking(
         member = explanation.candidates[-1]
         if (member.name, member.targets) not in seen:
             seen.add((member.name, member.targets))
-            rest = search.explain(explanation.candidates[:-1])
+            rest = fits.explain(explanation.candidates[:-1])
             findings.append(finding_of(white, rest, explanation, member, (), chosen=False))
     return findings
 
@@ -405,21 +355,19 @@ def _well_explained(
 
 
 def _status(
-    search: Search,
+    fits: Fits,
     final: Explanation,
     effect: type[Effect],
     rivals: dict[int, list[Explanation]],
     experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
-    smallest = search.smallest_detectable(final, effect)
+    smallest = smallest_detectable(fits, final, effect)
     scenario = None
     mistaken_for = [
         final.candidates[k]
         for k, alternatives in rivals.items()
-        if any(
-            e.candidates[-1].effect is effect and _equals(search, e, final) for e in alternatives
-        )
+        if any(e.candidates[-1].effect is effect and _equals(fits, e, final) for e in alternatives)
     ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"
@@ -429,35 +377,39 @@ def _status(
         scenario = experiments.that_separates(
             member.effect, member.targets, final.values(member)[0], effect
         )
-    elif all(size > search.largest_plausible(effect, target) for target, size in smallest.items()):
+    elif all(
+        size > fits.dictionary.largest_plausible(effect, target)
+        for target, size in smallest.items()
+    ):
         verdict = "not_visible"
         scenario = experiments.that_shows(effect)
     else:
         verdict = "absent"
     units = dict.fromkeys(
-        search.parameters(effect, target)[parameter].unit for target in smallest
+        fits.dictionary.parameters(effect, target)[parameter].unit for target in smallest
     ) or [effect.parameters[parameter].unit]
     return EffectStatus(
         verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
     )
 
 
-def _equals(search: Search, rival: Explanation, final: Explanation) -> bool:
+def _equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
     """Does a rival explain as much? One with fewer parameters does also if chance may have brought what the final explanation has more."""
     more = len(final.fit.parameters) - len(rival.fit.parameters)
-    return rival.deviance < final.deviance + (
-        search.threshold[min(12, more)] if more > 0 else MARGIN
-    )
+    return rival.deviance < final.deviance + (fits.threshold[min(12, more)] if more > 0 else MARGIN)
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Contents of diagnosis.json."""
     return {
         "verdict": diagnosis.verdict,
+        "partial": diagnosis.partial is not None,
+        "interrupted_because": diagnosis.partial,
         "held_out_before": diagnosis.held_out_before,
         "held_out_after": diagnosis.held_out_after,
         "train_after": diagnosis.train_after,
         "noise_floor": 1.0,
+        "block": None if diagnosis.averaging is None else diagnosis.averaging.block,
         "ranking": [
             {
                 "effect": f.effect,
@@ -470,6 +422,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 },
                 "confusable_with": list(f.confusable_with),
                 "chosen": f.chosen,
+                "too_small": f.too_small,
+                "share": f.share,
             }
             for f in diagnosis.ranking
         ],

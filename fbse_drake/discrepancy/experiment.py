@@ -7,9 +7,12 @@ from functools import cached_property
 import numpy as np
 
 from fbse_drake import resources
+from fbse_drake.discrepancy.detectability import separation, smallest_detectable
+from fbse_drake.discrepancy.dictionary import Dictionary
+from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual import EquationOfMotion, Instants
-from fbse_drake.discrepancy.search import MARGIN, Search
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log
@@ -132,17 +135,21 @@ class Experiments:
                 continue  # A motion that this robot cannot make shows nothing.
         return found
 
-    def _searches(self, effect: type[Effect]) -> dict[str, Search]:
+    @cached_property
+    def _whitened(self) -> dict[str, WhitenedResidual]:
+        return {name: WhitenedResidual(p.residual) for name, p in self._predictors.items()}
+
+    def _fits(self, effect: type[Effect]) -> dict[str, Fits]:
         return {
-            name: Search(predictor, [effect], self._bodies)
+            name: Fits(Dictionary(predictor, [effect], self._bodies), self._whitened[name])
             for name, predictor in self._predictors.items()
         }
 
     def that_shows(self, effect: type[Effect]) -> str | None:
         """Name of the scenario that would show the smallest size of an effect, if that is a plausible one."""
         sizes = {}
-        for name, search in self._searches(effect).items():
-            found = search.smallest_detectable(search.noise_alone, effect)
+        for name, fits in self._fits(effect).items():
+            found = smallest_detectable(fits, fits.noise_alone, effect)
             sizes[name] = min(found.values(), default=np.inf)
         best = min(sizes, key=lambda name: sizes[name], default=None)
         return best if best is not None and sizes[best] < effect.largest_plausible() else None
@@ -156,8 +163,8 @@ class Experiments:
     ) -> str | None:
         """Name of the scenario in which an effect, with its values, could least be taken for a rival, if it could not."""
         differences = {
-            name: search.separation(effect, targets, values, rival)
-            for name, search in self._searches(rival).items()
+            name: separation(fits, effect, targets, values, rival)
+            for name, fits in self._fits(rival).items()
         }
         best = max(differences, key=lambda name: differences[name], default=None)
         return best if best is not None and differences[best] > MARGIN else None

@@ -562,13 +562,20 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
     chosen = [
         finding for diagnosis in diagnoses for finding in diagnosis["ranking"] if finding["chosen"]
     ]
+    # What is small and said to be so is found, too; but who names something too small to matter claims nothing.
+    small = [
+        finding
+        for diagnosis in diagnoses
+        for finding in diagnosis["ranking"]
+        if finding.get("too_small", False)
+    ]
     hidden = (
         {effect.effect: effect for effect in answer.effects} if answer.kind == "library" else {}
     )
 
     found, confusable, targets, covered = {}, {}, {}, {}
     for name, effect in hidden.items():
-        named = [finding for finding in chosen if finding["effect"] == name]
+        named = [finding for finding in [*chosen, *small] if finding["effect"] == name]
         found[name] = bool(named)
         confusable[name] = not named and any(
             name in finding["confusable_with"] for finding in chosen

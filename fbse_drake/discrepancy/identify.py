@@ -1,6 +1,6 @@
 """Identifies inertial parameters together with plain friction: the textbook fit, without a search for what else may be missing."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,13 +8,17 @@ import numpy as np
 
 from fbse_drake.discrepancy.add import add
 from fbse_drake.discrepancy.diagnose import Finding, finding_of, inertia_findings
+from fbse_drake.discrepancy.dictionary import Dictionary
+from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.search import Search
+from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.refinement import consistent
 from fbse_drake.discrepancy.study import ModelError, model_error
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.progress import Progress, silent
 from fbse_drake.scenario import Scenario
 
 
@@ -37,13 +41,13 @@ def identify(
     log: Log,
     tests: Mapping[str, Log] | None = None,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> Identification:
     """Identifies the inertial parameters that a scenario does not trust, with friction and bias of every joint.
 
     Args:
         tests: logs that are not fitted, by name.
-        progress: called with a word on what is being done.
+        progress: is told what is being done.
 
     Raises:
         InputError: a log that does not fit the scenario, or a scenario that trusts all inertia.
@@ -52,18 +56,17 @@ def identify(
         raise InputError(
             "identify.inertia: names no body, so there is nothing to identify (as in identify: {inertia: [all]})"
         )
-    say = progress or (lambda _: None)
-    say("predicting what each parameter would do")
+    progress("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
-    search = Search(predictor, [])
-    raw, alone = search.white.sse, search.explain([])
-    say("fitting")
-    fitted, inertia = search.consistent(search.plain_friction())
+    fits = Fits(Dictionary(predictor, [], progress=progress))
+    raw, alone = fits.white.sse, fits.explain([])
+    progress("fitting plain friction")
+    fitted, inertia = consistent(fits, Proposals(fits).plain_friction())
     findings = [
-        finding_of(search.white, alone, fitted, member, (), chosen=True)
+        finding_of(fits.white, alone, fitted, member, (), chosen=True)
         for member in fitted.candidates
     ]
-    findings += inertia_findings(search.white, raw, alone, inertia)
+    findings += inertia_findings(fits.white, raw, alone, inertia)
     completed = add(scenario, findings)
     logs = {"train": log} | dict(tests or {})
     errors = [

@@ -1,8 +1,8 @@
 """What effects add to the residual of a log: signatures for the regression to fit, and predictions of effects whose values are known."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -48,6 +48,8 @@ _SMOOTHING = 9
 _LAW_DOUBT = 8.0
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
+# A law without memory is evaluated at least so often in a block, if the log has that many samples.
+_EVALUATIONS = 8
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
 
@@ -179,9 +181,14 @@ class Predictor:
         return self._joint_motion_of(self.motion.signals)
 
     @cached_property
-    def noisier_joint_motion(self) -> JointMotion:
+    def _joint_motions(self) -> Callable[[int], JointMotion]:
+        """The same averaged over so many steps."""
+        return cache(partial(_joined, self.joint_motion))
+
+    @cached_property
+    def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
         """The same if the sensors' noise were in it once more."""
-        return self._joint_motion_of(self._noisier_signals)
+        return cache(partial(_joined, self._joint_motion_of(self._noisier_signals)))
 
     def _joint_motion_of(self, signals: SensorSignals) -> JointMotion:
         motion = self.motion
@@ -227,7 +234,9 @@ class Predictor:
         Returns:
             Shape (p, B, T), or (p, G, B, T).
         """
-        whole = self.noisier_joint_motion if noisier else self.joint_motion
+        # What remembers must see every step.
+        step = 1 if effect.has_memory else self._joined_steps
+        whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
         motion = whole._replace(
             **{
                 name: getattr(whole, name)[:, joints]
@@ -235,18 +244,34 @@ class Predictor:
             }
         )
         if nonlinear.ndim == 2:
-            return np.stack(
-                [
-                    self.motion.averages(column)
-                    for column in basis_over_time(effect, motion, nonlinear)
-                ]
-            )
+            return self._averages(basis_over_time(effect, motion, nonlinear), step)
         sets = max(1, _CHUNK // motion.velocity.size)
-        parts = []
-        for start in range(0, nonlinear.shape[1], sets):
-            columns = basis_over_time(effect, motion, nonlinear[:, start : start + sets])
-            parts.append([[self.motion.averages(column) for column in group] for group in columns])
-        return np.concatenate([np.array(part) for part in parts], axis=1)
+        parts = [
+            self._averages(
+                basis_over_time(effect, motion, nonlinear[:, start : start + sets]), step
+            )
+            for start in range(0, nonlinear.shape[1], sets)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def _averages(self, columns: np.ndarray, step: int) -> np.ndarray:
+        """Averages over blocks of columns (..., M, T) that were evaluated once for so many steps, all at once."""
+        first = np.moveaxis(columns, -2, 0)
+        if step > 1:
+            return np.moveaxis(block_means(first, self.motion.length // step), 0, -2)
+        return np.moveaxis(self.motion.averages(first), 0, -2)
+
+    @property
+    def _joined_steps(self) -> int:
+        """How many steps may be averaged before a law is evaluated: in long blocks a law is evaluated often enough all the same."""
+        motion = self.motion
+        if motion.recording.recorded_cutoff > 0:
+            return 1
+        return max(
+            step
+            for step in range(1, max(1, motion.length // _EVALUATIONS) + 1)
+            if motion.length % step == 0
+        )
 
     def signature(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> Signature:
         """What an effect on one target adds to the residual per unit of each linear parameter.
@@ -307,7 +332,10 @@ class Predictor:
         noisy_force = motion.signals.pad_force + force_noise(
             sensors.foot_force, self.robot, len(motion.signals.pad_force), random
         )
-        return replace(motion.signals, pad_force=noisy_force, **added)
+        torque = motion.signals.torque_command
+        deviation = np.sqrt(motion.torque_variance(torque))
+        noisy_torque = torque + deviation * random.standard_normal(torque.shape)
+        return replace(motion.signals, pad_force=noisy_force, torque_command=noisy_torque, **added)
 
     @cached_property
     def _noisier_blocks(self) -> Instants:
@@ -509,6 +537,17 @@ class Predictor:
         """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""
         sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
+
+
+def _joined(motion: JointMotion, steps: int) -> JointMotion:
+    """Averages over so many steps."""
+    if steps == 1:
+        return motion
+    joined = {
+        name: block_means(getattr(motion, name), steps)
+        for name in ("velocity", "position", "command", "time", "load")
+    }
+    return motion._replace(**joined, time_step=steps * motion.time_step)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

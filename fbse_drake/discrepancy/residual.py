@@ -323,6 +323,13 @@ class EquationOfMotion:
             for part, G in zip(parts, self.robot.grasp_maps, strict=True)
         ]
 
+    def feet_wrench(self, at: Instants) -> np.ndarray:
+        """What the feet give, [moment, force] on the base in its axes, (M, 6)."""
+        unloaded = replace(at, pad_force=np.zeros_like(at.pad_force))
+        n = len(self.robot.joint_names)
+        with_feet, without = (self.residual(one, kinematic=False)[:, n:] for one in (at, unloaded))
+        return with_feet - without
+
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
         result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)
@@ -661,6 +668,15 @@ class RecordedMotion:
         known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
         return known
 
+    def torque_variance(self, torque: np.ndarray) -> np.ndarray:
+        """Variance of the white noise of a sample of torques (M, n), as the recording says it, (M, n)."""
+        names, recording = self.robot.description, self.recording
+        noise, share = (
+            names.per_joint(getattr(recording, key), key=f"recording.{key}", default=0.0)
+            for key in ("torque_noise", "torque_noise_share")
+        )
+        return noise**2 + (share * torque) ** 2
+
     @cached_property
     def residual(self) -> Residual:
         """The residual of the model's rigid bodies; what its effects explain is not taken off.
@@ -684,16 +700,8 @@ class RecordedMotion:
         else:
             value = block_means(value, self.length)
         white, differenced = self.equation.noise(self.blocks, self.sensors)
-        names = self.robot.description
-        torque_noise = names.per_joint(
-            self.recording.torque_noise, key="recording.torque_noise", default=0.0
-        )
-        torque_share = names.per_joint(
-            self.recording.torque_noise_share, key="recording.torque_noise_share", default=0.0
-        )
-        white[:, : len(torque_noise)] += (
-            torque_noise**2 + (torque_share * self.blocks.torque_command) ** 2
-        )
+        torque = self.torque_variance(self.blocks.torque_command)
+        white[:, : torque.shape[1]] += torque
         duration = self.length * self.period
         variance = white / self.length + 2 * differenced / duration**2
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2

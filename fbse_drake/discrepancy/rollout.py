@@ -1,7 +1,11 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-from collections.abc import Callable, Mapping
+import multiprocessing
+import signal
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -13,10 +17,11 @@ from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.log import Log
+from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RobotConfig, Scenario
 from fbse_drake.signals import channels_of
-from fbse_drake.simulate import add_record, simulate
+from fbse_drake.simulate import INTERRUPTED, add_record, simulate
 from fbse_drake.station import build_station
 from fbse_drake.walking.reference import Recorded, RecordedReference
 from fbse_drake.wiring import release
@@ -26,6 +31,9 @@ _STARTING_SAMPLES = 10
 # A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and then noise alone lets a foot land or a
 # joint slip otherwise, and the rest of the walk is another.
 _DRAWS = 3
+# How often runs in other processes are looked at [s].
+_LOOK_PERIOD = 0.2
+_SIMULATING = "simulating the model against the log"
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,8 @@ def rollout(
     log: Log,
     *,
     planned_with: RobotConfig | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = silent,
+    jobs: int = 1,
 ) -> RolloutError | None:
     """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
 
@@ -74,6 +83,8 @@ def rollout(
     is not stable in itself falls.
 
     Args:
+        progress: is told what is being done.
+        jobs: how many simulations run side by side, each in a process of its own.
         planned_with: the model that reference and feed-forward were planned with, and that the
             estimator believed, when the log was made, which did not know what has been added since;
             by default the scenario's.
@@ -91,10 +102,58 @@ def rollout(
         return _recorded_rollout(believed, scenario.reference, log, progress)
     believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
     seeds = range(scenario.seed + 1, scenario.seed + 1 + _DRAWS)
-    draws = [_simulated_error(replace(believed, seed=seed), log, progress) for seed in seeds]
+    drawn = [replace(believed, seed=seed) for seed in seeds]
+    draws = (
+        _side_by_side(drawn, log, progress, jobs)
+        if jobs > 1
+        else [_simulated_error(one, log, progress) for one in drawn]
+    )
     return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[
         _DRAWS // 2
     ]
+
+
+def _side_by_side(
+    scenarios: Sequence[Scenario], log: Log, progress: Progress, jobs: int
+) -> list[RolloutError]:
+    """The errors of several scenarios, so many at a time.
+
+    Processes are forked: a plant's configuration does not go through a pipe, and a user's own effects are known here only.
+    """
+    context = multiprocessing.get_context("fork")
+    waiting = dict(enumerate(scenarios))
+    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    found: dict[int, RolloutError] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                place = min(waiting)
+                receiver, sender = context.Pipe(duplex=False)
+                run = context.Process(target=_send_error, args=(sender, waiting.pop(place), log))
+                run.start()
+                sender.close()
+                running[receiver] = place, run
+            progress(_SIMULATING, len(found) / len(scenarios))
+            for receiver in wait(list(running), timeout=_LOOK_PERIOD):
+                place, run = running.pop(receiver)
+                result = receiver.recv()
+                run.join()
+                if isinstance(result, Exception):
+                    raise result
+                found[place] = result
+    finally:
+        for _, run in running.values():
+            run.terminate()
+    return [found[place] for place in range(len(scenarios))]
+
+
+def _send_error(sender: Connection, scenario: Scenario, log: Log) -> None:
+    """In a process of its own; who started it decides about its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        sender.send(_simulated_error(scenario, log, silent))
+    except Exception as error:
+        sender.send(error)
 
 
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
@@ -106,11 +165,15 @@ def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
     return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
 
 
-def _simulated_error(
-    scenario: Scenario, log: Log, progress: Callable[[float], None] | None
-) -> RolloutError:
+def _simulated_error(scenario: Scenario, log: Log, progress: Progress) -> RolloutError:
     """The error of a scenario's robot as it is simulated."""
-    result = simulate(scenario, progress=progress)
+
+    def tell(time: float) -> None:
+        progress(_SIMULATING, time / scenario.duration)
+
+    result = simulate(scenario, progress=tell)
+    if result.failure == INTERRUPTED:
+        raise Interrupted("it was interrupted")
     simulated = result.log
     rows = np.searchsorted(simulated.time, log.time - 1e-9)
     shared = (rows < len(simulated.time)) & (
@@ -156,7 +219,7 @@ def _rollout_error(
 
 
 def _recorded_rollout(
-    scenario: Scenario, recorded: Recorded, log: Log, progress: Callable[[float], None] | None
+    scenario: Scenario, recorded: Recorded, log: Log, progress: Progress
 ) -> RolloutError:
     rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
     for stretch, constants in stretches(log):
@@ -168,8 +231,7 @@ def _recorded_rollout(
         channels.append(done)
         if count:
             simulated_time += float(log.time[stretch.start + count - 1] - log.time[stretch.start])
-        if progress is not None:
-            progress(simulated_time)
+        progress(_SIMULATING, float(rows.mean()))
         if failure is not None:
             break
     names = [name for name in _COMPARED if name in log]

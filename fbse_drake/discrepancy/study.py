@@ -1,6 +1,6 @@
 """The whole loop: diagnose, add, and again, until nothing is left."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -15,6 +15,7 @@ from fbse_drake.discrepancy.residual import rms
 from fbse_drake.discrepancy.rollout import RolloutError, rollout
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
+from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.scenario import Scenario
 from fbse_drake.walking.reference import Recorded
 
@@ -98,6 +99,8 @@ class Study:
     stopped_because: str
     # With the effects in its model.
     scenario: Scenario
+    # Was it interrupted? Then `stopped_because` says why.
+    partial: bool = False
 
     @property
     def found(self) -> list[Finding]:
@@ -112,7 +115,8 @@ def study(
     *,
     rollouts: bool = True,
     tests: Mapping[str, Log] | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
+    jobs: int = 1,
 ) -> Study:
     """Diagnoses a log and adds what is found to the model until nothing more is found.
 
@@ -120,38 +124,50 @@ def study(
         effects: what is tried; by default the library.
         rollouts: also simulates the model after every round.
         tests: logs on which the models are tested, by name; nothing is fitted to them.
-        progress: called with a word on what is being done.
+        progress: is told what is being done. If it interrupts the work, the study is partial.
+        jobs: how many simulations run side by side.
 
     Raises:
         InputError: a log that does not fit the scenario.
     """
-    say = progress or (lambda _: None)
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
 
     def measured_step(
-        added: Sequence[Finding], held_out_rmse: float, train_rmse: float
+        added: Sequence[Finding], held_out_rmse: float, train_rmse: float, *, simulated: bool
     ) -> StudyStep:
         others = {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
         errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
         rolled, test_rolled = None, {}
-        if rollouts:
-            say("simulating the model against the log")
-            rolled = rollout(scenario, log, planned_with=planned_with)
+        if simulated:
+            played = partial(
+                rollout, scenario, planned_with=planned_with, progress=progress, jobs=jobs
+            )
+            rolled = played(log)
             if isinstance(scenario.reference, Recorded):
-                played = partial(rollout, scenario, planned_with=planned_with)
                 candidates = ((name, played(other)) for name, other in (tests or {}).items())
                 test_rolled = {name: error for name, error in candidates if error is not None}
         return StudyStep(tuple(added), held_out_rmse, train_rmse, rolled, errors, test_rolled)
 
+    def step(added: Sequence[Finding], held_out_rmse: float, train_rmse: float) -> None:
+        nonlocal interrupted
+        try:
+            simulated = rollouts and interrupted is None
+            made = measured_step(added, held_out_rmse, train_rmse, simulated=simulated)
+        except Interrupted as stop:
+            interrupted = str(stop)
+            made = measured_step(added, held_out_rmse, train_rmse, simulated=False)
+        steps.append(made)
+
     effects = None if effects is None else list(effects)
     predictor, planned_with = Predictor(scenario, log), scenario.believed
-    while len(diagnoses) < _MOST_ROUNDS:
-        say(f"round {len(diagnoses) + 1}")
+    interrupted: str | None = None
+    while len(diagnoses) < _MOST_ROUNDS and interrupted is None:
         diagnosis = diagnose(predictor, effects, progress=progress)
         diagnoses.append(diagnosis)
+        interrupted = diagnosis.partial
         if not steps:
-            steps.append(measured_step((), diagnosis.held_out_before, diagnosis.held_out_before))
+            step((), diagnosis.held_out_before, diagnosis.held_out_before)
         least_gain = _LEAST_GAIN if diagnosis.held_out_before > 1.0 else _LEAST_GAIN_IN_NOISE
         worthwhile = (
             diagnosis.held_out_after
@@ -161,10 +177,9 @@ def study(
             break
         scenario = add(scenario, diagnosis.chosen)
         predictor = Predictor(scenario, log)
-        steps.append(
-            measured_step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after)
-        )
-    return Study(tuple(steps), tuple(diagnoses), _reason(diagnoses), scenario)
+        step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after)
+    because = _reason(diagnoses) if interrupted is None else interrupted
+    return Study(tuple(steps), tuple(diagnoses), because, scenario, interrupted is not None)
 
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
@@ -210,6 +225,7 @@ def study_json(result: Study) -> dict[str, Any]:
         ],
         "noise_floor": 1.0,
         "unit": "multiples of the sensors' noise",
+        "partial": result.partial,
         "stopped_because": result.stopped_because,
         "verdict": result.diagnoses[0].verdict,
         "diagnoses": [diagnosis_json(diagnosis) for diagnosis in result.diagnoses],

@@ -117,6 +117,7 @@ def write_diagnosis_report(
             ),
         ),
         ("What else it could be", _what_else(diagnosis.chosen)),
+        *_too_small(diagnosis.too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", next_step(diagnosis, inputs)),
     )
@@ -129,7 +130,7 @@ def write_diagnosis_report(
         _hygiene(predictor, inputs),
         _reproduce("diagnose", predictor, inputs),
     ]
-    passed = diagnosis.verdict in ("effect_found", "nothing_missing")
+    passed = diagnosis.partial is None and diagnosis.verdict in _PASSED
     write_report(
         path,
         Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)),
@@ -159,6 +160,7 @@ def write_study_report(
             how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse),
         ),
         ("What else it could be", _what_else(study.found)),
+        *_too_small(study.diagnoses[-1].too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", _after_study(study, inputs)),
     )
@@ -176,7 +178,7 @@ def write_study_report(
         _hygiene(before[0], inputs),
         _reproduce("study", before[0], inputs, completed),
     ]
-    passed = study.diagnoses[-1].verdict in ("effect_found", "nothing_missing")
+    passed = not study.partial and study.diagnoses[-1].verdict in _PASSED
     write_report(
         path,
         Report(
@@ -201,6 +203,32 @@ def compare_outcome(comparison: Comparison) -> str:
 
 def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     """The verdict in one or two sentences."""
+    if diagnosis.partial is not None:
+        return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
+    if diagnosis.averaging is not None and diagnosis.averaging.text:
+        return f"{_verdict(diagnosis)} {diagnosis.averaging.text}"
+    return _verdict(diagnosis)
+
+
+def _too_small(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    if not findings:
+        return []
+    return [
+        (
+            "Too small to matter",
+            f"{_listed(findings)}: at most {100 * max(f.share for f in findings):.2g} % of what these rows are made of.",
+        )
+    ]
+
+
+def _partly(diagnosis: Diagnosis) -> str:
+    """What is known of a search that ended early."""
+    if not diagnosis.chosen:
+        return "Nothing was found until then; that rules nothing out."
+    return f"Until then it seems that the model lacks {_listed(diagnosis.chosen)}; rivals were not compared."
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
     found = _listed(diagnosis.chosen)
     if diagnosis.verdict == "effect_found":
         doubtful = dict.fromkeys(
@@ -226,6 +254,14 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def study_outcome(study: Study) -> str:
     """The result of a study in one or two sentences."""
+    if study.partial and not study.diagnoses[-1].partial:
+        return f"Partial: {study.stopped_because}. {_study_result(study)}"
+    if study.partial and study.found:
+        return f"Partial: {study.stopped_because} before the search was through. {_study_result(study)}"
+    return _study_result(study)
+
+
+def _study_result(study: Study) -> str:
     if not study.found:
         return diagnosis_outcome(study.diagnoses[-1])
     first, last = study.steps[0], study.steps[-1]
@@ -428,6 +464,8 @@ def _statuses(study: Study) -> dict[str, EffectStatus]:
 
 def _verdicts(statuses: Mapping[str, EffectStatus]) -> str:
     """How many effects of the library have each verdict."""
+    if not statuses:
+        return "The search ended before it could say what else there is."
     verdicts = [status.verdict for status in statuses.values()]
     counts = ", ".join(
         f"{verdicts.count(name)} {words(name)}"
@@ -480,6 +518,8 @@ def _worst(comparison: Comparison) -> list[Channel]:
     ][:_CHANNELS]
 
 
+# Verdicts that a report calls a success.
+_PASSED = ("effect_found", "nothing_missing")
 _METHOD = (
     "The recorded motion is put into the model's equation of motion. What it leaves over, the residual, is what the model does not "
     "explain; it stands beside the noise that the sensors must put into it."

@@ -1,0 +1,164 @@
+"""Fits by inner products are those of plain least squares, and columns meet the data once."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fbse_drake.discrepancy import regression
+from fbse_drake.discrepancy.memory import Memory
+from fbse_drake.discrepancy.regression import FOLDS, Regression, Signature, WhitenedResidual
+from fbse_drake.discrepancy.remainder import Remainder
+from fbse_drake.discrepancy.residual import Residual, Row
+
+ROWS = 3
+
+
+def white_of(values: np.ndarray) -> WhitenedResidual:
+    """A residual (B, R) of unit noise."""
+    one = np.ones_like(values)
+    rows = [Row(f"joint_{k}", "joint", "Nm") for k in range(values.shape[1])]
+    time = 0.01 * np.arange(len(values))
+    return WhitenedResidual(
+        Residual(rows, time, values, one > 0, one, 0 * one, one[:, :1] > 0, signals=None)
+    )
+
+
+def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
+    """In single rows and in all, with and without an offset, a belief and a bound; of very different units."""
+    return [
+        Signature(np.array([0]), 1e-4 * rng.normal(size=(blocks, 1, 2))),
+        Signature(np.array([1]), rng.normal(size=(blocks, 1, 1)), rng.normal(size=(blocks, 1))),
+        Signature(
+            np.arange(ROWS), 1e3 * rng.normal(size=(blocks, ROWS, 2)), prior=np.array([1e6, 0.0])
+        ),
+        Signature(np.array([2]), rng.normal(size=(blocks, 1, 1)), lowest=np.array([0.5])),
+    ]
+
+
+def plain_least_squares(
+    white: WhitenedResidual, signatures: Sequence[Signature], held_out: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters and what is left (B, R), from the columns one below the other; rows are weighted as `Regression` says."""
+    size = sum(s.values.shape[2] for s in signatures)
+    X, y = np.zeros((*white.y.shape, size)), white.y.copy()
+    prior, lowest, start = np.zeros(size), np.full(size, -np.inf), 0
+    for s in signatures:
+        part = slice(start, start + s.values.shape[2])
+        X[:, s.rows, part], prior[part], lowest[part] = s.values, s.prior, s.lowest
+        y[:, s.rows] -= s.offset
+        start = part.stop
+
+    def solved(blocks: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        weight = 1.0 / np.sqrt(scale)
+        A = (X[blocks] * weight[:, None]).reshape(-1, size)
+        b = (y[blocks] * weight).ravel()
+        A, b = np.concatenate([A, np.diag(np.sqrt(prior))]), np.concatenate([b, np.zeros(size)])
+        norm = np.linalg.norm(A, axis=0)
+        theta = np.linalg.lstsq(A / norm, b)[0] / norm
+        below = theta < lowest
+        if below.any():
+            theta[below] = lowest[below]
+            rest = b - A[:, below] @ theta[below]
+            theta[~below] = np.linalg.lstsq(A[:, ~below] / norm[~below], rest)[0] / norm[~below]
+        return theta
+
+    every = np.ones(len(y), dtype=bool)
+    scale = white.scale(white.sse)
+    for _ in range(3):
+        left = y - X @ solved(every, scale)
+        scale = np.maximum((left**2).sum(axis=0) / white.count, 1.0)
+    theta = solved(every if held_out is None else white.fold != held_out, scale)
+    return theta, y - X @ theta
+
+
+@pytest.mark.parametrize("noise", [1.0, 1e-6])
+def test_fits_by_inner_products_are_those_of_plain_least_squares(noise: float) -> None:
+    """Also where a residual of some thousands of noises is explained to the last millionth: squares must not cancel."""
+    rng = np.random.default_rng(4)
+    signatures = some_signatures(rng, 500)
+    values = noise * rng.normal(size=(500, ROWS))
+    for s in signatures:
+        amounts = rng.normal(size=s.values.shape[2]) / np.abs(s.values).mean()
+        values[:, s.rows] += 3e3 * s.values @ amounts + s.offset
+    white = white_of(values)
+    fit = Regression(white).fit(signatures)
+    theta, left = plain_least_squares(white, signatures)
+    np.testing.assert_allclose(fit.parameters, theta, rtol=1e-7)
+    np.testing.assert_allclose(fit.sse, (left**2).sum(axis=0), rtol=1e-6)
+    held_out = np.zeros(ROWS)
+    for fold in range(FOLDS):
+        _, left = plain_least_squares(white, signatures, fold)
+        held_out += (left[white.fold == fold] ** 2).sum(axis=0)
+    np.testing.assert_allclose(fit.held_out_sse, held_out, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool) -> None:
+    rng = np.random.default_rng(5)
+    known = [Signature(np.array([row]), rng.normal(size=(400, 1, 2))) for row in range(ROWS)]
+    if tied:
+        known = [Signature(np.arange(ROWS), rng.normal(size=(400, ROWS, 4)))]
+    new = Signature(np.array([1]), rng.normal(size=(400, 1, 2)) + known[0].values[:, -1:, :2])
+    white = white_of(rng.normal(size=(400, ROWS)) + known[0].values.sum(axis=(1, 2))[:, None])
+    found = Regression(white)
+    base = found.fit(known)
+    scale = np.ones(ROWS)
+    beside = Remainder(found, tuple(known), base.parameters, scale, tied=tied)
+    gram, right = beside.moments(new, 0)
+
+    def columns(signatures: Sequence[Signature]) -> np.ndarray:
+        parts = []
+        for s in signatures:
+            full = np.zeros((400, ROWS, s.values.shape[2]))
+            full[:, s.rows] = s.values
+            parts.append(full.reshape(-1, full.shape[2]))
+        return np.concatenate(parts, axis=1)
+
+    Q, _ = np.linalg.qr(columns(known))
+    own, y = columns([new]), white.y.ravel()
+    own, y = (values - Q @ (Q.T @ values) for values in (own, y))
+    np.testing.assert_allclose(gram, own.T @ own, rtol=1e-9)
+    np.testing.assert_allclose(right, own.T @ y, rtol=1e-6, atol=1e-6)
+
+
+def test_columns_meet_the_data_once_and_twice_as_long_a_log_costs_twice_as_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Numbers that are read from columns are counted, in a search of fits that share members."""
+    read = 0
+    original = regression.columns_of
+
+    def counted(signature: Signature) -> np.ndarray:
+        nonlocal read
+        read += signature.values.size
+        return original(signature)
+
+    monkeypatch.setattr(regression, "columns_of", counted)
+    rng = np.random.default_rng(6)
+    counts = []
+    for blocks in (500, 1000):
+        signatures = some_signatures(rng, blocks)
+        found = Regression(white_of(rng.normal(size=(blocks, ROWS))))
+        read = 0
+        found.fit(signatures)
+        counts.append(read)
+        assert read == sum(s.values.size for s in signatures)
+        for left_out in signatures:
+            found.fit([s for s in signatures if s is not left_out])
+        assert read == counts[-1]
+    assert counts[1] <= 2.0 * counts[0]
+
+
+def test_what_was_not_asked_for_the_longest_is_forgotten() -> None:
+    memory: Memory[np.ndarray] = Memory(10, np.size)
+    memory["a"], memory["b"] = np.zeros(4), np.zeros(4)
+    assert memory["a"].size == 4
+    memory["c"] = np.zeros(4)
+    assert "b" not in memory
+    assert "a" in memory
+    assert "c" in memory
+    memory["large"] = np.zeros(20)
+    assert "large" in memory
+    assert "c" not in memory
+    assert memory.or_made("large", lambda: np.zeros(1)).size == 20
