@@ -1,6 +1,7 @@
 """The `fbse` command line. Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command line; returns the exit status."""
     try:
         options = _parser().parse_args(arguments)
+        # Matrices are small here: more threads of the linear algebra wait for each other, at three times the cost.
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
         # What the commands need takes seconds to import: `fbse --help` must not wait for it.
         from fbse_drake.commands import COMMANDS
 

@@ -67,7 +67,7 @@ class Dictionary:
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
             self.directions = self.inertia.visible_directions(WhitenedResidual(predictor.residual))
             self.inertia_signature = self.inertia.signature(self.directions)
-        self._grids: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._grids: dict[type[JointTorqueEffect], np.ndarray] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
 
     def parameters(self, effect: type[Effect], target: str) -> Mapping[str, Parameter]:
@@ -124,26 +124,32 @@ class Dictionary:
                     result.append(FixedColumns(effect, target, usual, raw, noise))
         return result
 
-    def grid(self, effect: type[JointTorqueEffect]) -> tuple[np.ndarray, np.ndarray]:
-        """First grid of an effect's nonlinear values for each joint, (m, G, n), and its columns, (B, n, p, G)."""
-        if effect.__name__ not in self._grids:
-            self.progress("predicting what each joint effect would do", self._predicted)
-            searched = [p for p in effect.parameters.values() if not p.linear]
-            most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
-            axes = [np.geomspace(*p.plausible, min(most, p.grid)) for p in searched]
-            points = (
-                np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1)
-                if searched
-                else np.zeros((0, 1))
-            )
-            factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
-            points = points[:, :, None] * factors[:, None]
-            columns = np.transpose(
-                self.predictor.joint_columns(effect, points, np.arange(len(self.joints))),
-                (2, 3, 0, 1),
-            )
-            self._grids[effect.__name__] = (points, columns)
-        return self._grids[effect.__name__]
+    def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
+        """First grid of an effect's nonlinear values for each joint, (m, G, n)."""
+        searched = [p for p in effect.parameters.values() if not p.linear]
+        most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
+        axes = [np.geomspace(*p.plausible, min(most, p.grid)) for p in searched]
+        points = (
+            np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1)
+            if searched
+            else np.zeros((0, 1))
+        )
+        factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
+        return points[:, :, None] * factors[:, None]
+
+    def grid(self, effect: type[JointTorqueEffect]) -> np.ndarray:
+        """Columns of an effect's first grid, (B, n, p, G)."""
+        if effect in self._grids:
+            return self._grids[effect]
+        self.progress("predicting what each joint effect would do", self._predicted)
+        columns = self.predictor.joint_columns(
+            effect, self.points(effect), np.arange(len(self.joints))
+        )
+        columns = np.transpose(columns, (2, 3, 0, 1))
+        # Where no law is doubted, nothing is weighed anew, and nobody asks again.
+        if self.per_step:
+            self._grids[effect] = columns
+        return columns
 
     @property
     def _predicted(self) -> float:

@@ -146,9 +146,8 @@ class Fits:
         """Drop of the deviance that k parameters must bring before they count, by k."""
         tests = len(self.fixed_candidates)
         for effect in self.dictionary.joint_effects:
-            tests += len(self.dictionary.groups) * max(
-                1, self.dictionary.grid(effect)[0].shape[1] // 4
-            )
+            sets = self.dictionary.points(effect).shape[1]
+            tests += len(self.dictionary.groups) * max(1, sets // 4)
         return np.array([np.inf, *(chi2.isf(_FALSE_ALARM / tests, k) for k in range(1, 13))])
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:
@@ -213,7 +212,7 @@ class Fits:
     def grid(self, effect: type[JointTorqueEffect]) -> Grid:
         """First grid of an effect's nonlinear values, in all joints."""
         if effect.__name__ not in self._grids:
-            points, columns = self.dictionary.grid(effect)
+            points, columns = self.dictionary.points(effect), self.dictionary.grid(effect)
             sets = (self._whitened(columns[:, j], j) for j in range(columns.shape[1]))
             self._grids[effect.__name__] = Grid(points, tuple(sets))
         return self._grids[effect.__name__]
