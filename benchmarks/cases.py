@@ -1,4 +1,4 @@
-"""Cases of hidden physics, for `benchmarks.hidden` and `benchmarks.mujoco_walks`: how they are run, kept and shown."""
+"""Cases of hidden physics, for `benchmarks.hidden` and `benchmarks.mujoco_hidden`: how they are run, kept and shown."""
 
 import hashlib
 import json
@@ -187,11 +187,17 @@ def share(values: Iterable[bool]) -> tuple[str, str]:
     return (f"{100 * np.mean(values):.1f} %" if values else "n/a"), f"{len(values)}"
 
 
-def sources_checksum() -> str:
-    """Checksum of what decides on a case."""
+def sources_checksum(*more: Path, note: str = "") -> str:
+    """Checksum of what decides on a case.
+
+    Args:
+        more: files beside those of diagnosis and effects.
+        note: whatever else it depends on.
+    """
     folder = Path(diagnose.__code__.co_filename).parent
     files = sorted([*folder.glob("*.py"), *(folder.parent / "effects").glob("*.py")])
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    contents = [file.read_bytes() for file in (*files, *more)]
+    return hashlib.sha256(b"".join([*contents, note.encode()])).hexdigest()
 
 
 class Store:
