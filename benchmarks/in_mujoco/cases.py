@@ -132,7 +132,7 @@ def effects() -> list[Case]:
         arm("lag-axis_2", MotorLag("axis_2", 0.008)),
         arm("delay-axis_3", MotorDelay("axis_3", 0.006)),
         arm("bias-axis_3", MotorBias("axis_3", 4.0)),
-        arm("limit-axis_1", MotorLimit("axis_1", 40.0)),
+        arm("limit-axis_1", MotorLimit("axis_1", 45.0)),
         arm("drag-axis_1", Drag("axis_1", 15.0)),
         arm("offset-axis_2", EncoderOffset("axis_2", 0.03)),
         arm("offset-axis_3", EncoderOffset("axis_3", 0.02)),
@@ -258,7 +258,7 @@ def best_score(case: Case, diagnoses: Sequence[dict[str, Any]]) -> tuple[Answer,
     else:
         answers = [Answer("decoy", "medium", 1.0, ())]
     scored = [(answer, score(answer, diagnoses)) for answer in answers]
-    return max(
+    best, of_best = max(
         scored,
         key=lambda pair: (
             pair[1].first,
@@ -266,6 +266,8 @@ def best_score(case: Case, diagnoses: Sequence[dict[str, Any]]) -> tuple[Answer,
             any(pair[1].confusable.values()),
         ),
     )
+    true = {hidden.effect for hidden in case.physics.answers}
+    return best, replace(of_best, wrong=tuple(name for name in of_best.wrong if name not in true))
 
 
 def arm_scenario(torque_noise: float = 1.0) -> Scenario:
