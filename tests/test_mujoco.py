@@ -18,6 +18,7 @@ from benchmarks import mujoco_hidden
 from benchmarks.cases import Result
 from fbse_drake import Log, load_scenario
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.scenario import Scenario, SensorsConfig, build_robot, planned_reference
 from fbse_drake.walking.reference import Reference
@@ -31,14 +32,19 @@ if find_spec("mujoco") is not None:
     from benchmarks.in_mujoco.cases import Case, arm_motion, arm_scenario, best_score
     from benchmarks.in_mujoco.loop import Run, record
     from benchmarks.in_mujoco.physics import (
+        AccelerometerBias,
         Drag,
         EncoderScale,
+        FootGain,
+        GyroscopeBias,
         JointProperty,
+        Misalignment,
         MotorBias,
         MotorGain,
         Nothing,
         Payload,
         Physics,
+        Readings,
         Ripple,
         Spring,
     )
@@ -274,6 +280,38 @@ def test_hidden_physics_is_what_a_log_leaves_over(name: str) -> None:
     # Friction is not known where the axis turns round.
     counts = np.abs(motion[2]) > 0.05 if name == "friction" else np.full(len(residual), True)
     assert rms((residual - expected)[counts]) < 0.02 * rms(expected[counts])
+
+
+SENSORS: dict[str, Callable[[], "Physics"]] = {
+    "accelerometer": lambda: AccelerometerBias((0.2, 0.1, -0.3)),
+    "gyroscope": lambda: GyroscopeBias((0.02, -0.01, 0.03)),
+    "misalignment": lambda: Misalignment((0.02, 0.01, -0.03)),
+    "foot": lambda: FootGain("right", 1.05),
+}
+
+
+@needs_mujoco
+@pytest.mark.parametrize("name", SENSORS)
+def test_faulty_sensor_reads_what_its_answer_says(name: str) -> None:
+    robot, _ = make_robot("biped")
+    random, physics = np.random.default_rng(2), SENSORS[name]()
+    true = {
+        "specific_force": random.normal(size=(4, 3)),
+        "angular_velocity": random.normal(size=(4, 3)),
+        "pad_force": random.normal(size=(4, 8, 3)),
+    }
+    joints = dict.fromkeys(
+        ("joint_position", "joint_velocity", "torque_command"), np.zeros((4, 12))
+    )
+    effect = physics.answers[0].make()
+    values = effect.resolve(robot.description, key="hidden")
+    expected = effect.reading(SensorSignals(**joints, **true), np.zeros((0, 1)), values, robot)
+    read = physics.read(robot, Readings(**true))
+    for channel in true:
+        assert getattr(read, channel) == pytest.approx(getattr(expected, channel), abs=1e-12)
+    assert any(
+        np.abs(getattr(read, channel) - value).max() > 1e-3 for channel, value in true.items()
+    )
 
 
 @needs_mujoco

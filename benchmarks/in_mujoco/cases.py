@@ -14,15 +14,17 @@ import numpy as np
 from benchmarks.cases import sources_checksum
 from benchmarks.in_mujoco.loop import Run, record
 from benchmarks.in_mujoco.physics import (
+    AccelerometerBias,
     CentreOfMass,
     Drag,
     Elasticity,
     EncoderOffset,
     EncoderScale,
     FootGain,
-    ImuError,
+    GyroscopeBias,
     JointProperty,
     Mass,
+    Misalignment,
     MotorBias,
     MotorDelay,
     MotorGain,
@@ -159,9 +161,9 @@ def effects() -> list[Case]:
         biped("ripple-right_knee", Ripple("right_knee_pitch", 3.0, cycles=40.0)),
         biped("offset-right_ankle", EncoderOffset("right_ankle_pitch", 0.01)),
         biped("offset-left_knee", EncoderOffset("left_knee_pitch", 0.015), 1),
-        biped("accelerometer-bias", ImuError("AccelerometerBias", (0.2, 0.1, 0.0))),
-        biped("gyroscope-bias", ImuError("GyroscopeBias", (0.02, -0.01, 0.0))),
-        biped("misalignment", ImuError("ImuMisalignment", (0.02, 0.01, 0.0))),
+        biped("accelerometer-bias", AccelerometerBias((0.2, 0.1, 0.0))),
+        biped("gyroscope-bias", GyroscopeBias((0.02, -0.01, 0.0))),
+        biped("misalignment", Misalignment((0.02, 0.01, 0.0))),
         biped("foot-gain", FootGain("left", 1.05)),
     ]
 

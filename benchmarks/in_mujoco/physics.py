@@ -6,7 +6,7 @@ None of it is made with `fbse_drake.effects`, whose names it only gives as the a
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -398,25 +398,50 @@ class EncoderScale(Physics):
 
 @dataclass(frozen=True)
 class ImuError(Physics):
-    """Biases of the IMU in its frame [m/s^2], [rad/s], and axes that are turned by a rotation vector [rad]."""
+    """Base of the errors of the IMU, a vector in its frame."""
 
-    effect: str
     vector: tuple[float, float, float]
+    # What the library calls it.
+    effect: ClassVar[str]
 
     @property
     def answers(self) -> tuple[HiddenEffect, ...]:
         values = dict(zip("xyz", self.vector, strict=True))
         return (_values(self.effect, ("robot",), float(np.linalg.norm(self.vector)), **values),)
 
+
+@dataclass(frozen=True)
+class AccelerometerBias(ImuError):
+    """A bias [m/s^2]."""
+
+    effect: ClassVar[str] = "AccelerometerBias"
+
     def read(self, robot: Robot, readings: Readings) -> Readings:
         del robot
-        vector = np.array(self.vector)
-        if self.effect == "AccelerometerBias":
-            return replace(readings, specific_force=readings.specific_force + vector)
-        if self.effect == "GyroscopeBias":
-            return replace(readings, angular_velocity=readings.angular_velocity + vector)
+        return replace(readings, specific_force=readings.specific_force + self.vector)
+
+
+@dataclass(frozen=True)
+class GyroscopeBias(ImuError):
+    """A bias [rad/s]."""
+
+    effect: ClassVar[str] = "GyroscopeBias"
+
+    def read(self, robot: Robot, readings: Readings) -> Readings:
+        del robot
+        return replace(readings, angular_velocity=readings.angular_velocity + self.vector)
+
+
+@dataclass(frozen=True)
+class Misalignment(ImuError):
+    """Axes that are turned by a rotation vector [rad]."""
+
+    effect: ClassVar[str] = "ImuMisalignment"
+
+    def read(self, robot: Robot, readings: Readings) -> Readings:
+        del robot
         # From axes of the frame to those of the sensor.
-        turn = Rotation.from_rotvec(vector).inv()
+        turn = Rotation.from_rotvec(self.vector).inv()
         return replace(
             readings,
             specific_force=turn.apply(readings.specific_force),
