@@ -1,4 +1,4 @@
-"""Cases of hidden physics, for `benchmarks.hidden` and `benchmarks.mujoco_hidden`: how they are run, kept and shown."""
+"""Cases of hidden physics: how the benchmarks that hide it run, keep and show them."""
 
 import hashlib
 import json

@@ -1,10 +1,11 @@
-"""How well missing physics is found in another simulator: `python -m benchmarks.mujoco_hidden [--quick]
-[--only NAME] [--jobs N] [--keep] [--out DIR]`.
+"""How well missing physics is found in another simulator: `python -m benchmarks.mujoco_hidden
+[--quick] [--only NAME] [--jobs N] [--keep] [--out DIR]`.
 
-A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics that MuJoCo or the loop around it
-makes, with nothing hidden, and with what the library of effects does not have. Each log is diagnosed. Every case leaves
-DIR/cases/<case>.json; those that are there already, made by the same sources, are not run again. Prints the figures beside what was asked
-for and a line for each case that went wrong, and saves both as DIR/figures.json.
+A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
+that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
+does not have. Each log is diagnosed. Every case leaves DIR/cases/<case>.json; those that are there
+already, made by the same sources, are not run again. Prints the figures beside what was asked for
+and a line for each case that went wrong, and saves both as DIR/figures.json.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from fbse_drake.report.html import Table
 
 
 def is_alarm(decoy: Result) -> bool:
-    """Is something said to be missing where nothing is hidden, but for what rightly stands for the difference?"""
+    """Is anything said to be missing but what rightly stands for the decoy's difference?"""
     named = {finding["effect"] for finding in decoy.chosen}
     rightly = bool(named) and named <= set(decoy.tree["case"]["allowed"])
     return not (decoy.score["verdict"] or rightly)

@@ -1,4 +1,4 @@
-"""The benchmark in MuJoCo: the robots are the project's, and a log means there what it means in the project's own simulation."""
+"""The benchmark in MuJoCo: its robots are the project's, and its logs mean the same."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -54,7 +54,7 @@ STEP = 1e-3
 
 
 def random_state(robot: Robot, seed: int) -> tuple[np.ndarray, np.ndarray, Rotation, np.ndarray]:
-    """Joint positions and velocities, attitude of the base and its velocity [angular, linear] in world axes."""
+    """Joint positions and velocities; attitude and velocity [angular, linear] of the base."""
     random, n = np.random.default_rng(seed), len(robot.joint_names)
     attitude = Rotation.random(random_state=random)
     return random.uniform(-1.5, 1.5, n), random.normal(size=n), attitude, random.normal(size=6)
@@ -193,7 +193,8 @@ def arm_log(physics: "Physics") -> Log:
 
 
 def left_over(log: Log, later: int = 0) -> tuple[np.ndarray, ...]:
-    """Torque held over a step less Drake's inverse dynamics in its middle, the torque, and the motion there: (N, n) each, of some steps.
+    """Torque held over a step less Drake's inverse dynamics in its middle, the torque, and the
+    motion there: (N, n) each, of some steps.
 
     Args:
         later: how many steps later the torque is taken.

@@ -1,1 +1,1 @@
-"""The project's robots in MuJoCo, another simulator than the one that the diagnosis was written on."""
+"""The project's robots in MuJoCo, a simulator that the diagnosis was not written on."""

@@ -1,4 +1,4 @@
-"""Robots in MuJoCo with physics that their models lack, with nothing hidden, and with what the library of effects does not have."""
+"""Runs in MuJoCo: with physics that the model lacks, with nothing hidden, with strangers."""
 
 import math
 import time
@@ -65,7 +65,7 @@ _KD = (200.0, 200.0, 100.0, 20.0, 20.0, 8.0)
 _ARM_TORQUE_NOISE = (1.0, 1.0, 0.5, 0.2, 0.2, 0.1)
 _POSTURE = (0.0, 0.5, 0.2, 0.0, 0.3, 0.0)
 _AMPLITUDE = (1.2, 0.5, 0.6, 1.2, 1.0, 1.5)
-# Every axis swings with as many sines, of one to so many times a lowest frequency from this range [Hz].
+# Every axis swings with so many sines: near the multiples of a frequency in this range [Hz].
 _SINES = 3
 _LOWEST_FREQUENCY = (0.1, 0.25)
 # The arm moves for this long, and from rest to rest [s].
@@ -89,7 +89,8 @@ class Case:
     group: Literal["effect", "decoy", "stranger"]
     robot: Literal["arm", "biped"]
     physics: Physics = field(default_factory=Nothing)
-    # What is known of the run: another motion of the arm, other words of the walk's scenario, another noise of the torques.
+    # What is known of the run: another motion of the arm, other words of the walk's scenario,
+    # another noise of the torques.
     motion: int = 0
     overrides: tuple[str, ...] = ()
     torque_noise: float = 1.0
@@ -294,7 +295,8 @@ def arm_scenario(torque_noise: float = 1.0) -> Scenario:
 
 
 def arm_motion(robot: Robot, seed: int, period: float) -> Reference:
-    """Every axis swings with several sines, from rest to rest; with the torques that a robot without faults needs.
+    """Every axis swings with several sines, from rest to rest; with the torques that a robot
+    without faults needs.
 
     Args:
         robot: the model.

@@ -1,4 +1,4 @@
-"""The closed loop in MuJoCo: a robot follows a planned motion, and its sensors are recorded as a log."""
+"""The closed loop in MuJoCo: a robot follows a plan, and its sensors are recorded as a log."""
 
 from dataclasses import dataclass
 
@@ -61,9 +61,9 @@ class _States:
 def record(run: Run, reference: Reference, name: str) -> Log:
     """Runs a robot along a reference.
 
-    Commands are held over the control's period, in which MuJoCo takes several steps. Of the IMU and of the forces a row holds the mean
-    over the period that ends there; of the torque, the command of the period that begins there, with the noise that
-    `scenario.recording.torque_noise` says.
+    Commands are held over the control's period, in which MuJoCo takes several steps. Of the IMU and
+    of the forces a row holds the mean over the period that ends there; of the torque, the command
+    of the period that begins there, with the noise that `scenario.recording.torque_noise` says.
 
     Args:
         reference: sampled at the ticks of the control.
@@ -156,8 +156,11 @@ def _set_start(machine: Machine, data: mujoco.MjData, reference: Reference, grou
 
 
 def _imu(machine: Machine, states: _States, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Specific force, the mean over the period that ends, and rate at its end, (N, 3) each, in the IMU frame; the first row repeats the
-    second force."""
+    """Specific force, the mean over the period that ends, and rate at its end, in the IMU frame.
+
+    Returns:
+        Shape (N, 3) each [m/s^2], [rad/s]; of the first row the force is that of the second.
+    """
     frame = machine.robot.imu.GetFixedPoseInBodyFrame()
     R_BI = Rotation.from_matrix(frame.rotation().matrix())
     R_WB = Rotation.from_quat(states.qpos[:, 3:7], scalar_first=True)

@@ -1,4 +1,5 @@
-"""Physics that a robot in MuJoCo has beside its model: by MuJoCo's own means, or between controller, motors and sensors.
+"""Physics that a robot in MuJoCo has beside its model: by MuJoCo's own means, or between
+controller, motors and sensors.
 
 None of it is made with `fbse_drake.effects`, whose names it only gives as the answer.
 """
@@ -15,13 +16,16 @@ from scipy.spatial.transform import Rotation
 from fbse_drake.discrepancy.hidden import HiddenEffect
 from fbse_drake.robot.plant import Robot
 
-# Torques of the motors in a step of MuJoCo, from commands and joint velocities, (n,) each [Nm], [rad/s].
+# Torques of the motors in a step of MuJoCo [Nm], from commands [Nm], joint positions [rad] and
+# velocities [rad/s], (n,) each.
 Drive = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What sensors read over a run of N ticks, but for their noise; forces at all pads (N, P, 3), in the axes of the soles."""
+    """What sensors read over a run of N ticks, but for their noise, (N, 3) each, forces (N, P, 3)
+    in the axes of the soles.
+    """
 
     specific_force: np.ndarray
     angular_velocity: np.ndarray
@@ -39,7 +43,7 @@ class Physics:
 
     @property
     def answers(self) -> tuple[HiddenEffect, ...]:
-        """Each of these effects of the library says it truly; none where the library does not have it."""
+        """Effects of the library, each of which says it truly; none for a stranger."""
         return ()
 
     @property
@@ -81,7 +85,7 @@ class Nothing(Physics):
 
 @dataclass(frozen=True)
 class JointProperty(Physics):
-    """A property of joints that MuJoCo knows: `dof_damping`, `dof_frictionloss` or `dof_armature`."""
+    """MuJoCo's `dof_damping`, `dof_frictionloss` or `dof_armature` of joints."""
 
     field: str
     joints: tuple[str, ...]
@@ -382,7 +386,7 @@ class EncoderOffset(Physics):
 
 @dataclass(frozen=True)
 class EncoderScale(Physics):
-    """An encoder reads so many times the angle, while its velocity comes from the motor's: the library does not have it."""
+    """An encoder reads so many times the angle, but the right velocity: not in the library."""
 
     joint: str
     scale: float
@@ -471,7 +475,7 @@ class FootGain(Physics):
 
 @dataclass(frozen=True)
 class Tether(Physics):
-    """A spring of MuJoCo's from a body to a point of the world [N/m]: the library does not have it."""
+    """A spring of MuJoCo's from a body to a point of the world [N/m]: not in the library."""
 
     body: str
     anchor: tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""The project's robots in MuJoCo: the same bodies, joints and inertias as in Drake's plants, on MuJoCo's ground."""
+"""A robot's twin in MuJoCo: the bodies, joints and inertias of its plant in Drake."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,11 +12,11 @@ from pydrake.multibody.tree import Joint, RigidBody, SpatialInertia
 
 from fbse_drake.robot.plant import Ground, Robot
 
-# What the ground's constraint leaves of the acceleration that it opposes: the less, the harder the contact.
+# MuJoCo's impedance d of the ground's contact, in (0, 1).
 _IMPEDANCE = 0.95
 # A pad touches the ground in one point.
 _PAD_RADIUS = 1e-6
-# Friction of the ground is so much stiffer than its normal force, so that standing feet do not creep.
+# The ground is so much stiffer along its surface: standing feet do not creep.
 _FRICTION_STIFFNESS = 100.0
 
 Edit = Callable[[mujoco.MjSpec], None]
@@ -43,7 +43,7 @@ class Machine:
 
     @cached_property
     def _read_positions(self) -> np.ndarray:
-        """Places of the angles that the encoders read beside, shape (n,); a joint that has none reads a constant zero behind the last."""
+        """Places of the angles read beside, shape (n,); a zero is behind the last for none."""
         places = [
             self.model.joint(self.behind[name]).qposadr[0] if name in self.behind else self.model.nq
             for name in self.robot.joint_names
@@ -67,7 +67,11 @@ class Machine:
         return q, v
 
     def inverse_dynamics(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Torques of a robot with a fixed base along a motion, (N, n) each [rad], [rad/s], [rad/s^2] -> [Nm]."""
+        """Torques of a robot with a fixed base along a motion, shape (N, n) [Nm].
+
+        Args:
+            q, v, a: joint positions, velocities and accelerations, (N, n) each.
+        """
         data, torque = mujoco.MjData(self.model), np.empty_like(q)
         for k in range(len(q)):
             data.qpos[self.position_index] = q[k]
@@ -225,10 +229,11 @@ def _add_ground(spec: mujoco.MjSpec, robot: Robot, ground: Ground) -> None:
 
 
 def _set_stiffness(model: mujoco.MjModel, robot: Robot, ground: Ground) -> None:
-    """Gives every pad the ground's stiffness, and the damping that Drake's has under a pad's share of the weight.
+    """Gives every pad the ground's stiffness, and the damping that Drake's has under a pad's share
+    of the weight.
 
-    MuJoCo's contact is a spring and a damper of the acceleration, k and b over d, whose force is theirs over (1 - d) / d times the
-    inverse mass A that the pad has in the model's own posture.
+    MuJoCo's contact is a spring and a damper of the acceleration, k and b over d, whose force is
+    theirs over (1 - d) / d times the inverse mass A that the pad has in the model's own posture.
     """
     pads = pad_bodies(robot)
     share = float(np.linalg.norm(model.opt.gravity)) * model.body_mass.sum() / len(pads)
