@@ -11,7 +11,7 @@ and a line for each case that went wrong, and saves both as DIR/figures.json.
 import argparse
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -39,8 +39,9 @@ def is_misled(result: Result) -> bool:
     return result.is_wrong(result.tree["case"]["allowed"])
 
 
-def figures(results: Sequence[Result]) -> Table:
+def figures(everything: Sequence[Result]) -> Table:
     """What was asked for and what came out."""
+    results = [result for result in everything if "error" not in result.tree]
     rows = []
     for robot in ("arm", "biped", "both"):
         mine = [r for r in results if robot in (r.tree["case"]["robot"], "both")]
@@ -71,10 +72,12 @@ def figures(results: Sequence[Result]) -> Table:
             ),
         )
         rows += [(robot, *count) for count in counts]
+    failed, total = len(everything) - len(results), len(everything)
+    rows.append(("both", "diagnoses that ended in an error", "0", f"{failed}", f"{total}"))
     return Table(("robot", "figure", "asked", "measured", "of"), tuple(rows))
 
 
-def failures(results: Iterable[Result]) -> list[str]:
+def failures(results: Sequence[Result]) -> list[str]:
     """A line for each case that did not go as it should."""
 
     def went_wrong(result: Result) -> bool:
@@ -84,7 +87,9 @@ def failures(results: Iterable[Result]) -> list[str]:
             return is_alarm(result)
         return not (is_answered(result) if result.group == "effect" else result.score["verdict"])
 
-    return [result.text() for result in results if went_wrong(result)]
+    errors = [r for r in results if "error" in r.tree]
+    lines = [r.text() for r in results if r not in errors and went_wrong(r)]
+    return lines + [f"{r.name}:\n{r.tree['error']}" for r in errors]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -126,11 +131,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     store.run(wanted, judge, options.jobs, console, "hiding in MuJoCo and finding")
 
     everything = store.read(cases)
-    finished = [result for result in everything if "error" not in result.tree]
-    table, lines = figures(finished), failures(finished)
-    lines += [f"{r.name}:\n{r.tree['error']}" for r in everything if "error" in r.tree]
+    table, lines = figures(everything), failures(everything)
     print_table(console, "Hidden physics in MuJoCo", table)
-    console.print("\n".join(lines), highlight=False, soft_wrap=True)
+    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
     tree = {
         "cases": len(everything),
         "figures": [dict(zip(table.header, row, strict=True)) for row in table.rows],

@@ -179,6 +179,7 @@ def decoys() -> list[Case]:
     return [
         *(decoy("arm", f"motion-{number}", motion=number) for number in range(1, 5)),
         decoy("arm", "exact-torque", torque_noise=0.0),
+        decoy("arm", "exact-torque-rk4", torque_noise=0.0, integrator="rk4"),
         decoy("arm", "noisy-torque", torque_noise=3.0),
         decoy("arm", "low-gain", gain=0.4),
         decoy("arm", "euler", integrator="euler"),
