@@ -8,12 +8,8 @@ figures beside what was asked for and saves them as DIR/report.html with the con
 """
 
 import argparse
-import hashlib
-import json
-import multiprocessing
 import os
 import time
-import traceback
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -25,9 +21,16 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import track
-from rich.table import Table as ConsoleTable
 
+from benchmarks.cases import (
+    NOTHING,
+    UNKNOWN,
+    Result,
+    Store,
+    print_table,
+    share,
+    sources_checksum,
+)
 from fbse_drake import load_scenario
 from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import SIZES, Answer, HiddenEffect, make_exercise, record, score
@@ -35,14 +38,12 @@ from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.strangers import STRANGERS
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.effect import library
-from fbse_drake.files import write_text
 from fbse_drake.report.html import (
     Details,
     FigureBlock,
     Report,
     Section,
     Table,
-    number,
     write_report,
 )
 
@@ -101,7 +102,6 @@ _THRESHOLDS = {
 }
 # Logs without a hidden effect whose model is simulated: they show what the sensors' noise alone makes of two walks.
 _ROLLED_DECOYS = 4
-_NOTHING, _UNKNOWN = "nothing", "unknown"
 
 
 @dataclass(frozen=True)
@@ -208,24 +208,6 @@ def threshold_cases(stated: dict[str, dict[str, float]]) -> list[Case]:
     return result
 
 
-def run(job: tuple[Case, Path, str]) -> None:
-    """Runs a case and writes what came out.
-
-    Args:
-        job: the case, the file that is written, and a checksum of the sources.
-    """
-    case, path, sources = job
-    try:
-        result = _run(case)
-    except Exception:  # One bad case must not stop the others.
-        result = {"error": traceback.format_exc()}
-    write_text(
-        path,
-        json.dumps({"sources": sources, "case": asdict(case), **result}, indent=1, default=float)
-        + "\n",
-    )
-
-
 def _run(case: Case) -> dict[str, Any]:
     # However small an effect is, it is to be found.
     exact = "identify.tolerance=0"
@@ -257,133 +239,6 @@ def _run(case: Case) -> dict[str, Any]:
         "steps": found["steps"],
         "diagnoses": found["diagnoses"],
     }
-
-
-@dataclass(frozen=True)
-class Result:
-    """What came out of a case: the contents of its file."""
-
-    tree: dict[str, Any]
-
-    @property
-    def name(self) -> str:
-        return self.tree["case"]["name"]
-
-    @property
-    def group(self) -> str:
-        return self.tree["case"]["group"]
-
-    @property
-    def size(self) -> str:
-        return self.tree["case"]["size"]
-
-    @property
-    def hidden(self) -> list[dict[str, Any]]:
-        return self.tree["answer"]["effects"]
-
-    @property
-    def score(self) -> dict[str, Any]:
-        return self.tree["score"]
-
-    @property
-    def diagnosis(self) -> dict[str, Any]:
-        return self.tree["diagnoses"][0]
-
-    @cached_property
-    def chosen(self) -> list[dict[str, Any]]:
-        return [finding for finding in self.diagnosis["ranking"] if finding["chosen"]]
-
-    @property
-    def label(self) -> str:
-        """What the diagnosis says, in a word."""
-        if self.diagnosis["verdict"] == "unknown_effect" and (
-            self.group == "stranger" or not self.chosen
-        ):
-            return _UNKNOWN
-        return self.chosen[0]["effect"] if self.chosen else _NOTHING
-
-    @property
-    def truth(self) -> str:
-        return self.hidden[0]["effect"] if self.hidden else _NOTHING
-
-    def is_found(self, *, alternatives: bool = True) -> bool:
-        """Is everything found that is hidden, or else declared to be an alternative?"""
-        return all(
-            found or (alternatives and self.score["confusable"][name])
-            for name, found in self.score["found"].items()
-        )
-
-    def is_alternative(self) -> bool:
-        """Is the hidden effect declared to be an alternative to what is ranked first?"""
-        return bool(self.chosen) and self.truth in self.chosen[0]["confusable_with"]
-
-    def is_visible(self, stated: dict[str, dict[str, float]]) -> bool:
-        """Is every hidden effect, on some target, larger than the smallest size that can be found?
-
-        Where nothing is found, also larger than the size that this log's own diagnosis states: what is hidden may keep a joint still.
-        """
-        own = {
-            name: status["smallest_detectable_by_target"]
-            for name, status in self.diagnosis["effects"].items()
-        }
-        limits = [stated] if self.chosen else [stated, own]
-
-        def exceeds(hidden: dict[str, Any], target: str) -> bool:
-            return all(
-                _strength(hidden, target) > _limit(sizes, hidden, target) for sizes in limits
-            )
-
-        return all(
-            any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden
-        )
-
-    def is_wrong(self, allowed: Iterable[str] = ()) -> bool:
-        """Does it name effects with confidence that are not there?"""
-        return self.diagnosis["verdict"] == "effect_found" and bool(
-            set(self.score["wrong"]) - set(allowed)
-        )
-
-    def text(self) -> str:
-        """One line."""
-        hidden = (
-            ", ".join(
-                f"{e['effect']} {e['size']:.3g} ({' '.join(e['targets'])})" for e in self.hidden
-            )
-            or _NOTHING
-        )
-        chosen = (
-            ", ".join(f"{f['effect']} ({' '.join(f['joints'])})" for f in self.chosen) or _NOTHING
-        )
-        left = " ".join(row["row"] for row in self.diagnosis["unexplained"]) or "nothing"
-        return (
-            f"{self.name}: {hidden} -> {self.diagnosis['verdict']}: {chosen}; unexplained: {left}"
-        )
-
-
-def _strength(hidden: dict[str, Any], target: str) -> float:
-    """How large a hidden effect is on a target, so that more is easier to find: its first parameter, or the length of a vector."""
-    name, parameter = next(iter(library()[hidden["effect"]].parameters.items()))
-    if parameter.neutral == np.inf:
-        return -hidden["parameters"][name][target]
-    if not parameter.linear:
-        return hidden["parameters"][name][target]
-    parameters = library()[hidden["effect"]].parameters
-    return float(
-        np.linalg.norm(
-            [
-                hidden["parameters"].get(n, {}).get(target, 0.0)
-                for n, p in parameters.items()
-                if p.linear and p.unit == parameter.unit
-            ]
-        )
-    )
-
-
-def _limit(stated: dict[str, dict[str, float]], hidden: dict[str, Any], target: str) -> float:
-    """The smallest strength that can be found."""
-    parameter = next(iter(library()[hidden["effect"]].parameters.values()))
-    limit = stated.get(hidden["effect"], {}).get(target, np.inf)
-    return -limit if parameter.neutral == np.inf and np.isfinite(limit) else limit
 
 
 def stated_sizes(decoys: Sequence[Result]) -> dict[str, dict[str, float]]:
@@ -454,27 +309,27 @@ class Figures:
             (
                 "hidden effect ranked first (above the stated smallest size)",
                 ">= 95 %",
-                *_share(r.score["first"] for r in visible),
+                *share(r.score["first"] for r in visible),
             ),
             (
                 "  the rest: declared confusable with the first",
                 "100 %",
-                *_share(r.is_alternative() for r in missed),
+                *share(r.is_alternative() for r in missed),
             ),
             (
                 "  where it is found: on exactly the right targets",
                 "",
-                *_share(all(r.score["targets"].values()) for r in right),
+                *share(all(r.score["targets"].values()) for r in right),
             ),
             (
                 "  where it is found: no effect named that is not there",
                 "",
-                *_share(not r.score["wrong"] for r in right),
+                *share(not r.score["wrong"] for r in right),
             ),
             (
                 "  where it is found: with the verdict effect_found",
                 "",
-                *_share(r.score["verdict"] for r in right),
+                *share(r.score["verdict"] for r in right),
             ),
             (
                 "nothing hidden: false alarms",
@@ -485,46 +340,46 @@ class Figures:
             (
                 "below the stated smallest size: no other effect named",
                 "",
-                *_share(not r.score["wrong"] for r in small),
+                *share(not r.score["wrong"] for r in small),
             ),
             (
                 "not in the library: unknown_effect",
                 "",
-                *_share(r.score["verdict"] for r in strangers),
+                *share(r.score["verdict"] for r in strangers),
             ),
             (
                 "  with exactly the right joints",
                 ">= 80 %",
-                *_share(r.score["verdict"] and r.score["joints"] for r in strangers),
+                *share(r.score["verdict"] and r.score["joints"] for r in strangers),
             ),
-            ("  a wrong name with confidence", "<= 10 %", *_share(r.is_wrong() for r in strangers)),
-            ("two effects: both found", ">= 80 %", *_share(r.is_found() for r in pairs)),
+            ("  a wrong name with confidence", "<= 10 %", *share(r.is_wrong() for r in strangers)),
+            ("two effects: both found", ">= 80 %", *share(r.is_found() for r in pairs)),
             (
                 "held-out residual after adding <= 1.2 x noise",
                 "100 %",
-                *_share(r.diagnosis["held_out_after"] <= 1.2 for r in right),
+                *share(r.diagnosis["held_out_after"] <= 1.2 for r in right),
             ),
             (
                 "rollout error falls, where it is more than noise",
                 "100 %",
-                *_share(before > after for before, after in walks),
+                *share(before > after for before, after in walks),
             ),
-            ("95 % intervals that hold the true value", "88 to 99 %", *_share(covered)),
+            ("95 % intervals that hold the true value", "88 to 99 %", *share(covered)),
             (
                 "half the stated smallest size: not found",
                 "100 %",
-                *_share(not any(r.score["found"].values()) for r in half),
+                *share(not any(r.score["found"].values()) for r in half),
             ),
             (
                 "twice the stated smallest size: found",
                 "100 %",
-                *_share(r.is_found() for r in twice),
+                *share(r.is_found() for r in twice),
             ),
             *(
                 (
                     f"another {m.description} than the model's: a wrong name with confidence",
                     "0 %",
-                    *_share(bad for _, bad in self._misled(name)),
+                    *share(bad for _, bad in self._misled(name)),
                 )
                 for name, m in _MISMATCHES.items()
             ),
@@ -577,7 +432,7 @@ class Figures:
                     f"{len(mine) - len(seen)}",
                     f"{shrunk}",
                     shown,
-                    _share(covered)[0],
+                    share(covered)[0],
                     middle,
                 )
             )
@@ -611,9 +466,9 @@ class Figures:
             if r.group != "effect" or r in self.visible
         ]
         counts = Counter((r.truth, r.label) for r in shown)
-        names = [*(name for name, effect in library().items() if not effect.composite), _NOTHING]
+        names = [*(name for name, effect in library().items() if not effect.composite), NOTHING]
         rows = [name for name in (*names, *STRANGERS) if any(truth == name for truth, _ in counts)]
-        columns = [*names, _UNKNOWN]
+        columns = [*names, UNKNOWN]
         matrix = np.array(
             [[counts[row, column] for column in columns] for row in rows], dtype=float
         ).reshape(len(rows), len(columns))
@@ -633,12 +488,6 @@ class Figures:
         return figure
 
 
-def _share(values: Iterable[bool]) -> tuple[str, str]:
-    """Percentage and number of cases."""
-    values = list(values)
-    return (f"{100 * np.mean(values):.1f} %" if values else "n/a"), f"{len(values)}"
-
-
 def _spread(values: Sequence[float]) -> str:
     return f"{np.median(values):.0f} s, {max(values):.0f} s" if values else "n/a"
 
@@ -651,58 +500,6 @@ def _rollouts(result: Result) -> tuple[float, float]:
     """Error of the model simulated against the log [rad], as it was and with all that was added."""
     before, after = (result.tree["steps"][k]["rollout_rmse"]["joint_position"] for k in (0, -1))
     return before, after
-
-
-def _sources() -> str:
-    """Checksum of what decides on a case."""
-    folder = Path(diagnose.__code__.co_filename).parent
-    files = sorted([*folder.glob("*.py"), *(folder.parent / "effects").glob("*.py")])
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-class Store:
-    """The folder that holds a file for every case."""
-
-    def __init__(self, folder: Path, sources: str, *, keep: bool):
-        """Makes the folder.
-
-        Args:
-            sources: checksum of the sources; files made by others do not count.
-            keep: they do count.
-        """
-        self._folder, self._sources, self._keep = folder, sources, keep
-        folder.mkdir(parents=True, exist_ok=True)
-
-    def read(self, cases: Iterable[Case]) -> list[Result]:
-        """Results of those cases that have been run."""
-        trees = [json.loads(path.read_text()) for path in map(self._path, cases) if path.exists()]
-        return [Result(tree) for tree in trees if self._keep or tree["sources"] == self._sources]
-
-    def run(self, cases: Iterable[Case], jobs: int, console: Console, title: str) -> None:
-        """Runs those cases that have not been run."""
-        cases = list(cases)
-        done = {result.name for result in self.read(cases)}
-        todo = [(case, self._path(case), self._sources) for case in cases if case.name not in done]
-        # Numerical libraries must not start threads of their own beside a process for every core.
-        os.environ |= dict.fromkeys(
-            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-        )
-        # The shells of systems written in Python are never freed: a process grows slowly.
-        with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=10) as pool:
-            for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
-                pass
-
-    def _path(self, case: Case) -> Path:
-        return self._folder / f"{case.name}.json"
-
-
-def _print(console: Console, title: str, table: Table) -> None:
-    shown = ConsoleTable(title=title, title_justify="left")
-    for head in table.header:
-        shown.add_column(head)
-    for row in table.rows:
-        shown.add_row(*(cell if isinstance(cell, str) else number(cell) for cell in row))
-    console.print(shown)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -742,19 +539,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     console = Console(width=190)
-    store = Store(options.out / "cases", _sources(), keep=options.keep)
+    store = Store(options.out / "cases", sources_checksum(), keep=options.keep)
     seeds, sizes = (1, ("medium",)) if options.quick else (options.seeds, options.sizes)
     drawn, lengths = cases(seeds, sizes, quick=options.quick), length_cases()
 
     def wanted(some: Iterable[Case]) -> list[Case]:
         return [case for case in some if options.only in case.name]
 
-    store.run(wanted(drawn), options.jobs, console, "hiding and finding")
+    store.run(wanted(drawn), _run, options.jobs, console, "hiding and finding")
     thresholds = threshold_cases(Figures.of_finished(store.read(drawn)).stated)
     if not options.quick:
-        store.run(wanted(thresholds), options.jobs, console, "at the smallest sizes")
+        store.run(wanted(thresholds), _run, options.jobs, console, "at the smallest sizes")
         # Alone, since their times are compared.
-        store.run(wanted(lengths), 1, console, "longer logs")
+        store.run(wanted(lengths), _run, 1, console, "longer logs")
 
     everything = store.read([*drawn, *thresholds, *lengths])
     figures = Figures.of_finished(everything)
@@ -763,7 +560,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     made = {"What was asked for": figures.table(), "By effect": figures.by_effect()}
     for title, table in made.items():
-        _print(console, title, table)
+        print_table(console, title, table)
     failures = "\n".join([*figures.failures(), *errors])
     console.print(failures, highlight=False, soft_wrap=True)
     confusion = figures.confusion()

@@ -1,0 +1,1 @@
+"""The project's robots in MuJoCo, a simulator that the diagnosis was not written on."""

@@ -1,0 +1,147 @@
+"""How well missing physics is found in another simulator: `python -m benchmarks.mujoco_hidden
+[--quick] [--only NAME] [--jobs N] [--keep] [--out DIR]`.
+
+A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
+that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
+does not have. Each log is diagnosed. Every case leaves DIR/cases/<case>.json; those that are there
+already, made by the same sources, are not run again. Prints the figures beside what was asked for
+and a line for each case that went wrong, and saves both as DIR/figures.json.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.cases import Result, Store, print_table, share
+from fbse_drake.files import write_text
+from fbse_drake.report.html import Table
+
+
+def is_alarm(decoy: Result) -> bool:
+    """Is anything said to be missing but what rightly stands for the decoy's difference?"""
+    named = {finding["effect"] for finding in decoy.chosen}
+    rightly = bool(named) and named <= set(decoy.tree["case"]["allowed"])
+    return not (decoy.score["verdict"] or rightly)
+
+
+def is_answered(effect: Result) -> bool:
+    """Is the hidden effect ranked first, or declared confusable with the first?"""
+    return effect.score["first"] or effect.is_alternative()
+
+
+def is_misled(result: Result) -> bool:
+    """Is an effect named with confidence that is not there?"""
+    return result.is_wrong(result.tree["case"]["allowed"])
+
+
+def figures(everything: Sequence[Result]) -> Table:
+    """What was asked for and what came out."""
+    results = [result for result in everything if "error" not in result.tree]
+    rows = []
+    for robot in ("arm", "biped", "both"):
+        mine = [r for r in results if robot in (r.tree["case"]["robot"], "both")]
+        effects, decoys, strangers = (
+            [r for r in mine if r.group == group] for group in ("effect", "decoy", "stranger")
+        )
+        asked = (">= 95 %", "0", "<= 1") if robot == "both" else ("", "", "")
+        exact = [value for r in effects for value in r.score["targets"].values()]
+        counts = (
+            (
+                "hidden effect ranked first or declared confusable with the first",
+                asked[0],
+                *share(map(is_answered, effects)),
+            ),
+            ("  ranked first", "", *share(r.score["first"] for r in effects)),
+            ("  on exactly the right targets", "", *share(exact)),
+            (
+                "a wrong name with confidence",
+                asked[1],
+                f"{sum(map(is_misled, mine))}",
+                f"{len(mine)}",
+            ),
+            ("nothing hidden: alarms", asked[2], f"{sum(map(is_alarm, decoys))}", f"{len(decoys)}"),
+            (
+                "not in the library: unknown_effect",
+                "",
+                *share(r.score["verdict"] for r in strangers),
+            ),
+        )
+        rows += [(robot, *count) for count in counts]
+    failed, total = len(everything) - len(results), len(everything)
+    rows.append(("both", "diagnoses that ended in an error", "0", f"{failed}", f"{total}"))
+    return Table(("robot", "figure", "asked", "measured", "of"), tuple(rows))
+
+
+def failures(results: Sequence[Result]) -> list[str]:
+    """A line for each case that did not go as it should."""
+
+    def went_wrong(result: Result) -> bool:
+        if is_misled(result):
+            return True
+        if result.group == "decoy":
+            return is_alarm(result)
+        return not (is_answered(result) if result.group == "effect" else result.score["verdict"])
+
+    errors = [r for r in results if "error" in r.tree]
+    lines = [r.text() for r in results if r not in errors and went_wrong(r)]
+    return lines + [f"{r.name}:\n{r.tree['error']}" for r in errors]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs what has not been run, and prints the figures of all that has."""
+    parser = argparse.ArgumentParser(
+        description="How well missing physics is found in another simulator."
+    )
+    parser.add_argument("--quick", action="store_true", help="every fourth case")
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="NAME",
+        help="run only cases with this in their names, as arm or decoy-biped",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=os.cpu_count(),
+        help="cases that run at once (default: all cores)",
+    )
+    parser.add_argument("--keep", action="store_true", help="keep results of other sources")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/mujoco"),
+        help="where everything goes (default out/mujoco)",
+    )
+    options = parser.parse_args(arguments)
+    if find_spec("mujoco") is None:
+        print("MuJoCo is not installed (pip install 'fbse_drake[mujoco]'): no case runs in it.")
+        return
+    from benchmarks.in_mujoco.cases import decoys, effects, judge, sources, strangers
+
+    console = Console(width=190)
+    every = 4 if options.quick else 1
+    cases = [case for group in (effects(), decoys(), strangers()) for case in group[::every]]
+    store = Store(options.out / "cases", sources(), keep=options.keep)
+    wanted = [case for case in cases if options.only in case.name]
+    store.run(wanted, judge, options.jobs, console, "hiding in MuJoCo and finding")
+
+    everything = store.read(cases)
+    table, lines = figures(everything), failures(everything)
+    print_table(console, "Hidden physics in MuJoCo", table)
+    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    tree = {
+        "cases": len(everything),
+        "figures": [dict(zip(table.header, row, strict=True)) for row in table.rows],
+        "failures": lines,
+    }
+    write_text(options.out / "figures.json", json.dumps(tree, indent=1) + "\n")
+    console.print(f"{len(everything)} cases: {options.out / 'figures.json'}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()
