@@ -384,6 +384,17 @@ class EquationOfMotion:
             [joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1
         )
 
+    def joint_shares(self, at: Instants) -> np.ndarray:
+        """Spatial velocity [angular, linear] that each joint gives each sole, in its frame.
+
+        Returns:
+            (feet, M, 6, joints) [rad/s, m/s].
+        """
+        states, _ = self.plant_motion(at)
+        positions = self.robot.plant.num_positions()
+        rates = states[:, positions + self._order[self._joints]]
+        return self._jacobians(states[:, :positions])[..., self._joints] * rates[:, None]
+
     def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Generalized forces without those of the feet, (M, v), in our order."""
         plant, context, forces = self.robot.plant, self._context, MultibodyForces(self.robot.plant)

@@ -18,8 +18,8 @@ class Significance:
     def __init__(self, predictor: Predictor):
         """Measures the log.
 
-        Joint rows are measured by their torque, base rows by what the feet give, those of soles by the IMU's turning and by gravity. What
-        the velocity of soles relative to each other is to be measured by is not known.
+        Joint rows are measured by their torque, base rows by what the feet give, those of soles by how fast single joints turn and
+        move them, and by gravity.
         """
         motion, equation = predictor.motion, predictor.motion.equation
         blocks, rows = motion.blocks, motion.residual.rows
@@ -29,11 +29,14 @@ class Significance:
         self._sizes[:n] = rms(blocks.torque_command, motion.known[:, :n])
         if predictor.robot.has_floating_base:
             wrench = equation.feet_wrench(blocks)
+            # A sole that stays level is turned to and fro by joints that cancel each other.
+            legs = np.sqrt((equation.joint_shares(blocks) ** 2).sum(axis=3)).reshape(-1, 6)
             for kind, size in (
                 ("base/moment", _length(wrench[:, :3])),
                 ("base/force", _length(wrench[:, 3:])),
-                ("sole/angular_velocity", _length(blocks.angular_velocity)),
+                ("sole/angular_velocity", _length(legs[:, :3])),
                 ("sole/specific_force", equation.gravity),
+                ("soles/relative_velocity", _length(legs[:, 3:])),
             ):
                 self._sizes[[kind in row.name for row in rows]] = size
 
