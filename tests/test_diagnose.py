@@ -400,3 +400,14 @@ def test_planned_motion_satisfies_the_equation_of_motion() -> None:
     size = smallest_detectable(fits, fits.noise_alone, library()["ViscousFriction"])
     # The hip yaw does not move in a straight walk.
     assert size["left_hip_yaw"] > 100 * size["left_knee_pitch"]
+
+
+@pytest.mark.parametrize(("compliance", "matters"), [(4e-8, False), (1e-6, True)])
+def test_ground_that_gives_a_little_more_is_nobodys_concern(
+    compliance: float, matters: bool
+) -> None:
+    """The ground believed gives way by 1e-6 m/N."""
+    log = log_with(f"!GroundCompliance {{compliance: {compliance}}}")
+    diagnosis = diagnose(Predictor(scenario(), log), [library()["GroundCompliance"]])
+    assert bool(diagnosis.chosen) == matters
+    assert diagnosis.verdict == ("effect_found" if matters else "nothing_missing")

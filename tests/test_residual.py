@@ -98,6 +98,23 @@ def test_soles_give_way_as_the_contact_says(walk: tuple[Scenario, Log]) -> None:
             ), name
 
 
+def test_joints_that_cancel_each_other_keep_a_standing_sole_level(
+    walk: tuple[Scenario, Log],
+) -> None:
+    """All joints together turn it as the trunk does not; single ones turn it far more."""
+    scenario, _ = walk
+    scenario = replace(scenario, sensors=type(scenario.sensors)(), duration=0.4)
+    predictor = Predictor(scenario, simulate(scenario).log)
+    motion = predictor.motion
+    shares = motion.equation.joint_shares(motion.blocks)[..., :3, :]
+    trunk = np.linalg.norm(motion.blocks.angular_velocity, axis=1)
+    for foot, side in enumerate(predictor.robot.description.sides):
+        first = motion.residual.row_index[f"{side}_sole/angular_velocity_x"]
+        turned = motion.residual.value[:, first : first + 3] - shares[foot].sum(axis=2)
+        np.testing.assert_allclose(np.linalg.norm(turned, axis=1), trunk, atol=1e-4)
+    assert (shares[0] ** 2).sum(axis=(1, 2)).mean() > 25 * (trunk**2).mean()
+
+
 def test_a_force_at_the_end_of_the_range_is_not_known(walk: tuple[Scenario, Log]) -> None:
     scenario, log = walk
     force = log["foot/left/pad_force"].copy()
