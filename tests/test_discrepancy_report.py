@@ -436,6 +436,20 @@ def test_effects_without_a_place_on_the_robot_are_not_spoken_of(
     assert "Foot force gain" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_a_search_that_ended_early_rules_nothing_out(
+    walk: tuple[Predictor, Comparison], tmp_path: Path, interrupted: bool
+):
+    stopped = {"partial": "the time limit of 6 s was reached"} if interrupted else {}
+    diagnosis = dataclasses.replace(UNKNOWN, **stopped)
+    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for claim in ("no effect makes it smaller", "Nothing else in the library", "of your own"):
+        assert (claim in text) != interrupted
+    assert ("with more time" in text) == interrupted
+
+
 def test_effects_in_one_place_are_named_together():
     bias = dataclasses.replace(FRICTION, effect="TorqueBias")
     text = reports.diagnosis_outcome(made_diagnosis(ranking=(FRICTION, MASS, bias)))

@@ -114,9 +114,13 @@ def write_diagnosis_report(
                 diagnosis.held_out_before,
                 diagnosis.held_out_after,
                 diagnosis.train_after,
+                partial=diagnosis.partial is not None,
             ),
         ),
-        ("What else it could be", _what_else(diagnosis.chosen)),
+        (
+            "What else it could be",
+            _what_else(diagnosis.chosen, partial=diagnosis.partial is not None),
+        ),
         *_too_small(diagnosis.too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", next_step(diagnosis, inputs)),
@@ -157,9 +161,15 @@ def write_study_report(
         ("Why it stopped there", _sentence(study.stopped_because)),
         (
             "How sure",
-            how_sure(study.found, first.held_out_rmse, last.held_out_rmse, last.train_rmse),
+            how_sure(
+                study.found,
+                first.held_out_rmse,
+                last.held_out_rmse,
+                last.train_rmse,
+                partial=study.partial,
+            ),
         ),
-        ("What else it could be", _what_else(study.found)),
+        ("What else it could be", _what_else(study.found, partial=study.partial)),
         *_too_small(study.diagnoses[-1].too_small),
         ("What was looked for", _verdicts(statuses)),
         ("What to do next", _after_study(study, inputs)),
@@ -277,19 +287,25 @@ def _study_result(study: Study) -> str:
     )
 
 
-def how_sure(found: Sequence[Finding], before: float, after: float, train: float) -> str:
+def how_sure(
+    found: Sequence[Finding], before: float, after: float, train: float, *, partial: bool = False
+) -> str:
     """What supports a verdict.
 
     Args:
         before, after, train: error on held-out data without and with what was found, and on the data that it was fitted to, in multiples of
             the sensors' noise.
+        partial: the search ended before it was through.
     """
     if found:
         return (
             f"On data that nothing was fitted to, the error of all channels falls from {number(before)} to {number(after)} times the "
             f"sensors' noise ({number(train)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
         )
-    return f"The error of all channels is {number(before)} times the sensors' noise, and no effect makes it smaller on held-out data."
+    nothing = (
+        "nothing was found by then" if partial else "no effect makes it smaller on held-out data"
+    )
+    return f"The error of all channels is {number(before)} times the sensors' noise, and {nothing}."
 
 
 def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
@@ -321,13 +337,15 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[st
     statuses = _applicable(diagnosis.effects)
     doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
     steps = []
-    if diagnosis.verdict == "unknown_effect":
+    if diagnosis.partial is not None:
+        steps.append("Let it look for longer: the same command with more time.")
+    elif diagnosis.verdict == "unknown_effect":
         steps.append(
             "Look at the pictures of the channels that are left, and register an effect of your own that looks like them."
         )
     if doubtful:
         steps.append(f"To tell them apart: {_experiments(doubtful)}")
-    if diagnosis.verdict == "not_visible":
+    if diagnosis.partial is None and diagnosis.verdict == "not_visible":
         hidden = {
             name: status for name, status in statuses.items() if status.verdict == "not_visible"
         }
@@ -390,7 +408,9 @@ def _either(effects: Iterable[str]) -> str:
     return " or ".join(_inside(effect) for effect in effects)
 
 
-def _what_else(found: Sequence[Finding]) -> str:
+def _what_else(found: Sequence[Finding], *, partial: bool) -> str:
+    if partial:
+        return "The search ended before other effects of the library were compared."
     equal: dict[tuple[str, ...], list[Finding]] = {}
     for finding in found:
         equal.setdefault(finding.confusable_with, []).append(finding)
