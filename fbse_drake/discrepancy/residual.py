@@ -24,6 +24,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
+from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
@@ -256,15 +257,11 @@ class _Remembered:
 
     def __init__(self, function: Callable[..., np.ndarray]):
         self._function = function
-        self._results: dict[tuple[bytes, ...], np.ndarray] = {}
+        self._results: Memory[np.ndarray] = Memory(_REMEMBERED)
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         key = tuple(array.tobytes() for array in arrays)
-        result = self._results.pop(key) if key in self._results else self._function(*arrays)
-        self._results[key] = result
-        if len(self._results) > _REMEMBERED:
-            del self._results[next(iter(self._results))]
-        return result
+        return self._results.or_made(key, lambda: self._function(*arrays))
 
 
 class EquationOfMotion:
