@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.compare import compare, comparison_json
@@ -356,7 +357,8 @@ def _findings_table(title: str, findings: Sequence[Finding]) -> Table:
     for finding in findings:
         name = spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})"
         errors = (number(error) for error in (finding.held_out_before, finding.held_out_after))
-        table.add_row(name, targets_text(finding.targets), *errors, parameters_text(finding))
+        cells = (name, targets_text(finding.targets), *errors, parameters_text(finding))
+        table.add_row(*map(Text, cells))
     return table
 
 
@@ -378,12 +380,11 @@ def _add(options: argparse.Namespace) -> bool:
         raise InputError(f"--out {out}: this exists already, and fbse add did not write it")
     if out.exists() and Path(options.scenario).is_file() and out.samefile(options.scenario):
         raise InputError(f"--out {out}: the new scenario would overwrite the old one")
-    header = "\n# ".join(
-        [
-            f"{_ADDED} to {options.scenario}, from {path}.",
-            *(line for finding in findings for line in _value_lines(finding)),
-        ]
-    )
+    lines = [
+        f"{_ADDED} to {options.scenario}, from {path}.",
+        *(f"# {line}" for finding in findings for line in _value_lines(finding)),
+    ]
+    header = "\n".join(map(_on_one_line, lines))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_text(out, f"{header}\n{dump_scenario(completed, name)}")
@@ -393,6 +394,11 @@ def _add(options: argparse.Namespace) -> bool:
     console.print(_findings_table(name, findings))
     console.print(f"Scenario: {out}", highlight=False, soft_wrap=True)
     return True
+
+
+def _on_one_line(text: str) -> str:
+    """The text with what is not printable escaped: no file that it comes from can end a comment."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def _value_lines(finding: Finding) -> list[str]:

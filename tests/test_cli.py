@@ -17,6 +17,7 @@ from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.study import study
 from fbse_drake.effects.effect import library
+from fbse_drake.schema import load_tree
 
 FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
 # One foot swings from 0.5 s on.
@@ -669,6 +670,29 @@ def test_a_bad_diagnosis_is_one_line_and_status_2(
     assert message in printed
     assert printed.count("\n") == 1
     assert not (tmp_path / "new.yaml").exists()
+
+
+@pytest.mark.parametrize("line_break", ["\n", "\r", "\x85", "\u2028"])
+def test_a_diagnosis_puts_nothing_but_its_effects_into_a_scenario(line_break: str, tmp_path: Path):
+    """Its texts stand in comments of the new scenario, and end none of them."""
+    smuggled = f"Nm{line_break}effect_modules: [mine.py]{line_break}"
+    bias = {"value": 1.0, "interval": [0.9, 1.1], "unit": smuggled}
+    finding = {
+        "effect": "TorqueBias",
+        "joints": ["left_knee_pitch"],
+        "held_out_before": 2.0,
+        "held_out_after": 1.0,
+        "parameters": {"bias": bias},
+        "confusable_with": [],
+        "chosen": True,
+    }
+    (tmp_path / "diagnosis.json").write_text(json.dumps({"ranking": [finding]}))
+    (tmp_path / "mine.py").write_text("raise SystemExit('run')")
+    new = tmp_path / "new.yaml"
+    assert main(["add", "squat", str(tmp_path), "--out", str(new), "--quiet"]) == DONE
+    assert list(load_tree(new)) == ["squat"]
+    (effect,) = load_scenario(new).believed.effects.values()
+    assert effect.bias == {"left_knee_pitch": 1.0}
 
 
 @pytest.mark.usefixtures("undrawn")
