@@ -189,6 +189,25 @@ def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
         assert Log.load(tmp_path / "out/log.npz").meta["outcome"]["reason"].endswith("interrupted")
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_whatever_ends_a_command_ends_it_as_ctrl_c_does(name: str):
+    """As soon as it has begun, and so also while it imports what it needs."""
+    script = f"""
+import os, signal, sys
+from fbse_drake import cli
+parse = cli._parser
+def interrupted():
+    os.kill(os.getpid(), signal.{name})
+    return parse()
+cli._parser = interrupted
+sys.argv = ["fbse", "reveal", "nowhere"]
+cli.entry()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == FAILED
+    assert done.stderr == "fbse: interrupted; no file was left half-written\n"
+
+
 def test_a_copied_scenario_does_not_overwrite_the_original(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -150,6 +150,7 @@ def _side_by_side(
 def _send_error(sender: Connection, scenario: Scenario, log: Log) -> None:
     """In a process of its own; who started it decides about its end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         sender.send(_simulated_error(scenario, log, silent))
     except Exception as error:
