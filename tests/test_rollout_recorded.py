@@ -1,6 +1,7 @@
 """A model simulated against a recording, with the recording's own reference: exact for the true model, closed forms for others."""
 
 import dataclasses
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.estimators.fixed_friction import FixedFriction
+from fbse_drake.progress import Interrupted, ProgressLines
 from fbse_drake.scenario import RobotConfig
 from fbse_drake.walking.reference import JointSines, Recorded
 
@@ -250,3 +252,25 @@ def test_a_walk_is_simulated_with_its_estimator_and_compensation():
     assert error.time == pytest.approx(0.3)
     assert error.mean_torque_command < 0.5 * other.mean_torque_command
     assert error.mean_position < other.mean_position
+
+
+def test_simulations_side_by_side_say_what_they_say_one_after_another():
+    squat = load_scenario("squat", overrides=("duration=0.1",))
+    log = simulate(squat).log
+    side_by_side, one_by_one = rollout(squat, log, jobs=3), rollout(squat, log)
+    assert side_by_side.position == one_by_one.position
+    assert side_by_side.torque_command == one_by_one.torque_command
+
+
+def test_simulations_side_by_side_end_with_the_work():
+    """And leave no process behind."""
+    squat = load_scenario("squat", overrides=("duration=0.1",))
+    log = simulate(squat).log
+
+    work = ProgressLines(str)
+    work.stop("enough")
+    with pytest.raises(Interrupted, match="enough"):
+        rollout(squat, log, progress=work, jobs=2)
+    for process in multiprocessing.active_children():
+        process.join(10.0)
+    assert not multiprocessing.active_children()
