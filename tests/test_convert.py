@@ -116,6 +116,118 @@ def test_matrices_structs_and_parts_of_them(tmp_path: Path):
         assert log.meta["segments"][0]["mass"] == 2.5
 
 
+def test_cells_of_a_csv_file_that_hold_lists(tmp_path: Path):
+    """As pandas and spreadsheets write them, in whatever brackets; an empty cell is no list."""
+    styles = [
+        lambda q, tau: f'"[{q[0]!r}, {q[1]!r}]","({tau[0]!r}; {tau[1]!r})"',
+        lambda q, tau: f"{q[0]!r} {q[1]!r},[{tau[0]!r}  {tau[1]!r}]",
+    ]
+    log_map = LogMap(
+        joints=JOINTS,
+        channels={
+            "joint/position": ChannelMap(columns=["q"]),
+            "joint/torque_command": ChannelMap(columns=["tau[1]", "tau[0]"]),
+        },
+    )
+    for style in styles:
+        rows = (
+            f"{time!r},{style(q, tau)}"
+            for time, q, tau in zip(TIME.tolist(), Q.tolist(), TAU.tolist(), strict=True)
+        )
+        text = "\n".join(["time,q,tau", *rows])
+        (tmp_path / "log.csv").write_text(text)
+        log = convert([tmp_path / "log.csv"], log_map)
+        np.testing.assert_array_equal(log["joint/position"], Q)
+        np.testing.assert_array_equal(log["joint/torque_command"], TAU[:, ::-1])
+        (tmp_path / "gap.csv").write_text(text + f"\n{N / 100},,[1 2]\n")
+        assert "without numbers" in convert([tmp_path / "gap.csv"], log_map).meta["findings"][0]
+        (tmp_path / "short.csv").write_text(text + f"\n{N / 100},[1],[1 2]\n")
+        message = rf"line {N + 2}, column q: expected 2 numbers, found '\[1\]'"
+        with pytest.raises(InputError, match=message):
+            convert([tmp_path / "short.csv"], log_map)
+
+
+def test_joints_that_share_motors_are_combinations_of_columns(tmp_path: Path):
+    """A differential wrist: pitch is the mean of two motors, roll half their difference. Torques
+    go the other way round, so that both have the same power."""
+    to_joints = np.array([[0.5, 0.5], [0.5, -0.5]])
+    motors = Q @ np.linalg.inv(to_joints).T
+    motor_torques = TAU @ to_joints
+    rows = np.column_stack([TIME, motors, motor_torques])
+    np.savetxt(
+        tmp_path / "log.csv",
+        rows,
+        delimiter=",",
+        header="time,m1,m2,t1,t2",
+        comments="",
+        fmt="%.17g",
+    )
+    log = convert(
+        [tmp_path / "log.csv"],
+        LogMap(
+            joints=JOINTS,
+            channels={
+                "joint/position": ChannelMap(columns=["m1", "m2"], matrix=to_joints.tolist()),
+                "joint/torque_command": ChannelMap(
+                    columns=["t1", "t2"], matrix=[[1, 1], [1, -1]], gains=[1e3, 1e3], unit="mNm"
+                ),
+            },
+        ),
+    )
+    np.testing.assert_allclose(log["joint/position"], Q, atol=1e-14)
+    np.testing.assert_allclose(log["joint/torque_command"], TAU, atol=1e-12)
+
+
+def test_files_side_by_side_meet_at_the_rows_of_the_joints(tmp_path: Path):
+    """Each topic is a file, with a clock and a rate of its own; forces that are linear in time are
+    interpolated exactly, and rows where a file has ended are left out."""
+    slow = np.arange(0.0, 0.8 * TIME[-1], 0.025)
+    forces = np.column_stack([3.0 * slow, -slow, 700.0 + slow])
+    for trial, start in (("one", 0.0), ("two", 1.7e9)):
+        write_csv(tmp_path / f"joints_{trial}.csv", time=start + TIME)
+        np.savetxt(
+            tmp_path / f"feet_{trial}.csv",
+            np.column_stack([start + slow, np.zeros((len(slow), 3)), forces]),
+            delimiter=",",
+            header="time,mx,my,mz,fx,fy,fz",
+            comments="",
+            fmt="%.17g",
+        )
+    log_map = LogMap(
+        joints=JOINTS,
+        channels={
+            "foot/left/wrench": ChannelMap(
+                topic="feet_*", columns=["mx", "my", "mz", "fx", "fy", "fz"]
+            ),
+            "joint/position": ChannelMap(topic="joints_*", columns=["q1", "q2"]),
+        },
+    )
+    names = ("joints_one", "feet_one", "joints_two", "feet_two")
+    paths = [tmp_path / f"{name}.csv" for name in names]
+    log = convert(paths, log_map)
+    rows = int(np.searchsorted(TIME, slow[-1] + 1e-9))
+    assert [segment["source"] for segment in log.meta["segments"]] == [
+        "feet_one.csv and joints_one.csv",
+        "feet_two.csv and joints_two.csv",
+    ]
+    # What is left of the clock's resolution since 1970.
+    for first, last, resolution in ((0, rows, 1e-9), (len(log.time) - rows, len(log.time), 1e-6)):
+        stretch = slice(first, last)
+        np.testing.assert_array_equal(log["joint/position"][stretch], Q[:rows])
+        expected = np.column_stack([3.0 * TIME, -TIME, 700.0 + TIME])[:rows]
+        np.testing.assert_allclose(
+            log["foot/left/wrench"][stretch, 3:], expected, atol=4.0 * resolution
+        )
+    other = {
+        "joint/position": ChannelMap(topic="joints"),
+        "imu/angular_velocity": ChannelMap(topic="imu"),
+    }
+    with pytest.raises(InputError, match=r"feet_two\.csv: .* topics joints, imu, it fits none"):
+        convert(paths[-1:] * 2, replace(log_map, channels=other))
+    with pytest.raises(InputError, match=r"as many files of each topic; found feet_\*: 1, join"):
+        convert(paths[:3], log_map)
+
+
 def test_a_csv_file_without_names_or_with_other_separators(tmp_path: Path):
     rows = np.column_stack([1e3 * TIME, Q])
     log_map = replace(

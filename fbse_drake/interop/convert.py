@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from fbse_drake.errors import InputError, located
 from fbse_drake.interop.bags import is_bag, open_bag
 from fbse_drake.interop.mapping import ChannelMap, LogMap, load_map
-from fbse_drake.interop.tables import Progress, listed, open_table
+from fbse_drake.interop.tables import Progress, Table, listed, open_table
 from fbse_drake.interop.units import si_factor
 from fbse_drake.log import Log
 
@@ -61,6 +62,10 @@ def read_logs(
 def convert(paths: Sequence[Path], log_map: LogMap, *, progress: Progress = lambda _: None) -> Log:
     """Makes one log of one or several recordings: bags, CSV, JSON, MATLAB and npz files.
 
+    Files of rows are recordings one after another, unless the map's channels are of several topics:
+    then those are what the files are called, and files lie side by side in time, of which those
+    without the joint positions are interpolated at the rows of the one that has them.
+
     Rows that lack a number, and rows at the time of the row before, are left out. What was left out is said in `meta["findings"]`; the
     stretch that each file became is in `meta["segments"]` ("start", "end" [s], "source", "recorded_start" [s], and the map's constants).
     Time begins at zero.
@@ -73,33 +78,116 @@ def convert(paths: Sequence[Path], log_map: LogMap, *, progress: Progress = lamb
         InputError: a file is damaged, does not fit the map, or its time runs backwards.
     """
     recordings = []
-    for path in paths:
-        progress(f"reading {path.name}")
-        read = _read_bag if is_bag(path) else _read_table
-        recording = read(path, log_map, progress)
-        with located(f"{path}: "):
+    for files in _recordings(paths, log_map):
+        first = next(iter(files.values()))
+        progress(f"reading {first.name}")
+        recording = (
+            _read_bag(first, log_map, progress)
+            if is_bag(first)
+            else _read_tables(files, log_map, progress)
+        )
+        with located(f"{first}: "):
             recordings.append(_cleaned(recording, log_map))
     return _joined(recordings, log_map)
 
 
-def _read_table(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
-    table = open_table(path, log_map.records)
-    with located(f"{path}: "):
+def _recordings(paths: Sequence[Path], log_map: LogMap) -> list[dict[str, Path]]:
+    """The files of each recording by topic: several where files of rows lie side by side, else one.
+
+    Raises:
+        InputError: a file is of no topic or of two, or a topic lacks a file.
+    """
+    topics = list(dict.fromkeys(channel.topic for channel in log_map.channels.values()))
+    if len(paths) < 2 or len(topics) < 2 or any(map(is_bag, paths)):
+        return [{"": path} for path in paths]
+    files: dict[str, list[Path]] = {topic: [] for topic in topics}
+    for path in paths:
+        fitting = [topic for topic in topics if fnmatchcase(path.stem, topic)]
+        if len(fitting) != 1:
+            found = listed(fitting)
+            raise InputError(
+                f"{path}: its name is to fit one of the topics {listed(topics)}, it fits {found}"
+            )
+        files[fitting[0]].append(path)
+    counts = [len(found) for found in files.values()]
+    if len(set(counts)) != 1:
+        there = ", ".join(f"{topic}: {len(found)}" for topic, found in files.items())
+        raise InputError(f"side by side there are to be as many files of each topic; found {there}")
+    return [
+        dict(zip(topics, together, strict=True)) for together in zip(*files.values(), strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of one file: columns, (N, k) each, and the clock's readings, (N,)."""
+
+    columns: dict[str, np.ndarray]
+    clock: np.ndarray
+    constants: dict[str, float | str]
+
+
+def _read_tables(files: Mapping[str, Path], log_map: LogMap, progress: Progress) -> _Recording:
+    """Files side by side, each with the channels of its topic; a single one, whose topic is empty,
+    with all of them. Rows are those of the file that has the joint positions, or of the first."""
+    single = len(files) == 1
+    tables = {topic: open_table(path, log_map.records) for topic, path in files.items()}
+    channels: dict[str, ChannelMap] = {}
+    parts: dict[str, _Rows] = {}
+    for topic, table in tables.items():
+        own = {
+            name: replace(channel, topic=topic)
+            for name, channel in log_map.channels.items()
+            if single or channel.topic == topic
+        }
+        own = {name: channel for name, channel in own.items() if _is_there(channel, table)}
+        parts[topic] = _read_rows(table, own, log_map, progress)
+        channels |= own
+    positions = channels.get("joint/position")
+    base = positions.topic if positions else next(iter(files))
+    # Seconds since 1970 are not as fine as the clock's own unit.
+    clock = parts[base].clock
+    origin = clock[np.isfinite(clock)][:1].sum()
+    unit = si_factor(log_map.time.unit, "s") if log_map.time.column else log_map.period
+    times = {topic: (rows.clock - origin) * unit for topic, rows in parts.items()}
+
+    def take(topic: str, column: str) -> np.ndarray:
+        values = _taken(column, parts[topic].columns)
+        if topic == base:
+            return values
+        with located(f"{files[topic]}: "):
+            return _interpolated(times[base], times[topic], values)
+
+    in_order = {name: channels[name] for name in log_map.channels if name in channels}
+    with located(f"{files[base]}: "):
+        made = _channels(in_order, take, len(log_map.joints))
+    constants = {name: value for rows in parts.values() for name, value in rows.constants.items()}
+    for name in log_map.constants:
+        if name not in constants:
+            known = [name for table in tables.values() for name in table.constants]
+            raise InputError(
+                f"{files[base]}: constants: {name} is not in this file (there are: {listed(known)})"
+            )
+    source = " and ".join(path.name for path in files.values())
+    return _Recording(source, log_map.joints, times[base], origin * unit, made, constants, [])
+
+
+def _is_there(channel: ChannelMap, table: Table) -> bool:
+    """Whether a file is to have a channel: all that are not optional, or whose columns it has."""
+    return not channel.optional or all(
+        _split(column, table.names)[0] in table.names for column in channel.columns
+    )
+
+
+def _read_rows(
+    table: Table, channels: Mapping[str, ChannelMap], log_map: LogMap, progress: Progress
+) -> _Rows:
+    with located(f"{table.path}: "):
         if not log_map.joints or not log_map.channels:
             raise InputError(
-                f"a map must name the joints and say what the columns are (columns: {listed(table.names)})"
+                "a map must name the joints and say what the columns are "
+                f"(columns: {listed(table.names)})"
             )
-        for name in log_map.constants:
-            if name not in table.constants:
-                raise InputError(
-                    f"constants: {name} is not in this file (there are: {listed(list(table.constants))})"
-                )
-        channels = {
-            name: channel
-            for name, channel in log_map.channels.items()
-            if not channel.optional
-            or all(_split(column, table.names)[0] in table.names for column in channel.columns)
-        }
         fields = [
             column for channel in channels.values() for column in (*channel.columns, *channel.times)
         ]
@@ -111,24 +199,18 @@ def _read_table(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
             if name not in table.names:
                 raise InputError(f"column {name} is missing (there are: {listed(table.names)})")
     columns = table.read(list(wanted), progress)
-    with located(f"{path}: "):
+    with located(f"{table.path}: "):
         samples = (
             len(columns[log_map.time.column])
             if log_map.time.column
             else max(values.shape[0] for values in columns.values())
         )
         rows = {name: _in_rows(name, values, samples) for name, values in columns.items()}
-        made = _channels(channels, lambda _, column: _taken(column, rows), len(log_map.joints))
-    if log_map.time.column:
-        clock, unit = rows[log_map.time.column][:, 0], si_factor(log_map.time.unit, "s")
-    else:
-        clock, unit = np.arange(float(samples)), log_map.period
-    # Seconds since 1970 are not as fine as the clock's own unit.
-    origin = clock[np.isfinite(clock)][:1].sum()
-    constants = {name: table.constants[name] for name in log_map.constants}
-    return _Recording(
-        path.name, log_map.joints, (clock - origin) * unit, origin * unit, made, constants, []
-    )
+    clock = rows[log_map.time.column][:, 0] if log_map.time.column else np.arange(float(samples))
+    constants = {
+        name: value for name, value in table.constants.items() if name in log_map.constants
+    }
+    return _Rows(rows, clock, constants)
 
 
 def _read_bag(path: Path, log_map: LogMap, progress: Progress) -> _Recording:

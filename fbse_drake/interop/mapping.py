@@ -7,6 +7,10 @@
       joint/torque_command: {columns: [i1, i2], gains: [0.091, -0.091]}    # motor current [A] times Nm/A
 
 A column that has several numbers in a row is meant with all of them (`q`), one (`q[0]`) or some (`q[0:3]`).
+Joints that share motors are combinations of columns, and what another file recorded is said by its name:
+
+      joint/velocity: {columns: [m1, m2], matrix: [[0.5, 0.5], [0.5, -0.5]]}
+      imu/angular_velocity: {topic: imu_*, columns: [wx, wy, wz]}
 """
 
 from dataclasses import dataclass, field
@@ -23,9 +27,13 @@ from fbse_drake.signals import channel_kind
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """Where the numbers of a channel come from: unit * (gain * gains_i * column_i [* times_i] + offsets_i), turned by the rotation."""
+    """Where the numbers of a channel come from: unit * (gain * gains_i * column_i [* times_i] + offsets_i), turned by the rotation.
 
-    # Of a bag; by default the one that has the channel's standard message.
+    With a matrix, column_i stands for row i of it times all columns.
+    """
+
+    # Of a bag; by default the one that has the channel's standard message. Of files of rows that lie
+    # side by side: what the file is called without its suffix, where `*` is any text.
     topic: str = ""
     # One for each component, or fewer that have several numbers in a row. Of a message: a field, as `wrench.force`. An orientation
     # is a quaternion [w, x, y, z] or roll, pitch and yaw.
@@ -34,6 +42,8 @@ class ChannelMap:
     times: list[str] = field(default_factory=list)
     # Columns that hold signed numbers of so many bits, recorded as if they had no sign; 0 if they do not.
     signed_bits: int = 0
+    # One row of factors for each component, one factor in it for each column.
+    matrix: list[list[float]] = field(default_factory=list)
     gain: float = 1.0
     # One for each component.
     gains: list[float] = field(default_factory=list)
@@ -55,6 +65,8 @@ class ChannelMap:
             raise InputError(
                 f"times: expected one column or {len(self.columns)} as in columns, found {len(self.times)}"
             )
+        if len(set(map(len, self.matrix))) > 1:
+            raise InputError("matrix: its rows are not of one length")
         if not 0 <= self.signed_bits <= 32:
             raise InputError(
                 f"signed_bits: expected a number from 0 to 32, found {self.signed_bits}"
@@ -74,9 +86,10 @@ class ChannelMap:
             InputError: the number of columns does not fit the channel.
         """
         unit, shape = channel_kind(name)
-        width = columns.shape[1]
+        values = self._combined(columns, times)
+        width = values.shape[1]
         if name.endswith("/orientation") and width == 3:
-            return self._quaternions(columns)
+            return self._quaternions(values)
         expected = ("n" in shape and joints) or int(
             np.prod([size for size in shape if isinstance(size, int)])
         )
@@ -94,12 +107,6 @@ class ChannelMap:
                 raise InputError(
                     f"{key}: expected {width} numbers, one for each component, found {len(getattr(self, key))}"
                 )
-        values = columns
-        if self.signed_bits:
-            half = 2.0 ** (self.signed_bits - 1)
-            values = np.mod(values + half, 2 * half) - half
-        if times is not None:
-            values = values * times
         factor = si_factor(self.unit, unit, joint="n" in shape) if self.unit else 1.0
         if self.gain != 1.0 or factor != 1.0 or self.gains:
             values = values * (factor * self.gain * np.array(self.gains or 1.0))
@@ -110,6 +117,23 @@ class ChannelMap:
         return values.reshape(
             len(values), *(-1 if size == "m" else joints if size == "n" else size for size in shape)
         )
+
+    def _combined(self, columns: np.ndarray, times: np.ndarray | None) -> np.ndarray:
+        """Signed columns times others, and combinations of them, (N, components)."""
+        values = columns
+        if self.signed_bits:
+            half = 2.0 ** (self.signed_bits - 1)
+            values = np.mod(values + half, 2 * half) - half
+        if times is not None:
+            values = values * times
+        if not self.matrix:
+            return values
+        if len(self.matrix[0]) != values.shape[1]:
+            raise InputError(
+                f"matrix: expected {values.shape[1]} factors in a row, one for each column, "
+                f"found {len(self.matrix[0])}"
+            )
+        return values @ np.array(self.matrix).T
 
     def _quaternions(self, columns: np.ndarray) -> np.ndarray:
         """Orientations [w, x, y, z], (N, 4), of recorded roll, pitch and yaw, (N, 3)."""

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import faulthandler
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -140,32 +141,73 @@ def _open_csv(path: Path) -> Table:
 
     def read(wanted: Sequence[str], progress: Progress) -> dict[str, np.ndarray]:
         indices = [names.index(name) for name in wanted]
-        rows, line, size = Growing((len(wanted),), float), 1 if headless else 2, path.stat().st_size
+        widths = _widths(path, delimiter, headless=headless, indices=indices)
+        line, size = 1 if headless else 2, path.stat().st_size
+        rows = Growing((sum(widths.values()),), float)
         with path.open(encoding="utf-8-sig", newline="") as file:
             if not headless:
                 file.readline()
             while lines := list(islice(file, _CHUNK)):
-                rows.extend(_csv_rows(lines, line, delimiter, fields=names, indices=indices))
+                rows.extend(_csv_rows(lines, line, delimiter, fields=names, widths=widths))
                 line += len(lines)
                 progress(f"reading {path.name}: {min(1.0, file.buffer.tell() / size):.0%}")
-        return dict(zip(wanted, rows.rows().T, strict=True))
+        ends = np.cumsum(list(widths.values()))[:-1]
+        columns = np.split(rows.rows(), ends, axis=1)
+        return {
+            name: values[:, 0] if values.shape[1] == 1 else values
+            for name, values in zip(wanted, columns, strict=True)
+        }
 
     return Table(path, names, {}, read)
 
 
+def _widths(
+    path: Path, delimiter: str, *, headless: bool, indices: Sequence[int]
+) -> dict[int, int]:
+    """How many numbers the cells of some columns hold, as the first ones that are not empty do."""
+    widths: dict[int, int] = {}
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for cells in islice(csv.reader(file, delimiter=delimiter), 0 if headless else 1, _CHUNK):
+            for i in indices:
+                if i not in widths and i < len(cells) and (count := len(_listed_texts(cells[i]))):
+                    widths[i] = count
+            if len(widths) == len(set(indices)):
+                break
+    return {i: widths.get(i, 1) for i in indices}
+
+
+def _listed_texts(cell: str) -> list[str]:
+    """The numbers of a cell as texts: one, or a list of them as `[1, 2]`, `(1; 2)` or `1 2`."""
+    return re.split(r"[\s,;]+", inner) if (inner := cell.strip(" \t[](){}")) else []
+
+
 def _csv_rows(
-    lines: list[str], first: int, delimiter: str, *, fields: list[str], indices: list[int]
+    lines: list[str],
+    first: int,
+    delimiter: str,
+    *,
+    fields: list[str],
+    widths: Mapping[int, int],
 ) -> np.ndarray:
-    """Numbers of some lines, (N, columns); what is empty is NaN.
+    """Numbers of some lines, (N, sum of the widths); what is empty is NaN.
 
     Args:
         first: number of the first line, for messages.
+        widths: of the wanted columns: how many numbers their cells hold.
     """
     # Numpy looks at the wanted columns only: it would not see that a line has too many.
-    if all(line.count(delimiter) == len(fields) - 1 and not line.isspace() for line in lines):
+    plain = all(width == 1 for width in widths.values()) and all(
+        line.count(delimiter) == len(fields) - 1 and not line.isspace() for line in lines
+    )
+    if plain:
         with contextlib.suppress(ValueError):
             return np.loadtxt(
-                lines, delimiter=delimiter, usecols=indices, ndmin=2, comments=None, quotechar='"'
+                lines,
+                delimiter=delimiter,
+                usecols=list(widths),
+                ndmin=2,
+                comments=None,
+                quotechar='"',
             )
     rows = []
     for number, line in enumerate(lines, first):
@@ -174,16 +216,18 @@ def _csv_rows(
             continue
         if len(cells) != len(fields):
             raise InputError(f"line {number}: expected {len(fields)} columns, found {len(cells)}")
-        row = []
-        for i in indices:
-            text = cells[i].strip()
-            if text and not _is_number(text):
+        row: list[float] = []
+        for i, width in widths.items():
+            texts = _listed_texts(cells[i]) or ["nan"] * width
+            if len(texts) != width or not all(map(_is_number, texts)):
+                expected = "a number" if width == 1 else f"{width} numbers"
                 raise InputError(
-                    f"line {number}, column {fields[i]}: expected a number, found {text[:40]!r}"
+                    f"line {number}, column {fields[i]}: "
+                    f"expected {expected}, found {cells[i].strip()[:40]!r}"
                 )
-            row.append(float(text or "nan"))
+            row.extend(map(float, texts))
         rows.append(row)
-    return np.array(rows).reshape(-1, len(indices))
+    return np.array(rows).reshape(-1, sum(widths.values()))
 
 
 def _is_number(text: str) -> bool:
