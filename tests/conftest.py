@@ -30,6 +30,12 @@ def run() -> Callable[..., Log]:
     return simulated
 
 
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures in reports are empty: drawing them takes most of the time of a short run."""
+    monkeypatch.setattr("fbse_drake.report.html._png_uri", lambda _: "data:image/png;base64,")
+
+
 def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:
     """A shipped scenario, without sensor errors if so wished."""
     result = load_scenario(name, overrides=overrides)

@@ -5,8 +5,8 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.discrepancy.study import study
 from fbse_drake.effects.effect import library
 from fbse_drake.schema import load_tree
+from fbse_drake.simulate import fall_reason
 
 FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
 # One foot swings from 0.5 s on.
@@ -51,12 +52,14 @@ def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "report.html" in printed
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_written_scenario_runs_again_to_the_same_log(tmp_path: Path):
     main(["simulate", "sway", "--set", "duration=0.2", "--out", str(tmp_path / "a"), "--quiet"])
     main(["simulate", str(tmp_path / "a/scenario.yaml"), "--out", str(tmp_path / "b"), "--quiet"])
     assert (tmp_path / "a/log.npz").read_bytes() == (tmp_path / "b/log.npz").read_bytes()
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert (
         main(["simulate", "squat", "--set", "duration=0.1", "--out", str(tmp_path), "--quiet"])
@@ -65,6 +68,7 @@ def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_meshcat_is_recorded(tmp_path: Path):
     assert (
         main(
@@ -84,6 +88,7 @@ def test_meshcat_is_recorded(tmp_path: Path):
     assert "animation" in (tmp_path / "meshcat.html").read_text()
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_fall_ends_the_run_and_keeps_the_log(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main(["simulate", "paper_walk_pd", "--out", str(tmp_path), "--quiet"]) == FAILED
     message = capsys.readouterr().err
@@ -153,40 +158,25 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, capsys: pyte
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_an_interrupted_run_leaves_no_half_written_file(tmp_path: Path):
-    command = [
-        sys.executable,
-        "-m",
-        "fbse_drake",
-        "simulate",
-        "squat",
-        "--set",
-        "duration=20",
-        "--set",
-        "plant.time_step=1e-4",
-    ]
-    process = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "out")],
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ},
-    )
-    # An interruption while modules are being loaded can be lost in one of them; the folder is made when all are there.
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "out").is_dir() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    # By now it plans the motion, or runs, which takes a minute.
-    time.sleep(6)
-    process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=120)
-    assert process.returncode == FAILED
+@pytest.mark.usefixtures("blank_pictures")
+def test_an_interrupted_run_keeps_what_was_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Ctrl-C while it runs: the log ends there, and everything is written."""
+
+    def interrupted(*arguments: object) -> str | None:
+        os.kill(os.getpid(), signal.SIGINT)
+        return fall_reason(*arguments)
+
+    monkeypatch.setattr(import_module("fbse_drake.simulate"), "fall_reason", interrupted)
+    assert main(["simulate", "squat", "--out", str(tmp_path), "--quiet"]) == FAILED
+    message = capsys.readouterr().err
     assert "interrupted" in message
     assert message.count("\n") == 1
-    names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert not [name for name in names if name.endswith(".part")]
-    if names:
-        assert names == FILES
-        assert Log.load(tmp_path / "out/log.npz").meta["outcome"]["reason"].endswith("interrupted")
+    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+    log = Log.load(tmp_path / "log.npz")
+    assert log.time[-1] == pytest.approx(0.01)
+    assert log.meta["outcome"]["reason"].endswith("interrupted")
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
@@ -208,6 +198,27 @@ cli.entry()
     assert done.stderr == "fbse: interrupted; no file was left half-written\n"
 
 
+@pytest.mark.usefixtures("blank_pictures")
+def test_an_interrupted_report_leaves_no_half_written_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Ctrl-C while results are written, in the middle of the last file."""
+    replace = Path.replace
+
+    def interrupted(path: Path, target: Path) -> Path:
+        if target.name == "report.html":
+            os.kill(os.getpid(), signal.SIGINT)
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    options = ["--set", "duration=0.05", "--out", str(tmp_path), "--quiet"]
+    assert main(["simulate", "squat", *options]) == FAILED
+    assert capsys.readouterr().err == "fbse: interrupted; no file was left half-written\n"
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == [name for name in FILES if name != "report.html"]
+
+
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_copied_scenario_does_not_overwrite_the_original(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -249,6 +260,7 @@ def test_metrics_tell_the_law_error_of_every_joint(tmp_path: Path):
     assert all(0 < value < 0.02 for value in error.values())
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_run_that_does_not_follow_a_law_says_so(tmp_path: Path, capsys: pytest.CaptureFixture):
     reversing = "robot.effects.extra=!DirectionalFriction {asymmetry: {all: 2.0}}"
     options = ["--set", "duration=1", "--set", reversing, "--out", str(tmp_path)]
@@ -268,6 +280,7 @@ def test_a_run_that_does_not_follow_a_law_says_so(tmp_path: Path, capsys: pytest
     assert said in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_run_that_follows_its_laws_says_no_more(tmp_path: Path, capsys: pytest.CaptureFixture):
     options = ["--set", "duration=1", "--out", str(tmp_path)]
     assert main(["simulate", "hrp2_friction_walk", *options]) == DONE
@@ -354,6 +367,7 @@ def test_simulate_tells_the_errors_of_estimates(tmp_path: Path, capsys: pytest.C
     assert "estimator tick" not in printed
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_recording_of_a_robot_is_enough(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
@@ -390,6 +404,7 @@ def test_a_recording_of_a_robot_is_enough(
     assert "nan" not in printed
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_estimate_without_torques_says_so_in_a_line(
     walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ):

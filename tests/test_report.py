@@ -201,6 +201,7 @@ def log_with_law(*shares: float) -> Log:
     return Log(log.channels | channels, log.meta)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_report_says_where_a_law_is_not_followed(tmp_path):
     log = log_with_law(0.001, 0.25, 0.0, 0.02)
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
@@ -211,6 +212,7 @@ def test_report_says_where_a_law_is_not_followed(tmp_path):
     assert "Thin: the law" in text
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_report):
     log = log_with_law(0.001, 0.009, 0.0, 0.0)
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
@@ -361,7 +363,7 @@ def test_report_replaces_the_old_one_and_leaves_nothing_else(tmp_path):
 
 def test_failed_report_keeps_the_old_one(tmp_path):
     class Broken(Figure):
-        def savefig(self, *_, **__):
+        def draw(self, *_, **__):
             raise RuntimeError("no picture")
 
     path = tmp_path / "report.html"
@@ -375,6 +377,7 @@ def test_failed_report_keeps_the_old_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_report_of_estimates_tells_their_errors(tmp_path):
     log = estimated_log()
     write_run_report(
@@ -400,6 +403,7 @@ def test_report_of_estimates_tells_their_errors(tmp_path):
     assert ">n/a<" not in text
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_report_of_a_recording_tells_what_is_known(tmp_path):
     log = without(estimated_log(), "truth/", "reference/")
     log = dataclasses.replace(

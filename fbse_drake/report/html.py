@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fbse_drake.files import write_text
@@ -118,6 +119,11 @@ def write_report(path: str | Path, report: Report) -> None:
 
 
 def _png_uri(figure: Figure) -> str:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=_DPI)
+    # What `savefig` does, without its first drawing of a figure with a layout engine.
+    canvas, file = FigureCanvasAgg(figure), io.BytesIO()
+    figure.set_dpi(_DPI)
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+    canvas.print_png(file)
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
