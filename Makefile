@@ -15,7 +15,7 @@ walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
 
 test: lint
-	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadgroup
+	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadgroup --no-loadscope-reorder
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
