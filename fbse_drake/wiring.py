@@ -1,6 +1,9 @@
 """Systems of a diagram are wired by name, a port goes where an input of its name is; and let go."""
 
-from collections.abc import Mapping
+import weakref
+from collections.abc import Callable, Mapping
+from types import MethodType
+from typing import Any
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
@@ -32,11 +35,22 @@ def outputs_by_name(system: System) -> dict[str, OutputPort]:
     return {port.get_name(): port for port in ports}
 
 
+def weakly(method: MethodType) -> Callable[..., Any]:
+    """A method of a system as the callback of one of its ports, events or cache entries.
+
+    Drake keeps callbacks where Python's collector does not see them. The bound method itself would
+    keep the system alive for ever, and with it all that its cache and its ports hold.
+    """
+    system, function = weakref.ref(method.__self__), method.__func__
+    return lambda *arguments: function(system(), *arguments)
+
+
 def release(system: System) -> None:
     """Lets go of a system that is done with, and of all in it; none of them can be used any more.
 
     What Python knows of a system refers to its diagram and back, and Python's collector does not
     see through such cycles where a system is written in Python: without this, none is ever freed.
+    A system whose callbacks are not `weakly` held is emptied, and its shell stays.
     """
     if isinstance(system, Diagram):
         for inner in system.GetSystems():

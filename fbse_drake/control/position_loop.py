@@ -11,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.sampling import is_tick
+from fbse_drake.wiring import weakly
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,12 @@ class PositionLoop(LeafSystem):
             self._enabled = self.DeclareVectorInputPort("enabled", n)
         self._held = self.DeclareDiscreteState(n)
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
-        self.torque_command = self.DeclareVectorOutputPort("torque_command", n, self._calc, sources)
+        self.torque_command = self.DeclareVectorOutputPort(
+            "torque_command", n, weakly(self._calc), sources
+        )
         self._holds = time_step < config.period
         if self._holds:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._hold)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._hold))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         if self._holds and not is_tick(context.get_time(), self._period):

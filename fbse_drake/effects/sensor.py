@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake.effects.effect import Effect, Parameter, ResolvedEffect, in_library
 from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
 
 _ANY = (-np.inf, np.inf)
 # How often the effect of a sensor is taken off its signals.
@@ -636,9 +637,9 @@ class SensorEffects(LeafSystem):
         sources = {self.input_port_ticket(port.get_index()) for port in self._readings} | {
             self.xd_ticket()
         }
-        self.DeclareVectorOutputPort("measured", sum(sizes.values()), self._calc, sources)
+        self.DeclareVectorOutputPort("measured", sum(sizes.values()), weakly(self._calc), sources)
         if any(effect.effect.memory_size for effect in effects):
-            self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._remember)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
 
     def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
         joint_state, imu, pad_force = (port.Eval(context) for port in self._readings)

@@ -20,6 +20,7 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
 
 # Share of the last step's change of velocity that is expected of the next: smooth motion would go
 # on with all of it, a joint that is stopped by a contact with none.
@@ -193,10 +194,12 @@ class ExplicitTorque(LeafSystem):
         ended = (self._joint_state, self._net_actuation)
         sources = {self.xd_ticket(), *(self.input_port_ticket(port.get_index()) for port in ended)}
         # It depends on no command: what takes it may command.
-        self._torque_loss = self.DeclareVectorOutputPort("torque_loss", n, self._calc_loss, sources)
+        self._torque_loss = self.DeclareVectorOutputPort(
+            "torque_loss", n, weakly(self._calc_loss), sources
+        )
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
-        self._tick = self.DeclareVectorOutputPort("tick", size, self._calc, sources)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
+        self._tick = self.DeclareVectorOutputPort("tick", size, weakly(self._calc), sources)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._remember))
 
     def _calc_loss(self, context: Context, output: BasicVector) -> None:
         last = context.get_discrete_state().value(0)

@@ -53,6 +53,7 @@ from fbse_drake.estimators.spatial import (
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
+from fbse_drake.wiring import weakly
 
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
@@ -875,12 +876,12 @@ class InvariantBaseFilter(RecursiveEstimator):
         self._model = self._declare_record_input("model", model)
         self._declare_posterior()
         self.DeclareVectorOutputPort(
-            "last_angular_velocity_bias", 3, self._calc_last_bias, {self.xd_ticket()}
+            "last_angular_velocity_bias", 3, weakly(self._calc_last_bias), {self.xd_ticket()}
         )
 
         feet = len(robot.description.sides)
         state = {self.xd_ticket()}
-        self.DeclareVectorOutputPort("last_doubt", 1 + feet, self._calc_last_doubt, state)
+        self.DeclareVectorOutputPort("last_doubt", 1 + feet, weakly(self._calc_last_doubt), state)
 
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:

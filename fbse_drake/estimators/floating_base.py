@@ -34,6 +34,7 @@ from fbse_drake.estimators.spatial import (
     vector,
 )
 from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
 
 _ORIGIN = np.zeros(3)
 
@@ -232,13 +233,15 @@ class FloatingBaseModel(RecursiveEstimator):
         # Never computed anew: an entry of the cache is what a context can keep for itself.
         self._workspace = self.DeclareCacheEntry(
             "workspace",
-            ValueProducer(self._allocate_workspace, ValueProducer.NoopCalc),
+            ValueProducer(weakly(self._allocate_workspace), ValueProducer.NoopCalc),
             {self.nothing_ticket()},
         )
         self._declare_posterior()
         self.DeclareStateOutputPort("at_step_start", self._last)
         size, self._reading = size_of(self.posterior_type), clock.reading
-        self.DeclareVectorOutputPort("over_step", size, self._calc_over_step, self._tickets())
+        self.DeclareVectorOutputPort(
+            "over_step", size, weakly(self._calc_over_step), self._tickets()
+        )
 
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:

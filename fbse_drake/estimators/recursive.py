@@ -27,6 +27,7 @@ from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.records import as_record, parts, size_of
 from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
 
 # Sensors are compared with each other at ticks of at most this [s]. Between rarer readings healthy
 # ones differ as much as faulty ones, and nothing is said.
@@ -142,8 +143,8 @@ class RecursiveEstimator(LeafSystem):
         # Types of the records on its input ports.
         self.record_inputs: dict[str, np.dtype] = {}
         self._remembered: list[RememberedInput] = []
-        self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, self._remember)
-        self.DeclareForcedUnrestrictedUpdateEvent(self._remember)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, weakly(self._remember))
+        self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
 
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:  # noqa: ARG004
@@ -212,11 +213,11 @@ class RecursiveEstimator(LeafSystem):
         self._posterior = self.DeclareVectorOutputPort(
             "posterior",
             size,
-            self._calc_posterior,
+            weakly(self._calc_posterior),
             tickets,
         )
         for name, part in parts(self.posterior_type).items():
-            calc = partial(self._calc_field, part)
+            calc = partial(weakly(self._calc_field), part)
             self.DeclareVectorOutputPort(name, part.stop - part.start, calc, tickets)
 
     def _tickets(self) -> set[DependencyTicket]:

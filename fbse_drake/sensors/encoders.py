@@ -22,6 +22,7 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
 from fbse_drake.signals import Signal, signals_of
+from fbse_drake.wiring import weakly
 
 # Time constant of the smoothing of joint velocities that are differentiated from angles [s]. Short:
 # estimators believe in noise, but not in lag.
@@ -148,10 +149,10 @@ class EncoderReadings(LeafSystem):
         self._last = self.DeclareDiscreteState(np.full(joints, np.nan))
         sources = {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
         self.measured_joint_state = self.DeclareVectorOutputPort(
-            "measured_joint_state", 2 * joints, self._calc, sources
+            "measured_joint_state", 2 * joints, weakly(self._calc), sources
         )
         if config.velocity == "differenced":
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._remember)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._remember))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         config, n, measured = self._config, self._n, output.get_mutable_value()

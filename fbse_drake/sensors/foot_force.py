@@ -32,6 +32,7 @@ from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
 from fbse_drake.signals import Signal, signals_of
+from fbse_drake.wiring import weakly
 
 
 @in_library
@@ -161,7 +162,9 @@ class PadForces(LeafSystem):
             "reaction_forces", Value([SpatialForce.Zero()])
         )
         sources = {self.input_port_ticket(self._reaction_forces.get_index())}
-        self.DeclareVectorOutputPort("pad_force", 3 * len(self._joints), self._calc, sources)
+        self.DeclareVectorOutputPort(
+            "pad_force", 3 * len(self._joints), weakly(self._calc), sources
+        )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         reactions = self._reaction_forces.Eval(context)

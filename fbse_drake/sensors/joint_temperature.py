@@ -36,6 +36,7 @@ from fbse_drake.sensors.encoders import quantize
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
 from fbse_drake.signals import Signal, signals_of
+from fbse_drake.wiring import weakly
 
 
 @in_library
@@ -142,8 +143,8 @@ class WindingThermometers(LeafSystem):
         self._error = self.DeclareVectorInputPort("error", n)
         self._temperature = self.DeclareDiscreteState(np.full(n, config.start))
         sources = {self.input_port_ticket(self._error.get_index()), self.xd_ticket()}
-        self.DeclareVectorOutputPort("measured_temperature", n, self._calc, sources)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, self._warm_up)
+        self.DeclareVectorOutputPort("measured_temperature", n, weakly(self._calc), sources)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._warm_up))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         temperature = context.get_discrete_state(self._temperature).value()

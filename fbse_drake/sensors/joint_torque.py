@@ -18,6 +18,7 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
 from fbse_drake.signals import Signal, signals_of
+from fbse_drake.wiring import weakly
 
 
 @in_library
@@ -63,8 +64,8 @@ class TransmittedTorque(LeafSystem):
         self._torque_loss = self.DeclareVectorInputPort("torque_loss", joints)
         self._last = self.DeclareDiscreteState(joints)
         sources = {self.input_port_ticket(self._torque_loss.get_index()), self.xd_ticket()}
-        self.DeclareVectorOutputPort("link_torque", joints, self._calc, sources)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, self._remember)
+        self.DeclareVectorOutputPort("link_torque", joints, weakly(self._calc), sources)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._remember))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         command = context.get_discrete_state(self._last).value()
