@@ -272,6 +272,17 @@ LAWS: dict[str, tuple[Callable[[], "Physics"], int, Callable[..., np.ndarray]]] 
 
 
 @needs_mujoco
+@pytest.mark.parametrize(("integrator", "step"), [("rk4", 0.0), ("implicitfast", 2.5e-4)])
+def test_rows_of_an_exact_arm_log_leave_nothing(integrator: str, step: float) -> None:
+    """The diagnosis has the torque, and the motion where MuJoCo's own steps have it."""
+    scenario, reference = exact_arm()
+    log = record(Run(scenario, 0, Nothing(), integrator=integrator), reference, "arm")
+    motion = Predictor(scenario, log).motion
+    assert motion.integration_step == pytest.approx(step, abs=1e-5)
+    assert (rms(motion.residual.value) < 2e-5 * rms(log["joint/torque_command"])).all()
+
+
+@needs_mujoco
 @pytest.mark.parametrize("name", LAWS)
 def test_hidden_physics_is_what_a_log_leaves_over(name: str) -> None:
     physics, axis, law = LAWS[name]

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
+from scipy.ndimage import shift
 from scipy.signal import savgol_filter
 
 from fbse_drake.discrepancy.inertial import inertia_addition, inertial_regressor
@@ -18,6 +19,7 @@ from fbse_drake.discrepancy.residual import (
     joint_velocity_noise,
     residual_rows,
     rms,
+    within_steps,
 )
 from fbse_drake.discrepancy.servo import with_command
 from fbse_drake.effects.contact import (
@@ -196,8 +198,7 @@ class Predictor:
         time = motion.start + np.arange(len(velocity) - 1) * motion.period
         at = motion.steps_of(replace(signals, joint_velocity=velocity))
         return JointMotion(
-            # A simulated step's law holds at the velocity of its end.
-            velocity=velocity[1:] if motion.recording.rows == "per_step" else at.joint_velocity,
+            velocity=within_steps(velocity, motion.law_share),
             position=at.joint_position,
             command=at.torque_command,
             time=time[:, None],
@@ -487,12 +488,6 @@ class Predictor:
         force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
         return list(zip(pads.split(force), pads.split(pads.position), strict=True))
 
-    def _rate(self, values: np.ndarray) -> np.ndarray:
-        """Derivative of sampled values, (N, ...): of samples per step that of the step which ended, as velocities are in a simulation."""
-        if self.motion.recording.rows == "per_step":
-            return np.diff(values, axis=0, prepend=values[:1]) / self.motion.period
-        return np.gradient(values, self.motion.period, axis=0)
-
     def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Kinematic rows for soles that move like this.
 
@@ -501,18 +496,28 @@ class Predictor:
         """
         motion, length, period = self.motion, self.motion.length, self.motion.period
         result = np.zeros((len(motion.time), self.rows))
+        # A force that is the mean over the step that ends tells of a sole in that step, a sampled
+        # one of that instant; where that is in a step of the residual, and the motion's rate there.
+        share = motion.motion_share
+        posture, rate = (
+            (2 * share, 3 * share - 1) if motion.recording.rows == "per_step" else (0.5, 0.0)
+        )
         place = result.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
         velocities = []
         for rotation, displacement in motions:
-            angular, linear = self._rate(rotation), self._rate(displacement)
+            turning, moving = (
+                np.diff(values, axis=0, append=values[-1:]) / period
+                for values in (rotation, displacement)
+            )
             g = self.motion.equation.gravity
             # R_WF^T g z for a sole turned by the rotation vector, less g z.
             tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)
-            result[:, place : place + 3] = block_means(angular[:-1], length)
+            change = _later(moving, posture) - _later(moving, posture - 1)
+            result[:, place : place + 3] = block_means(_later(turning, rate)[:-1], length)
             result[:, place + 3 : place + 6] = block_means(
-                tilt[:-1] + np.diff(linear, axis=0) / period, length
+                (_later(tilt, posture) + change / period)[:-1], length
             )
-            velocities.append(block_means(linear[:-1], length))
+            velocities.append(block_means(_later(moving, rate)[:-1], length))
             place += 6
         if len(motions) == 2:
             left, right = (
@@ -548,6 +553,11 @@ def _joined(motion: JointMotion, steps: int) -> JointMotion:
         for name in ("velocity", "position", "command", "time", "load")
     }
     return motion._replace(**joined, time_step=steps * motion.time_step)
+
+
+def _later(values: np.ndarray, samples: float) -> np.ndarray:
+    """Samples (N, 3) so much later, interpolated; the ends are held."""
+    return shift(values, (-samples, 0), order=1, mode="nearest")
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
+from fbse_drake.discrepancy.integration import integration_step
 from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
@@ -214,11 +215,18 @@ class Instants:
     torque_command: np.ndarray
 
 
-def steps(signals: SensorSignals, period: float, rows: str = "per_step") -> Instants:
+def steps(
+    signals: SensorSignals, period: float, rows: str = "per_step", integration_step: float = 0.0
+) -> Instants:
     """Every step between two samples, M = N - 1, see `RecordingConfig.rows`.
 
-    Of samples per step posture, velocity and command count where the step began, accelerations and forces over it; of instantaneous ones
-    all in its middle.
+    Of samples per step the command counts that was held over the step, accelerations and forces are
+    those over it, and posture and velocities those amid it; a simulation has its forces from where
+    its own, semi-implicit steps began, which is half of such a step earlier. Of instantaneous
+    samples all is taken amid the step.
+
+    Args:
+        integration_step: see the function `integration_step`.
     """
     if rows == "instantaneous":
         middle = {name: 0.5 * (values[1:] + values[:-1]) for name, values in vars(signals).items()}
@@ -227,16 +235,23 @@ def steps(signals: SensorSignals, period: float, rows: str = "per_step") -> Inst
             angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
             **middle,
         )
+    share = 0.5 - 0.5 * integration_step / period
     return Instants(
-        joint_position=signals.joint_position[:-1],
-        joint_velocity=signals.joint_velocity[:-1],
+        joint_position=within_steps(signals.joint_position, share),
+        joint_velocity=within_steps(signals.joint_velocity, share),
         joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
-        angular_velocity=signals.angular_velocity[:-1],
+        angular_velocity=within_steps(signals.angular_velocity, share),
         angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
         specific_force=signals.specific_force[1:],
         pad_force=signals.pad_force[1:],
         torque_command=signals.torque_command[:-1],
     )
+
+
+def within_steps(values: np.ndarray, share: float) -> np.ndarray:
+    """Samples (N, ...) interpolated in every step, (N - 1, ...): at its start for a share of 0, at
+    its end for 1."""
+    return (1.0 - share) * values[:-1] + share * values[1:]
 
 
 def block_means(values: np.ndarray, length: int) -> np.ndarray:
@@ -596,6 +611,23 @@ class RecordedMotion:
                 )
         self.start = float(log.time[0])
         self.equation = EquationOfMotion(robot)
+        # Steps in which the motion was integrated [s]: 0 for continuous motion.
+        self.integration_step = 0.0
+        if recording.rows == "per_step":
+            self.integration_step = integration_step(
+                self.signals.joint_position, self.signals.joint_velocity, self.period, self.measured
+            )
+
+    @property
+    def motion_share(self) -> float:
+        """Where in a step its forces have their posture and velocities, as a share of it."""
+        return 0.5 - 0.5 * self.integration_step / self.period
+
+    @property
+    def law_share(self) -> float:
+        """Where in a step the velocity is that friction has: a simulated law holds at the end of
+        its integration step."""
+        return 0.5 + 0.5 * self.integration_step / self.period
 
     @cached_property
     def steps(self) -> Instants:
@@ -603,7 +635,7 @@ class RecordedMotion:
 
     def steps_of(self, signals: SensorSignals) -> Instants:
         """Steps of other signals on the same grid."""
-        return steps(signals, self.period, self.recording.rows)
+        return steps(signals, self.period, self.recording.rows, self.integration_step)
 
     def averages(self, predicted: np.ndarray) -> np.ndarray:
         """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
