@@ -5,6 +5,7 @@ inverted by Newton's method. All functions work on arrays over time. B is the ba
 in B's axes.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -214,12 +215,33 @@ class LegKinematics:
         p = p + R @ self.offsets[6]
         return R @ self.sole, p, _jacobian(axes, origins, p)
 
+    def first_moment(self, q: np.ndarray) -> np.ndarray:
+        """`moment` of `forward` alone, for angles q (N, 6) [rad]."""
+        moment = np.zeros((len(q), 3))
+        for mass, center, (_, position, _, R) in zip(
+            self.masses, self.centers, self._links(q), strict=True
+        ):
+            moment = moment + mass * (position + R @ center)
+        return moment
+
+    def _links(
+        self, q: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Of each link, from base to foot: its joint's place from the joint before, and from the
+        base, and axis, (N, 3) each, and its rotation (N, 3, 3)."""
+        R, position = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
+        for i in range(6):
+            r = R @ self.offsets[i]
+            position = position + r
+            axis = R @ self.axes[i]
+            R = R @ _rotation(self.axes[i], q[:, i])
+            yield r, position, axis, R
+
     def forward(self, q: np.ndarray, v: np.ndarray | None = None) -> LegMotion:
         """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes (N, 6) [rad, rad/s]."""
         samples = len(q)
         v = np.zeros_like(q) if v is None else v
-        R = np.broadcast_to(np.eye(3), (samples, 3, 3))
-        position, axes, origins = np.zeros((samples, 3)), [], []
+        axes, origins = [], []
         # Motion for the given rates and zero joint accelerations, recursed from base to foot.
         omega, alpha, bias = np.zeros((samples, 3)), np.zeros((samples, 3)), np.zeros((samples, 3))
         moment, J_moment, bias_moment = (
@@ -231,15 +253,12 @@ class LegKinematics:
         def carried(r: np.ndarray) -> np.ndarray:
             return bias + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
 
-        for i in range(6):
-            r = R @ self.offsets[i]
-            bias, position = carried(r), position + r
-            axis = R @ self.axes[i]
+        for i, (r, position, axis, R) in enumerate(self._links(q)):
+            bias = carried(r)
             axes.append(axis)
             origins.append(position)
             alpha = alpha + np.cross(omega, axis) * v[:, i, None]
             omega = omega + axis * v[:, i, None]
-            R = R @ _rotation(self.axes[i], q[:, i])
             r = R @ self.centers[i]
             moment = moment + self.masses[i] * (position + r)
             bias_moment = bias_moment + self.masses[i] * carried(r)

@@ -215,7 +215,7 @@ def _inverse_kinematics(
                 raise InputError(_unreachable(plan, side, error)) from None
         com = (
             p_WB
-            + (base_moment + sum(leg.forward(q[side]).moment for side, leg in legs.items()))
+            + (base_moment + sum(leg.first_moment(q[side]) for side, leg in legs.items()))
             / total_mass
         )
         correction = plan.com.position - com
