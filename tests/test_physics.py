@@ -31,7 +31,7 @@ def test_standing_feet_carry_the_weight(run: Run):
 
 
 def test_zmp_of_slow_sway_is_the_planned_one(run: Run):
-    log = run("sway", noise=False)
+    log = run("sway", "duration=5", noise=False)
     assert np.abs(log["truth/zmp"] - log["reference/zmp"])[200:].max() < 0.01
     assert np.ptp(log["truth/zmp"][:, 1]) > 0.08
 
@@ -77,7 +77,8 @@ def test_pad_forces_are_the_contact_forces():
 
 
 def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
-    log = run("squat", "robot.effects.joint_friction=null", "reference.frequency=0.15", noise=False)
+    changes = ("duration=5", "reference.frequency=0.15", "robot.effects.joint_friction=null")
+    log = run("squat", *changes, noise=False)
     assert np.all(log["truth/joint/friction_torque"] == 0)
     feedforward = log["reference/joint/feedforward_torque"]
     added = log["joint/torque_command"] - feedforward
@@ -246,7 +247,8 @@ def test_robot_walks(run: Run, name: str, largest_error: float, seed: int):
 
 def test_com_converges_under_step_halving(run: Run):
     coarse, fine = (
-        run("paper_walk", *changes, noise=False) for changes in ((), ("plant.time_step=0.0005",))
+        run("paper_walk", "duration=4.3", *changes, noise=False)
+        for changes in ((), ("plant.time_step=0.0005",))
     )
     np.testing.assert_allclose(fine.time, coarse.time, atol=1e-12)
     assert np.abs(coarse["truth/com/position"] - fine["truth/com/position"]).max() < 1e-3
