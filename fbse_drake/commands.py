@@ -136,10 +136,12 @@ def _compare(options: argparse.Namespace) -> bool:
 def _diagnose(options: argparse.Namespace) -> bool:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
     with _errors_located(options), _told(console, options.time_limit) as progress:
-        predictor = _checked(scenario, train_and_rest(scenario, log)[0])
+        train = train_and_rest(scenario, log)[0]
+        predictor = _checked(scenario, train)
         inputs = replace(inputs, hygiene=inspect(predictor.motion))
         comparison = compare(predictor)
-        diagnosis = diagnose(predictor, progress=progress)
+        trusted = inputs.hygiene.trusted(scenario, predictor.robot)
+        diagnosis = diagnose(Predictor(trusted, train), progress=progress)
     _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
     with console.status("writing the report"):
         write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)
@@ -162,6 +164,7 @@ def _study(options: argparse.Namespace) -> bool:
             inputs, hygiene=inspect(predictor.motion), tests=tuple(map(str, options.test))
         )
         comparison = compare(predictor)
+        scenario = inputs.hygiene.trusted(scenario, predictor.robot)
         result = study(scenario, train, tests=tests, progress=progress, jobs=options.jobs)
         after = Predictor(result.scenario, train) if result.found else predictor
         completed = (after, compare(after) if result.found else comparison)

@@ -17,8 +17,11 @@ _MANY_GAPS = 0.1
 _STUCK, _STUCK_SAMPLES = 0.25, 20
 # How long a filtered velocity runs on after its joint [s].
 _SETTLING = 0.1
-# A velocity that adds up to less than this while an angle rests may be an offset [rad or m].
-_FAR = 0.02
+# A velocity that adds up to less than this while an angle rests, and to less than an offset of the velocity would, says nothing
+# [rad or m, rad/s or m/s].
+_FAR, _VELOCITY_OFFSET = 0.02, 0.02
+# White noise stays within so many of its standard deviations.
+_NOISE_WIDTH = 10.0
 # Shortest run at its largest value of a channel that is clipped [samples], and the share of the log that such runs need.
 _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
 # A channel whose neighbouring samples are equal this often is sampled more slowly than the log.
@@ -74,9 +77,9 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
     """A channel that repeats itself exactly while the robot moves; one of a joint, while that joint moves."""
     least = max(_STUCK_SAMPLES, round(_STUCK / evidence.period))
     position = evidence.log["joint/position"]
-    # Farther than steps of the encoder, and than what an offset of a velocity adds up to.
-    far = {"joint/position": np.full(len(evidence.joints), _FAR)}
-    far_by_angles = np.maximum(10 * STILL, 10 * evidence.quantum["joint/position"])
+    # Farther than steps and noise of the encoder.
+    steps = 10 * np.maximum(STILL, evidence.quantum["joint/position"])
+    far_by_angles = np.fmax(steps, _NOISE_WIDTH * white_noise(evidence.motion, position))
     velocity = evidence.log.get("joint/velocity", np.zeros_like(position))
     # One count of a velocity may be its offset.
     velocity = np.where(
@@ -93,12 +96,19 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
                 if name == "joint/position"
                 else position
             )
-            moves = travelled / far.get(name, far_by_angles)
-            moves = moves[:, [k]] if name.startswith("joint/") else moves
+            columns = [k] if name.startswith("joint/") else list(range(len(evidence.joints)))
+            travel = travelled[:, columns]
             # A velocity that was filtered still runs on for a while after its joint has come to rest.
             late = settling if name == "joint/position" else 0
             runs = [(a, b) for a, b in _runs(np.diff(values[:, k]) == 0) if b - a >= least + late]
-            runs = [(a, b) for a, b in runs if np.ptp(moves[a + late : b + 1], axis=0).max() > 1]
+            # Farther than what an offset of a velocity adds up to.
+            by_offset = [_FAR + _VELOCITY_OFFSET * (b - a) * evidence.period for a, b in runs]
+            far = by_offset if name == "joint/position" else [far_by_angles[columns]] * len(runs)
+            runs = [
+                (a, b)
+                for (a, b), least in zip(runs, far, strict=True)
+                if (np.ptp(travel[a + late : b + 1], axis=0) > least).any()
+            ]
             if name == "joint/torque_command":
                 # A drive may be off, or at its limit, which is another finding.
                 column = values[:, k]
@@ -237,9 +247,9 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
     return result
 
 
-def _level(
-    motion: RecordedMotion, name: str, values: np.ndarray, unit: str, believed: float
-) -> NoiseLevel:
+def white_noise(motion: RecordedMotion, values: np.ndarray) -> np.ndarray:
+    """White noise of each component of a channel (N, components): standard deviation in the quiet parts of the log, which have no
+    impacts; NaN where it has none."""
     whole = (
         np.convolve(np.diff(motion.log.time) < 1.5 * motion.period, np.ones(_DIFFERENCE), "valid")
         == _DIFFERENCE
@@ -247,13 +257,21 @@ def _level(
     differences = np.diff(values, _DIFFERENCE, axis=0)[whole] / np.sqrt(
         comb(2 * _DIFFERENCE, _DIFFERENCE)
     )
-    # The quiet parts of the log, and the typical component: impacts and trembling joints are no noise of sensors.
     parts = [
         (part**2).mean(axis=0)
         for part in np.array_split(differences, max(1, len(differences) // _QUIET_SAMPLES))
         if len(part)
     ]
-    level = float(np.median(np.sqrt(np.quantile(parts, _QUIET, axis=0)))) if parts else np.nan
+    return (
+        np.sqrt(np.quantile(parts, _QUIET, axis=0)) if parts else np.full(values.shape[1], np.nan)
+    )
+
+
+def _level(
+    motion: RecordedMotion, name: str, values: np.ndarray, unit: str, believed: float
+) -> NoiseLevel:
+    # The typical component: joints that tremble are no noise of sensors.
+    level = float(np.median(white_noise(motion, values)))
     return NoiseLevel(name, level, unit, float(believed))
 
 

@@ -1,17 +1,30 @@
 """Can a recording be believed? What is wrong with its clocks, channels, units and frames, before anybody looks for physics in it.
 
-A log that makes the equation of motion meaningless is refused (`sanity.check_sensors`). What is found here does not stop a diagnosis, but
-says what of it is not to be believed.
+A log that makes the equation of motion meaningless is refused (`sanity.check_sensors`). What is found here says what of a diagnosis is
+not to be believed; torques that are not to be trusted are not explained (`Hygiene.trusted`).
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fbse_drake.discrepancy import channel_checks, model_checks
 from fbse_drake.discrepancy.evidence import Evidence, HygieneFinding, NoiseLevel
 from fbse_drake.discrepancy.residual import RecordedMotion
+from fbse_drake.errors import InputError
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario
 
 _CHECKS = (*channel_checks.CHECKS, *model_checks.CHECKS)
+# What makes the torque of a joint worthless throughout.
+_WHOLE_LOG = (
+    "clock_offset",
+    "dead_torque",
+    "not_a_torque",
+    "swapped_joints",
+    "torque_scale",
+    "torque_sign",
+)
 _ORDER = ("untrustworthy", "warning", "note")
 
 
@@ -25,6 +38,35 @@ class Hygiene:
     @property
     def untrustworthy(self) -> list[HygieneFinding]:
         return [finding for finding in self.findings if finding.severity == "untrustworthy"]
+
+    def untrusted_joints(self, identified: Sequence[str] = ()) -> list[str]:
+        """Joints whose torque, or whose place among the joints, is not to be trusted at any time; `*` for all.
+
+        Args:
+            identified: bodies whose inertia is not trusted: with them no scale of a torque is known.
+        """
+        kinds = [kind for kind in _WHOLE_LOG if not (identified and kind == "torque_scale")]
+        found = [
+            joint
+            for finding in self.untrustworthy
+            if finding.channel.startswith("joint/") and finding.kind in kinds
+            for joint in finding.where or ("*",)
+        ]
+        return list(dict.fromkeys(found))
+
+    def trusted(self, scenario: Scenario, robot: Robot) -> Scenario:
+        """The scenario with nothing fitted to rows of joints whose torque is not to be trusted.
+
+        Raises:
+            InputError: nothing is left that could be explained.
+        """
+        recording, untrusted = scenario.recording, self.untrusted_joints(scenario.identify.inertia)
+        joints = robot.joint_names if "*" in untrusted else untrusted
+        if not robot.has_floating_base and not set(robot.joint_names) - set(joints):
+            reasons = "; ".join(finding.text for finding in self.untrustworthy)
+            raise InputError(f"nothing is left that could be explained: {reasons}")
+        unused = [*recording.unused_rows, *(j for j in joints if j not in recording.unused_rows)]
+        return replace(scenario, recording=replace(recording, unused_rows=unused))
 
     def before(self, outcome: str) -> str:
         """A result with what is not to be trusted of it said first."""

@@ -2,24 +2,34 @@
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, uniform_filter1d
 
-from fbse_drake.discrepancy.channel_checks import CLIPPED_SHARE, SPECTRUM, STILL
+from fbse_drake.discrepancy.channel_checks import SPECTRUM, STILL
 from fbse_drake.discrepancy.evidence import Evidence, HygieneFinding, remark, remarks
 from fbse_drake.discrepancy.residual import Instants, RecordedMotion, rms
 from fbse_drake.discrepancy.sanity import rate_by_legs
+from fbse_drake.discrepancy.torque_checks import check_torque
+from fbse_drake.discrepancy.torque_readings import (
+    FALSE_ALARM,
+    STRETCH,
+    Columns,
+    JointTorques,
+    chance,
+    fitted,
+    gain,
+)
 
 # Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation from which on a delay can be told.
 _LARGEST_OFFSET, _SMALLEST_OFFSET, _CORRELATED = 20, 1.5, 0.7
+# Moments of feet are smoothed over so many samples before they are differenced.
+_SMOOTHED = 11
 # What a delay or a low-pass must take off the mismatch of two channels to be named, as a share of its sum of squares.
 _WORTHWHILE = 0.1
 # Root mean square rate of a joint that moves well [rad/s or m/s].
 _MOVING = 0.05
-# A torque scale that is off by more than a factor of this is no torque; off by more than the smaller it is doubtful.
-_NO_TORQUE, _DOUBTFUL_TORQUE = 3.0, 1.3
 # Two swapped joints leave at most this share of the squared residual when they are swapped back.
 _SWAPPED = 0.5
 _SWAP_BLOCKS = 40
@@ -87,15 +97,50 @@ def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 
 def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """While a sole stands, its leg tells how the base turns."""
+    """While a sole stands, its leg tells how the base turns. So does a sole that rolls or gives way, or an angle that is read too much,
+    look like a clock."""
     if not evidence.robot.has_floating_base:
         return
     motion, at = evidence.motion, evidence.instants
     by_legs, stands = rate_by_legs(motion, at)
     gyro = at.angular_velocity @ motion.equation.R_BI.T
-    yield from _clock(
-        evidence, "imu/angular_velocity", *_offset(by_legs, gyro, stands), "the legs that stand"
+    offset, correlation = _offset(by_legs, gyro, stands)
+    against = "the legs that stand"
+    if not (correlation > _CORRELATED and abs(offset) > _SMALLEST_OFFSET):
+        return
+    if _is_late(evidence, by_legs, gyro, stands, round(offset)):
+        yield from _clock(evidence, "imu/angular_velocity", offset, correlation, against)
+        return
+    seconds = offset * evidence.period
+    text = (
+        f"seems {1e3 * abs(seconds):.3g} ms {'late' if offset > 0 else 'early'} against {against}; this may be its clock, but soles "
+        "that roll or give way, or angles that are read too much, look the same"
     )
+    yield remark("clock_or_sole", "note", "imu/angular_velocity", seconds, "s", text)
+
+
+def _is_late(
+    evidence: Evidence, by_legs: np.ndarray, gyro: np.ndarray, stands: np.ndarray, samples: int
+) -> bool:
+    """Is a gyro (M, 3) so many samples late for sure, whatever mixes its axes and however soles turn with their moments?"""
+    motion = evidence.motion
+    moments = np.hstack([w[:, :3] for w in motion.equation.wrenches(evidence.instants.pad_force)])
+    turning = uniform_filter1d(np.gradient(moments, axis=0), _SMOOTHED, axis=0)
+    values = np.column_stack([by_legs, turning, np.ones(len(gyro))])
+    anything = np.full(values.shape[1], np.inf)
+    columns = Columns(("a sole that turns",) * values.shape[1], values, -anything, anything)
+    inside = stands.copy()
+    inside[:_LARGEST_OFFSET] = inside[len(inside) - _LARGEST_OFFSET :] = False
+    stretch = (np.flatnonzero(inside) * evidence.period / STRETCH).astype(int)
+    chances = [
+        chance(
+            gain(*(fitted(np.roll(rate, -late), columns, inside).left for late in (0, samples))),
+            stretch,
+        )
+        for rate in gyro.T
+    ]
+    # The best of several offsets and axes is the best by chance more often than one.
+    return len(chances) * (2 * _LARGEST_OFFSET + 1) * min(chances) < FALSE_ALARM
 
 
 def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -144,160 +189,14 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
         yield from _clock(evidence, "foot/<side>", offset, 1.0, "what the masses need")
 
 
-@dataclass(frozen=True)
-class _TorqueFit:
-    """Torque of a joint as scale times what the model needs, beside viscous and Coulomb friction and a constant."""
-
-    scale: float
-    deviation: float
-    # Shares of the torque's variance that are explained: by all of it, by what the model needs alone, by velocity alone.
-    explained: float
-    by_model: float
-    by_velocity: float
-
-
-def _fit_torque(torque: np.ndarray, link: np.ndarray, velocity: np.ndarray) -> _TorqueFit:
-    one, direction = np.ones_like(torque), np.tanh(velocity / 0.02)
-    spread = float(((torque - torque.mean()) ** 2).sum())
-
-    def explained(*columns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        X = np.stack([*columns, one], axis=1)
-        theta = np.linalg.lstsq(X, torque)[0]
-        return 1 - float(((torque - X @ theta) ** 2).sum()) / max(spread, 1e-300), theta, X
-
-    share, theta, X = explained(link, velocity, direction)
-    left = torque - X @ theta
-    # What is left lasts: counts as a twentieth as many samples.
-    deviation = np.sqrt(20 * (left**2).mean() * np.linalg.pinv(X.T @ X)[0, 0])
-    return _TorqueFit(
-        float(theta[0]),
-        float(deviation),
-        share,
-        explained(link)[0],
-        explained(velocity, direction)[0],
-    )
-
-
-def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """Scale, clock and nature of the torques."""
-    channel = "joint/torque_command"
-    if channel not in evidence.log:
-        return
-    motion = evidence.motion
-    known = evidence.known[:, 0]
-    torque, link, velocity = (
-        motion.blocks.torque_command[known],
-        evidence.link_torque[known],
-        motion.blocks.joint_velocity[known],
-    )
-    floor = np.nan_to_num(motion.residual.noise_floor[: len(evidence.joints)])
-    raw = evidence.log[channel]
-    scales, duty, offsets = {}, {}, []
-    for k, joint in enumerate(evidence.joints):
-        needed = link[:, k].std()
-        if needed < max(10 * floor[k], 1e-9) or np.ptp(torque[:, k]) == 0:
-            continue
-        fit = _fit_torque(torque[:, k], link[:, k], velocity[:, k])
-        limit = np.abs(raw[:, k]).max()
-        saturates = float((np.abs(raw[:, k]) == limit).mean()) > CLIPPED_SHARE
-        if (
-            saturates
-            and fit.by_velocity > max(fit.by_model, 0.3)
-            and not 1 / _NO_TORQUE < fit.scale < _NO_TORQUE
-        ):
-            duty[joint] = limit
-            continue
-        off = max(fit.scale, 1 / fit.scale) if fit.scale > 0 else np.inf
-        if (
-            fit.explained > 0.5
-            and off > _DOUBTFUL_TORQUE
-            and abs(fit.scale - 1) > 5 * fit.deviation
-        ):
-            scales[joint] = fit.scale
-        if fit.explained > 0.8 and fit.by_model > 0.3:
-            offsets.append(_torque_offset(torque[:, k], link[:, k], velocity[:, k]))
-    doubtful = {
-        joint: scale for joint, scale in scales.items() if 1 / _NO_TORQUE < scale < _NO_TORQUE
-    }
-    hopeless = {joint: scale for joint, scale in scales.items() if joint not in doubtful}
-    text = (
-        "{where} reads {size} times what the model needs: unit, gear ratio or torque constant is wrong, or the model's masses; "
-        "friction cannot be told in its unit"
-    )
-    yield from remarks("torque_scale", "untrustworthy", channel, hopeless, "1", text)
-    yield from remarks("torque_scale", "warning", channel, doubtful, "1", text)
-    text = (
-        "{where} saturates at {size} and follows the velocity rather than what the model needs: this is PWM or voltage, not a "
-        "torque; a motor model makes a torque of it, without one no effect found here is mechanical"
-    )
-    yield from remarks("not_a_torque", "untrustworthy", channel, duty, "1", text)
-    if offsets and abs(offset := float(np.median(offsets))) > 0.5:
-        seconds = offset * motion.length * motion.period
-        agree = np.mean(np.abs(np.array(offsets) - offset) < 0.5) > 0.7
-        if agree and offset > 0:
-            yield from _clock(
-                evidence, channel, seconds / evidence.period, 1.0, "the motion that it makes"
-            )
-        elif agree:
-            text = (
-                f"the motion follows {-1e3 * seconds:.3g} ms behind it; this can be the robot's own delay or lag (TorqueDelay, "
-                "TorqueLag) as well as its clocks"
-            )
-            yield remark("command_ahead", "note", channel, -seconds, "s", text)
-
-
-def _torque_offset(torque: np.ndarray, link: np.ndarray, velocity: np.ndarray) -> float:
-    """By how many blocks a torque comes later than the motion that it makes."""
-    lags = np.arange(-5, 6)
-    inner = slice(5, len(torque) - 5)
-    left = np.array(
-        [
-            1 - _fit_torque(np.roll(torque, -lag)[inner], link[inner], velocity[inner]).explained
-            for lag in lags
-        ]
-    )
-    best = int(left.argmin())
-    if not 0 < best < len(lags) - 1 or left[best] > (1 - _WORTHWHILE) * left[5]:
-        return float(lags[best]) if left[best] <= (1 - _WORTHWHILE) * left[5] else 0.0
-    before, here, after = left[best - 1 : best + 2]
-    return float(lags[best] + 0.5 * (before - after) / (before - 2 * here + after))
-
-
-def check_dead_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """Joints that do not move, and torques that do not answer."""
-    motion = evidence.motion
-    resting = np.ptp(evidence.log["joint/position"], axis=0) < np.maximum(
-        STILL, 3 * evidence.quantum["joint/position"]
-    )
-    at_rest = {
-        joint: float(np.ptp(evidence.log["joint/position"][:, k]))
-        for k, joint in enumerate(evidence.joints)
-        if resting[k]
-    }
+def check_resting_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
+    """Joints that do not move."""
+    travel = np.ptp(evidence.log["joint/position"], axis=0)
+    resting = travel < np.maximum(STILL, 3 * evidence.quantum["joint/position"])
+    at_rest = {joint: float(travel[k]) for k, joint in enumerate(evidence.joints) if resting[k]}
     text = "{where} does not move ({size}); nothing can be said of its friction"
     yield from remarks(
         "no_motion", "note", "joint/position", at_rest, evidence.units["joint/position"], text
-    )
-    if "joint/torque_command" not in evidence.log:
-        return
-    torque = evidence.log["joint/torque_command"]
-    floor = np.nan_to_num(motion.residual.noise_floor[: len(evidence.joints)])
-    needed = evidence.link_torque.std(axis=0)
-    dead = {
-        joint: float(np.ptp(torque[:, k]))
-        for k, joint in enumerate(evidence.joints)
-        if needed[k] > 10 * floor[k]
-        and needed[k] > 0
-        and np.ptp(torque[:, k]) < 0.05 * np.ptp(evidence.link_torque[:, k])
-    }
-    text = "{where} moves but its torque does not ({size}); the channel is dead, whatever is found in this joint"
-    yield from remarks(
-        "dead_torque",
-        "untrustworthy",
-        "joint/torque_command",
-        dead,
-        evidence.units["joint/torque_command"],
-        text,
     )
 
 
@@ -320,7 +219,9 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
         left = np.where(known, motion.equation.residual(instants) / scale, 0.0)
         return float((left**2).sum())
 
-    def swapped(names: Iterable[str], first: list[int], second: list[int]) -> Instants:
+    def swapped(
+        at: Instants, names: Iterable[str], first: list[int], second: list[int]
+    ) -> Instants:
         order = np.arange(n)
         order[first], order[second] = second, first
         return replace(at, **{name: getattr(at, name)[:, order] for name in names})
@@ -335,11 +236,13 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
         if "torque_command" in channels and "joint/torque_command" not in evidence.log:
             continue
         after, (first, second) = min(
-            ((score(swapped(channels, *pair)), pair) for pair in pairs),
+            ((score(swapped(at, channels, *pair)), pair) for pair in pairs),
             key=lambda one: one[0],
             default=(np.inf, ([], [])),
         )
-        if after < _SWAPPED * before:
+        if after < _SWAPPED * before and _fits_better(
+            evidence, swapped(motion.blocks, channels, first, second), [*first, *second]
+        ):
             names = [evidence.joints[k] for k in (*first, *second)]
             text = (
                 f"with {' and '.join(names) if len(names) == 2 else 'the legs'} in each other's place the error falls to "
@@ -347,6 +250,22 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
             )
             yield remark("swapped_joints", "untrustworthy", what, after / before, "1", text, names)
             return
+
+
+def _fits_better(evidence: Evidence, other: Instants, places: list[int]) -> bool:
+    """Do the torques of some joints fit significantly better in another order, and none of them worse, whatever friction, inertia or
+    offsets they may have? Without torques there is nothing to doubt it by."""
+    if "joint/torque_command" not in evidence.log:
+        return True
+    recorded, rival = JointTorques(evidence), JointTorques(evidence, other)
+    gains = []
+    for k in places:
+        left = [t.as_recorded(k, t.columns(k, everything=True)).left for t in (recorded, rival)]
+        gains.append(gain(*left))
+        if chance(-gains[-1], recorded.stretches(k)) < FALSE_ALARM:
+            return False
+    stretch = np.concatenate([recorded.stretches(k) for k in places])
+    return chance(np.concatenate(gains), stretch) < FALSE_ALARM
 
 
 def _zero_prediction(motion: RecordedMotion, at: Instants) -> np.ndarray:
@@ -486,7 +405,7 @@ CHECKS = (
     check_gyro_clock,
     check_force_clock,
     check_torque,
-    check_dead_joints,
+    check_resting_joints,
     check_swapped_joints,
     check_weight,
     check_force_frames,

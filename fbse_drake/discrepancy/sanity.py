@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 from pydrake.multibody.tree import RevoluteJoint
 
+from fbse_drake.discrepancy.evidence import Evidence
 from fbse_drake.discrepancy.residual import Instants, RecordedMotion
+from fbse_drake.discrepancy.torque_checks import check_torque
 from fbse_drake.errors import InputError
 
 # Gravity on the IMU and the weight on the feet may be off by this share; an error of calibration is an effect of the library.
 _TOLERANCE = 0.3
-# Joints whose model torque is smaller than this [Nm] say nothing about the sign of their torque.
-_SMALLEST_TORQUE = 3.0
+# A torque that is so many times what the model needs is in another unit.
+_ANOTHER_UNIT = 20.0
 # Angles beyond this, or this many times as large as the joint's limits and beyond them by so much, are no angles in radians [rad].
 _LARGEST_ANGLE, _BEYOND_LIMITS, _BEYOND = 4 * np.pi, 3.0, 1.0
 # A base that turns less than this, root mean square, says nothing about its gyroscope [rad/s].
@@ -175,19 +177,13 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
 
 
 def _check_torque(motion: RecordedMotion) -> None:
-    n = len(motion.robot.joint_names)
-    if "joint/torque_command" not in motion.log:
-        return
-    command = motion.blocks.torque_command
-    link = command - motion.residual.value[:, :n]
-    for k in np.flatnonzero(np.sqrt((link**2).mean(axis=0)) > _SMALLEST_TORQUE):
-        slope = float((link[:, k] * command[:, k]).sum() / (link[:, k] ** 2).sum())
-        joint = motion.robot.joint_names[k]
-        if slope < -0.3:
-            raise InputError(
-                f"channel joint/torque_command: {joint} pulls against what the model needs ({slope:.2g} times); its sign is reversed"
-            )
-        if not slope < 20:
-            raise InputError(
-                f"channel joint/torque_command: {joint} reads {slope:.3g} times what the model needs; its unit is wrong (Nm)"
-            )
+    """Torques whose sign is wrong, or whose unit is another."""
+    for finding in check_torque(Evidence(motion)):
+        if finding.kind == "torque_sign":
+            raise InputError(f"channel {finding.text}")
+        if finding.kind == "torque_scale" and finding.severity == "untrustworthy":
+            worst, size = finding.where[0], finding.size
+            if size > _ANOTHER_UNIT:
+                raise InputError(
+                    f"channel {finding.channel}: {worst} reads {size:.3g} times what the model needs; its unit is wrong (Nm)"
+                )

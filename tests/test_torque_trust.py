@@ -1,0 +1,249 @@
+"""What is said of torques that are not what they are called, and what is not said where a machine's own physics looks alike."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded_arm import ARM, PENDULUM, Course, Machine
+
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.evidence import HygieneFinding
+from fbse_drake.discrepancy.hygiene import Hygiene, inspect
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.sanity import check_sensors
+from fbse_drake.discrepancy.torque_readings import chance, gain
+from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.errors import InputError
+from fbse_drake.log import Log
+
+AXIS = 1
+TORQUE_KINDS = {
+    "clock_offset",
+    "dead_torque",
+    "not_a_torque",
+    "swapped_joints",
+    "torque_or_model",
+    "torque_scale",
+    "torque_sign",
+}
+
+
+def said(machine: Machine, log: Log) -> list[HygieneFinding]:
+    """What is said of the torques."""
+    found = inspect(machine.predictor(log).motion).findings
+    return [finding for finding in found if finding.kind in TORQUE_KINDS]
+
+
+def only(found: list[HygieneFinding]) -> HygieneFinding:
+    assert len(found) == 1, [finding.text for finding in found]
+    return found[0]
+
+
+@pytest.fixture(scope="module")
+def arm() -> Course:
+    return ARM.course(1)
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Course:
+    return PENDULUM.course(1)
+
+
+def rubbing(course: Course) -> np.ndarray:
+    """Torques with Coulomb friction, a sixth of what each joint needs."""
+    return course.torque + np.tanh(course.velocity / 0.01) * course.torque.std(axis=0) / 6
+
+
+def of_one(
+    course: Course, change: Callable[[np.ndarray], np.ndarray], joint: int = AXIS
+) -> np.ndarray:
+    """Torques of which one joint's is another."""
+    torque = course.torque.copy()
+    torque[:, joint] = change(torque[:, joint])
+    return torque
+
+
+def shifted(course: Course, torque: np.ndarray, seconds: float) -> np.ndarray:
+    """Torques that much later."""
+    at = course.time - seconds
+    return np.stack([np.interp(at, course.time, column) for column in torque.T], axis=1)
+
+
+def test_a_lost_sign_is_noticed_in_every_joint(arm: Course, pendulum: Course) -> None:
+    for machine, course in ((ARM, arm), (PENDULUM, pendulum)):
+        for torque in (course.torque, rubbing(course)):
+            log = machine.log(course, torque, read=np.abs)
+            finding = only(said(machine, log))
+            assert (finding.kind, finding.severity) == ("torque_sign", "untrustworthy")
+            assert "sign is lost" in finding.text
+            assert len(finding.where) == len(log.joints)
+            with pytest.raises(InputError, match="sign is lost"):
+                check_sensors(machine.predictor(log).motion)
+
+
+def test_a_reversed_sign_is_told_from_a_lost_one(arm: Course, pendulum: Course) -> None:
+    for machine, course, joint in ((ARM, arm, AXIS), (PENDULUM, pendulum, 0)):
+        log = machine.log(course, of_one(course, np.negative, joint))
+        finding = only(said(machine, log))
+        assert finding.where == (log.joints[joint],)
+        assert finding.size == pytest.approx(-1, abs=0.02)
+        with pytest.raises(InputError, match="sign is reversed"):
+            check_sensors(machine.predictor(log).motion)
+
+
+def test_a_dead_channel_is_dead_and_nobody_is_swapped(arm: Course, pendulum: Course) -> None:
+    """Its own noise is all that it has, which may be a sixth of the torque's range."""
+    for machine, course, joint in ((ARM, arm, AXIS), (PENDULUM, pendulum, 0)):
+        finding = only(said(machine, machine.log(course, of_one(course, np.zeros_like, joint))))
+        assert (finding.kind, finding.where) == ("dead_torque", (machine.joints[joint],))
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.6, 1.6, 5.0])
+def test_a_scale_is_asserted_where_nothing_else_explains_it(arm: Course, scale: float) -> None:
+    """Axis 2 drives all others: neither inertia nor springs of its own make its torque larger."""
+    finding = only(said(ARM, ARM.log(arm, of_one(arm, lambda torque: scale * torque))))
+    assert finding.kind == "torque_scale"
+    assert finding.where == ("axis_2",)
+    assert finding.size == pytest.approx(scale, rel=0.02)
+    hopeless = not 1 / 3 < scale < 3
+    assert finding.severity == ("untrustworthy" if hopeless else "warning")
+
+
+def test_a_pendulum_s_scale_may_be_its_weight(pendulum: Course) -> None:
+    """A heavier or longer weight needs a torque in proportion: nothing tells it from another unit."""
+    finding = only(said(PENDULUM, PENDULUM.log(pendulum, 1.6 * pendulum.torque)))
+    assert (finding.kind, finding.severity) == ("torque_or_model", "note")
+    assert finding.size == pytest.approx(1.6, rel=0.02)
+    assert "a load" in finding.text
+
+
+def test_missing_rotor_inertia_is_no_torque_constant() -> None:
+    heavier = tuple(3 * inertia for inertia in ARM.rotor_inertia)
+    finding = only(said(ARM, ARM.log(ARM.course(1, heavier))))
+    assert (finding.kind, finding.severity) == ("torque_or_model", "note")
+    assert "reflected inertia" in finding.text
+
+
+@pytest.mark.parametrize("cause", ["counterbalance", "bungee", "offset"])
+def test_what_the_model_lacks_is_no_reversed_sign_and_no_swap(
+    arm: Course, pendulum: Course, cause: str
+) -> None:
+    for machine, course, joint in ((ARM, arm, AXIS), (PENDULUM, pendulum, 0)):
+        angle, own = course.position[:, joint], course.torque[:, joint]
+        pull = {
+            "counterbalance": -1.3 * np.abs(own).max() * np.cos(angle - 0.2),
+            "bungee": -3 * own.std() * np.maximum(angle, 0.0),
+            "offset": 0.0,
+        }[cause]
+        moved = course.position.copy()
+        moved[:, joint] += 0.3 * (cause == "offset")
+        recorded = replace(course, position=moved)
+        torque = of_one(recorded, lambda torque, pull=pull: torque + pull, joint)
+        log = machine.log(recorded, torque)
+        check_sensors(machine.predictor(log).motion)
+        assert {finding.severity for finding in said(machine, log)} <= {"note"}
+
+
+@pytest.mark.parametrize("late", [-0.02, -0.008, 0.008, 0.02])
+def test_torque_that_is_late_or_early_whatever_rubs(arm: Course, late: float) -> None:
+    finding = only(
+        [
+            finding
+            for finding in inspect(
+                ARM.predictor(ARM.log(arm, shifted(arm, rubbing(arm), late))).motion
+            ).findings
+            if finding.kind in ("clock_offset", "command_ahead")
+        ]
+    )
+    assert finding.kind == ("clock_offset" if late > 0 else "command_ahead")
+    assert finding.severity == ("untrustworthy" if late > 0 else "note")
+    assert finding.size == pytest.approx(abs(late), rel=0.1)
+
+
+@pytest.mark.parametrize("machine", [ARM, PENDULUM], ids=["arm", "pendulum"])
+def test_good_torques_with_friction_are_good(machine: Machine) -> None:
+    for seed in range(2):
+        course = machine.course(seed)
+        assert said(machine, machine.log(course, rubbing(course), seed)) == []
+
+
+def test_saturated_torque_is_clipped_and_of_no_other_scale(arm: Course) -> None:
+    limit = 0.6 * np.abs(arm.torque[:, AXIS]).max()
+
+    def clipped(torque: np.ndarray) -> np.ndarray:
+        limits = np.where(np.arange(torque.shape[1]) == AXIS, limit, np.inf)
+        return np.clip(torque, -limits, limits)
+
+    log = ARM.log(arm, read=clipped)
+    assert said(ARM, log) == []
+    assert "clipped" in {f.kind for f in inspect(ARM.predictor(log).motion).findings}
+
+
+def test_chances_are_what_they_say() -> None:
+    """Of two readings that are equally good the one is called better than the other as often as stated."""
+    random, blocks, alarms = np.random.default_rng(3), 300, []
+    stretch = np.arange(blocks) // 15
+    for _ in range(2000):
+        # Errors that last, of changing size, as long as a stretch or less.
+        drift = np.repeat(random.standard_normal((2, blocks // 5)), 5, axis=1)
+        size = np.repeat(random.uniform(0.5, 1.5, blocks // 15), 15)
+        common = random.standard_normal(blocks)
+        before, after = size * (common + 0.5 * drift)
+        alarms.append(chance(gain(before, after), stretch))
+    for level in (0.2, 0.05, 0.01):
+        # Three deviations of a count of 2000; one of the two has to seem better.
+        expected = level + 3 * np.sqrt(level / 2000)
+        assert 0.3 * level < np.mean(np.array(alarms) < level) < expected
+
+
+def test_rows_that_are_not_to_be_trusted_are_not_explained(arm: Course) -> None:
+    """A dead torque is no motor of which a share of -700 % arrives; friction of its neighbour is found all the same."""
+    torque = of_one(arm, np.zeros_like)
+    torque[:, 2] += 6.0 * np.tanh(arm.velocity[:, 2] / 0.01)
+    log = ARM.log(arm, torque)
+    predictor = ARM.predictor(log)
+    hygiene = inspect(predictor.motion)
+    assert hygiene.untrusted_joints() == ["axis_2"]
+    trusted = hygiene.trusted(ARM.scenario, predictor.robot)
+    effects = [CoulombFriction, ViscousFriction]
+    diagnosis = diagnose(Predictor(trusted, log), effects)
+    assert {target for f in diagnosis.ranking for target in f.targets} == {"axis_3"}
+
+
+def test_where_no_torque_is_to_be_trusted_nothing_is_explained(pendulum: Course) -> None:
+    predictor = PENDULUM.predictor(PENDULUM.log(pendulum, 0 * pendulum.torque))
+    hygiene = inspect(predictor.motion)
+    with pytest.raises(InputError, match=r"nothing is left that could be explained: .*dead"):
+        hygiene.trusted(PENDULUM.scenario, predictor.robot)
+    good = Hygiene().trusted(PENDULUM.scenario, predictor.robot)
+    assert good.recording == PENDULUM.scenario.recording
+
+
+def test_a_pendulum_that_is_held_still_is_not_stuck(pendulum: Course) -> None:
+    """Its angle has noise while its torque is held, or steps while a tachometer has an offset."""
+    held = slice(600, 1100)
+    random = np.random.default_rng(5)
+    log = PENDULUM.log(pendulum)
+    position, torque = (log[f"joint/{name}"].copy() for name in ("position", "torque_command"))
+    position[held], torque[held] = position[held.start], torque[held.start]
+    noisy = position + 2e-3 * random.standard_normal(position.shape)
+    coarse = 1.5e-3 * np.rint(position / 1.5e-3)
+    velocity = log["joint/velocity"].copy()
+    velocity[held] = 0.015 + 5e-4 * random.standard_normal(velocity[held].shape)
+    for angles in (noisy, coarse):
+        channels = {
+            "joint/position": angles,
+            "joint/velocity": velocity,
+            "joint/torque_command": torque,
+        }
+        found = inspect(
+            PENDULUM.predictor(replace(log, channels=log.channels | channels)).motion
+        ).findings
+        assert "stuck" not in {finding.kind for finding in found}
+    # An angle that stays where it is while the joint moves is stuck.
+    stuck = log["joint/position"].copy()
+    stuck[held] = stuck[held.start]
+    changed = replace(log, channels=log.channels | {"joint/position": stuck})
+    found = inspect(PENDULUM.predictor(changed).motion).findings
+    assert "stuck" in {finding.kind for finding in found}
