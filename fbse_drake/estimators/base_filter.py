@@ -58,7 +58,8 @@ from fbse_drake.wiring import weakly
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
 # its orientation.
-_ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = range(0, 18, 3)
+# (numpy integers: of a Python integer the value is part of the types that a function is compiled for.)
+_ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = np.arange(0, 18, 3)
 # What a standing foot tells.
 _FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
