@@ -64,7 +64,7 @@ def plain_least_squares(
         return theta
 
     every = np.ones(len(y), dtype=bool)
-    scale = white.scale(white.sse)
+    scale = np.ones(ROWS)
     for _ in range(3):
         left = y - X @ solved(every, scale)
         scale = np.maximum((left**2).sum(axis=0) / white.count, 1.0)

@@ -15,7 +15,7 @@ from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
-from fbse_drake.discrepancy.refinement import added, consistent
+from fbse_drake.discrepancy.refinement import added, consistent, remeasured
 from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.selection import best_additions, select
 from fbse_drake.discrepancy.significance import Significance
@@ -31,8 +31,6 @@ EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
 # many times the noise.
 _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
-# Bodies lighter than this share of the robot are not suspected.
-_LIGHT_BODY = 0.03
 
 
 @dataclass(frozen=True)
@@ -117,15 +115,6 @@ class Diagnosis:
         return [finding for finding in self.ranking if finding.too_small]
 
 
-def suspected_bodies(predictor: Predictor) -> list[str]:
-    """Bodies whose masses the diagnosis tries: those that weigh something."""
-    robot = predictor.robot
-    total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-    return [
-        name for name in robot.body_names if robot.body(name).default_mass() > _LIGHT_BODY * total
-    ]
-
-
 def plausible_effects(predictor: Predictor) -> list[type[Effect]]:
     """The library but for what the scenario rules out, and for what acts in the joints of a log without torques."""
     torques = "joint/torque_command" in predictor.motion.log
@@ -155,14 +144,13 @@ def diagnose(
         progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
     """
     predictor, averaging = averaged_to_bandwidth(predictor)
-    suspected = suspected_bodies(predictor)
     tried = plausible_effects(predictor) if effects is None else effects
-    dictionary = Dictionary(predictor, tried, suspected, progress)
+    dictionary = Dictionary(predictor, tried, progress)
     first, partial = Fits(dictionary), None
     before = first.white.sse
     path, proposals = [first.explain([])], Proposals(first)
     try:
-        for path, proposals in select(first):  # noqa: B007 - the last one counts.
+        for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
             progress("looking for what explains more")
     except Interrupted as stop:
         partial = str(stop)
@@ -183,7 +171,7 @@ def diagnose(
     try:
         if partial is None:
             rivals = _rivals(proposals, final)
-            experiments = Experiments(predictor.scenario, suspected)
+            experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
                 statuses[effect.__name__] = _status(fits, final, effect, rivals, experiments)
@@ -217,7 +205,8 @@ def diagnose(
 
 
 def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
-    """For each member: explanations with another effect in its place, best first; one for each effect and targets."""
+    """For each member: explanations with another effect in its place, best first; one for each effect and targets. The same effect is a rival on
+    another body."""
     result = {}
     for k, member in enumerate(final.candidates):
         rest = proposals.fits.explain([c for c in final.candidates if c is not member])
@@ -226,8 +215,16 @@ def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanat
             for e in best_additions(proposals, rest, member.signature.rows)
             if len(e.candidates) == len(final.candidates)
         ]
-        result[k] = [e for e in additions if e.candidates[-1].effect is not member.effect]
+        result[k] = [e for e in additions if _rival_name(e.candidates[-1], member)]
     return result
+
+
+def _rival_name(rival: Candidate, member: Candidate) -> str:
+    """What a rival of a member is called: another effect, or the same on another body; empty if it is neither."""
+    if rival.effect is not member.effect:
+        return rival.name
+    on_bodies = rival.effect.acts_on == "body" and rival.targets != member.targets
+    return f"{rival.name} on {rival.targets[0]}" if on_bodies else ""
 
 
 def _sized(finding: Finding, tolerance: float) -> Finding:
@@ -255,7 +252,9 @@ def _ranking(
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
         equal = tuple(
-            dict.fromkeys(e.candidates[-1].name for e in rivals[k] if _equals(fits, e, final))
+            dict.fromkeys(
+                _rival_name(e.candidates[-1], member) for e in rivals[k] if _equals(fits, e, final)
+            )
         )
         finding = finding_of(white, rest, final, member, equal, chosen=True)
         findings.append(replace(finding, share=shares[member]))

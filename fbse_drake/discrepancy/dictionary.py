@@ -2,12 +2,13 @@
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
 
-from fbse_drake.discrepancy.inertial import untrusted_bodies, untrusted_inertia
+from fbse_drake.discrepancy.inertial import UntrustedInertia, untrusted_bodies, untrusted_inertia
 from fbse_drake.discrepancy.memory import Memory
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import Signature, WhitenedResidual
@@ -41,14 +42,12 @@ class Dictionary:
         self,
         predictor: Predictor,
         effects: Collection[type[Effect]],
-        bodies: Sequence[str] = (),
         progress: Progress = silent,
     ):
         """Nothing is predicted before it is asked for.
 
         Args:
             effects: what is tried.
-            bodies: whose masses are tried.
             progress: is told what is being done with the dictionary, too.
         """
         self.predictor, self.progress = predictor, progress
@@ -59,16 +58,27 @@ class Dictionary:
         self.travel = np.ptp(predictor.motion.signals.joint_position, axis=0)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
-        self._bodies = [body for body in bodies if body not in untrusted]
+        self._untrusted = set(untrusted)
         # Inertial parameters that are not trusted are fitted in every explanation, in directions that the log shows.
         self.inertia = untrusted_inertia(predictor.motion, untrusted) if untrusted else None
         if self.inertia is not None:
             # Friction is tried as a whole: as long as half of it is missing, inertia is fitted to that half.
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
-            self.directions = self.inertia.visible_directions(WhitenedResidual(predictor.residual))
-            self.inertia_signature = self.inertia.signature(self.directions)
+            self._look_at(self.inertia)
         self._grids: dict[type[JointTorqueEffect], np.ndarray] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
+
+    def _look_at(self, inertia: UntrustedInertia) -> None:
+        """Finds the directions of inertia that the log shows."""
+        self.inertia = inertia
+        self.directions = inertia.visible_directions(WhitenedResidual(self.predictor.residual))
+        self.inertia_signature = inertia.signature(self.directions)
+
+    def with_inertia(self, inertia: UntrustedInertia) -> "Dictionary":
+        """The same with inertia that is measured otherwise."""
+        changed = copy(self)
+        changed._look_at(inertia)
+        return changed
 
     def parameters(self, effect: type[Effect], target: str) -> Mapping[str, Parameter]:
         """An effect's parameters in the units of a target."""
@@ -98,23 +108,16 @@ class Dictionary:
     @cached_property
     def fixed(self) -> list[FixedColumns]:
         """All candidates that are no joint torque effects: one for each target that moves the residual."""
-        targets = {
-            "joint": self.joints,
-            "foot": self.predictor.robot.description.sides,
-            "body": self._bodies,
-            "robot": ["robot"],
-        }
         result = []
         for k, effect in enumerate(self.effects):
             self.progress("predicting what each effect would do", k / len(self.effects))
             if issubclass(effect, JointTorqueEffect):
                 continue
             # Their nonlinear parameters keep the default.
-            for target in targets[effect.acts_on]:
+            for target in self._targets(effect):
                 usual = self.usual_at(effect, target)
                 raw = self.predictor.signature(effect, target, usual)
-                lowest = [p.bounds[0] for p in effect.parameters.values() if p.linear]
-                raw = replace(raw, lowest=np.array(lowest))
+                raw = replace(raw, lowest=effect.lowest_values(self.predictor.robot, target))
                 if len(raw.rows):
                     noise = (
                         self.predictor.noise_in(effect, target, raw)
@@ -123,6 +126,17 @@ class Dictionary:
                     )
                     result.append(FixedColumns(effect, target, usual, raw, noise))
         return result
+
+    def _targets(self, effect: type[Effect]) -> Sequence[str]:
+        """What an effect is tried on. Of bodies whose inertia is not trusted all is fitted anyhow."""
+        if effect.acts_on == "body":
+            suspected = effect.suspected_bodies(self.predictor.robot)
+            return [body for body in suspected if body not in self._untrusted]
+        return {
+            "joint": self.joints,
+            "foot": self.predictor.robot.description.sides,
+            "robot": ["robot"],
+        }[effect.acts_on]
 
     def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
         """First grid of an effect's nonlinear values for each joint, (m, G, n)."""

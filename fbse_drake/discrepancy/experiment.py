@@ -113,14 +113,13 @@ def _standing_forces(equation: EquationOfMotion, at: Instants, support: np.ndarr
 class Experiments:
     """Motions that a robot could make, and what each would show."""
 
-    def __init__(self, scenario: Scenario, bodies: Sequence[str]):
+    def __init__(self, scenario: Scenario):
         """Nothing is planned before it is asked for.
 
         Args:
             scenario: whose model and sensors make the motions of the shipped scenarios.
-            bodies: whose masses may be asked about.
         """
-        self._scenario, self._bodies = scenario, list(bodies)
+        self._scenario = scenario
 
     @cached_property
     def _predictors(self) -> dict[str, Predictor]:
@@ -141,7 +140,7 @@ class Experiments:
 
     def _fits(self, effect: type[Effect]) -> dict[str, Fits]:
         return {
-            name: Fits(Dictionary(predictor, [effect], self._bodies), self._whitened[name])
+            name: Fits(Dictionary(predictor, [effect]), self._whitened[name])
             for name, predictor in self._predictors.items()
         }
 

@@ -313,6 +313,21 @@ class Fits:
         spurious = _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
         return Candidate(effect, group, parameters, nonlinear, signature(whitened), raw, spurious)
 
+    def about(self, candidate: Candidate, values: np.ndarray) -> Candidate:
+        """A candidate that is no joint torque effect, made linear about values of its linear parameters.
+
+        Raises:
+            InputError: no body has these values.
+        """
+        raw = self.dictionary.predictor.signature_near(
+            candidate.effect,
+            candidate.targets[0],
+            values,
+            candidate.nonlinear,
+            candidate.raw,
+        )
+        return replace(candidate, source=raw, signature=self.white.whiten_signature(raw))
+
     def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
         """Whitened, in the order of the explanation's parameters."""
         return (

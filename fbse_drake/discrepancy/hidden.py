@@ -32,8 +32,6 @@ _SHARE = 1 / 8
 _HALVINGS = 6
 # Step at which the reference is looked at [s].
 _COARSE = 0.01
-# Bodies lighter than this share of the robot hide nothing.
-_LIGHT_BODY = 0.03
 
 
 @dataclass(frozen=True)
@@ -89,6 +87,11 @@ def _signed(name: str) -> Values:
 
 def _vector(names: Sequence[str]) -> Values:
     return lambda draw, size: draw.vector(size, names)
+
+
+def _load(draw: Draw, size: float) -> dict[str, float]:
+    """A point mass near the origin of its body."""
+    return {"mass": size} | draw.vector(draw.between(0.02, 0.1), "xyz")
 
 
 def _sharp(draw: Draw) -> dict[str, float]:
@@ -154,6 +157,7 @@ _RECIPES = {
     "ReflectedInertia": Recipe((0.02, 0.4), _one("inertia"), everywhere=True),
     "BodyMass": Recipe((0.2, 4.0), _one("mass")),
     "BodyCentreOfMass": Recipe((4e-3, 3e-2), _vector("xyz")),
+    "Payload": Recipe((0.3, 4.0), _load),
     "GroundSlope": Recipe((4e-3, 4e-2), _vector("xy")),
     "GroundCompliance": Recipe((5e-7, 5e-6), _one("compliance")),
     "FootCreep": Recipe((1e-3, 2e-2), _one("creep")),
@@ -358,18 +362,7 @@ def _targets(
     if effect.acts_on == "foot":
         return (str(random.choice(names.sides)),)
     if effect.acts_on == "body":
-        masses = {body: robot.plant.GetBodyByName(body).default_mass() for body in robot.body_names}
-        return (
-            str(
-                random.choice(
-                    [
-                        body
-                        for body, mass in masses.items()
-                        if mass > _LIGHT_BODY * sum(masses.values())
-                    ]
-                )
-            ),
-        )
+        return (str(random.choice(effect.suspected_bodies(robot))),)
     chance, joint = (
         random.random(),
         str(random.choice([joint for joint in robot.joint_names if joint not in taken])),

@@ -13,7 +13,7 @@ from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
-from fbse_drake.discrepancy.refinement import consistent
+from fbse_drake.discrepancy.refinement import consistent, remeasured
 from fbse_drake.discrepancy.study import ModelError, model_error
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
@@ -58,7 +58,7 @@ def identify(
         )
     progress("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
-    fits = Fits(Dictionary(predictor, [], progress=progress))
+    fits = remeasured(Fits(Dictionary(predictor, [], progress)))
     raw, alone = fits.white.sse, fits.explain([])
     progress("fitting plain friction")
     fitted, inertia = consistent(fits, Proposals(fits).plain_friction())

@@ -9,10 +9,13 @@ Parameters are measured in the body's own size. With the model's pseudo-inertia 
 of Lee and Park (2018) to first order. The model is believed with a standard deviation of 1 in each: within about its own size. What the
 log does not show stays there. A body is physical just if 1 + Z is positive semidefinite (Wensing, Kim and Slotine 2018): a convex
 constraint.
+
+A body that the log shows to be larger than the model's by many of these standard deviations (a hand that holds a load) was not believed
+in rightly: it is measured anew, in the mean of both sizes.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -50,6 +53,8 @@ _LEAST_SHARE = 1e-3
 IDENTIFIED = 0.1
 # Half the width of a 95 % interval of a normal distribution, in standard deviations.
 _QUANTILE = 1.96
+# A coordinate of a body beyond so many standard deviations of what is believed of it is in conflict with that belief.
+_CONFLICT = 4.0
 # Terms below this share of the largest one are not written out.
 _SMALLEST_TERM = 0.01
 
@@ -159,18 +164,20 @@ _BASIS = _symmetric_basis()
 _FROM_PSEUDO = np.linalg.pinv(pseudo_inertia(np.eye(10)).reshape(10, 16).T)
 
 
-def body_coordinates(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def body_coordinates(parameters: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates z of one body.
 
     Args:
         parameters: of the model's body, phi0, (10,).
+        size: of the body in whose size changes are measured, (10,).
 
     Returns:
-        T in phi = phi0 + T z, shape (10, 10), columns in the parameters' units; and L^-1 J0 L^-T, (4, 4), which is 1 but for a body that is
-        less spread than any body is taken to be.
+        T in phi = phi0 + T z, shape (10, 10), columns in the parameters' units; and L^-1 J0 L^-T, (4, 4), which is 1 for a body that is
+        measured in its own size, unless it is less spread than any body is taken to be.
     """
     J0 = pseudo_inertia(parameters)
-    L = np.linalg.cholesky(J0 + parameters[0] * _LEAST_SPREAD**2 * np.diag([1.0, 1.0, 1.0, 0.0]))
+    spread = size[0] * _LEAST_SPREAD**2 * np.diag([1.0, 1.0, 1.0, 0.0])
+    L = np.linalg.cholesky(pseudo_inertia(size) + spread)
     own = np.linalg.solve(L, np.linalg.solve(L, J0).T)
     return _FROM_PSEUDO @ (L @ _BASIS @ L.T).reshape(10, 16).T, own
 
@@ -199,6 +206,24 @@ class UntrustedInertia:
         values = self.columns if directions is None else self.columns @ directions
         return Signature(np.arange(self.columns.shape[1]), values, prior=np.ones(values.shape[2]))
 
+    def measured_by(self, change: np.ndarray) -> "UntrustedInertia":
+        """The same, where a body's change (bodies, 10) is in conflict with what is believed of it in the mean size of both."""
+        size = len(PARAMETERS)
+        scale, own, columns = self.scale.copy(), self.own.copy(), self.columns.copy()
+        conflicts = 0
+        for k, of_body in enumerate(change):
+            part = slice(k * size, (k + 1) * size)
+            z = np.linalg.solve(self.scale[part, part], of_body)
+            if np.abs(z).max() < _CONFLICT:
+                continue
+            conflicts += 1
+            model = self.model[part]
+            scale[part, part], own[k] = body_coordinates(model, model + 0.5 * of_body)
+            columns[:, :, part] = self.columns[:, :, part] @ np.linalg.solve(
+                self.scale[part, part], scale[part, part]
+            )
+        return replace(self, scale=scale, own=own, columns=columns) if conflicts else self
+
     def visible_directions(self, white: WhitenedResidual) -> np.ndarray:
         """Orthonormal directions of z that the log shows at all, best first, (P, D)."""
         values = white.whiten_signature(self.signature()).values
@@ -218,7 +243,7 @@ def untrusted_inertia(motion: RecordedMotion, bodies: Sequence[str]) -> Untruste
     own = np.empty((len(bodies), 4, 4))
     for k, body in enumerate(bodies):
         part = slice(k * size, (k + 1) * size)
-        scale[part, part], own[k] = body_coordinates(model[part])
+        scale[part, part], own[k] = body_coordinates(model[part], model[part])
         columns[:, :, part] = (
             motion.averages(inertial_regressor(motion.equation, motion.steps, body))
             @ scale[part, part]

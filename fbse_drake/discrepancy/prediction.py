@@ -287,6 +287,11 @@ class Predictor:
         if issubclass(effect, ContactEffect):
             values = self._contact_columns(effect)
         else:
+            point = self._expansion_point(effect, target)
+            if point is not None:
+                values, offset = self._slopes(effect, target, point, nonlinear)
+                rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
+                return Signature(rows, values[:, rows], offset[:, rows])
             names = [name for name, parameter in effect.parameters.items() if parameter.linear]
             units = np.diag([_probe(effect, name) for name in names])
             columns = [
@@ -349,8 +354,18 @@ class Predictor:
             self.motion.blocks
         )
 
+    def _expansion_point(self, effect: type[Effect], target: str) -> np.ndarray | None:
+        """Values about which the signature of an effect is taken first, (p,); None for zeros."""
+        if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
+            return None
+        return effect.expansion_point(self.robot.body(target))
+
     def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
         """What that noise adds to the signature of an inertia effect: regressors are measured too."""
+        point = self._expansion_point(effect, target)
+        if point is not None:
+            values, _ = self._slopes(effect, target, point, np.zeros(0), noisier=True)
+            return replace(clean, values=values[:, clean.rows] - clean.values, offset=0.0)
         columns = np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
         for k, name in enumerate(effect.parameters):
             unit = _probe(effect, name)
@@ -403,23 +418,43 @@ class Predictor:
         """
         if not issubclass(effect, InertiaEffect | SensorEffect):
             return elsewhere
+        values, offset = self._slopes(effect, target, linear, nonlinear)
+        rows = elsewhere.rows
+        return replace(elsewhere, values=values[:, rows], offset=offset[:, rows])
+
+    def _slopes(
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What an inertia or sensor effect adds per unit of each parameter about some values, (B, R, p), and what it adds with these
+        values beyond that, (B, R)."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
-        here = self._addition(effect, target, linear, nonlinear)
+        here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
         slopes = []
         for k, name in enumerate(names):
             moved = linear.copy()
             moved[k] += _probe(effect, name)
-            slopes.append(
-                (self._addition(effect, target, moved, nonlinear) - here) / _probe(effect, name)
-            )
+            there = self._addition(effect, target, moved, nonlinear, noisier=noisier)
+            slopes.append((there - here) / _probe(effect, name))
         values = _without_rounding(np.stack(slopes, axis=2))
-        rows = elsewhere.rows
-        return replace(elsewhere, values=values[:, rows], offset=(here - values @ linear)[:, rows])
+        return values, here - values @ linear
 
     def _addition(
-        self, effect: type[Effect], target: str, linear: np.ndarray, nonlinear: np.ndarray
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        *,
+        noisier: bool = False,
     ) -> np.ndarray:
-        """What an inertia or sensor effect with these values adds to the residual, (B, R)."""
+        """What an inertia or sensor effect with these values adds to the residual, (B, R); an inertia effect also if the sensors' noise
+        were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -431,7 +466,7 @@ class Predictor:
         }
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
-            return self._inertia_addition(changed)
+            return self._inertia_addition(changed, noisier=noisier)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self._undone(resolved, self._memory(effect, resolved))

@@ -16,6 +16,8 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 # How often a grid of nonlinear values is narrowed down around its best point, and to how many points.
 _NARROWINGS = 2
 _POINTS = 9
+# How often a candidate that is linear only nearby is made linear about the values that fit best.
+_EXPANSIONS = 3
 # So many numbers are kept in columns of candidates.
 _MOST_NUMBERS = 15_000_000
 # How often friction of all joints is fitted in turn.
@@ -46,7 +48,7 @@ class Proposals:
         enough = 0.5 * fits.threshold[1]
         known = {(c.effect, c.targets) for c in base.candidates}
         result = [
-            candidate
+            self._settled(candidate, base)
             for candidate in fits.fixed_candidates
             if (candidate.effect, candidate.targets) not in known
             and np.intersect1d(candidate.signature.rows, rows).size
@@ -78,6 +80,22 @@ class Proposals:
                     dictionary.progress(LOOKING, 0.3)
                     result.append(self._best_on(effect, group, best, beside))
         return result
+
+    def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
+        """A candidate made linear about the values that fit best beside an explanation, if it is linear only nearby."""
+        if not candidate.effect.linear_nearby:
+            return candidate
+
+        def made() -> Candidate:
+            settled = candidate
+            for _ in range(_EXPANSIONS):
+                wider = self.fits.explain([*base.candidates, settled])
+                start = wider.start(settled)
+                values = wider.fit.parameters[start : start + len(settled.linear_names)]
+                settled = self.fits.about(settled, values)
+            return settled
+
+        return self._found.or_made((candidate, base), made)
 
     def plain_friction(self) -> Explanation:
         """Coulomb and viscous friction and a bias in every joint, fitted together; what identification of inertia begins with."""

@@ -12,6 +12,7 @@ from fbse_drake.discrepancy.inertial import (
     identified_inertia,
 )
 from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -20,6 +21,8 @@ from fbse_drake.errors import InputError
 
 # How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
 _POLISHINGS = 3
+# How often untrusted bodies are measured anew, at most.
+_REMEASUREMENTS = 3
 
 
 def polished(fits: Fits, explanation: Explanation) -> Explanation:
@@ -32,17 +35,10 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
         if not issubclass(candidate.effect, JointTorqueEffect):
             values = explanation.fit.parameters[start - size : start]
             try:
-                raw = fits.dictionary.predictor.signature_near(
-                    candidate.effect,
-                    candidate.targets[0],
-                    values,
-                    candidate.nonlinear,
-                    candidate.raw,
-                )
+                moved.append(fits.about(candidate, values))
             except InputError:
                 # No body has these values.
                 return explanation
-            moved.append(replace(candidate, source=raw, signature=fits.white.whiten_signature(raw)))
             continue
         if m == 0:
             moved.append(candidate)
@@ -120,6 +116,22 @@ def consistent(
         fits.dictionary.inertia, fits.white, explanation.fit, z, fits.dictionary.directions
     )
     return replace(explanation, fit=fit, sse=sse), identified
+
+
+def remeasured(fits: Fits) -> Fits:
+    """Fits in which what the log says clearly of untrusted bodies is not held back by the belief in the model.
+
+    Plain friction is fitted along; see `inertial` for bodies that are in conflict with the model.
+    """
+    for _ in range(_REMEASUREMENTS):
+        if fits.dictionary.inertia is None:
+            break
+        _, found = consistent(fits, Proposals(fits).plain_friction())
+        inertia = fits.dictionary.inertia.measured_by(found.change)
+        if inertia is fits.dictionary.inertia:
+            break
+        fits = Fits(fits.dictionary.with_inertia(inertia), fits.white)
+    return fits
 
 
 def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedResidual, np.ndarray]:

@@ -435,8 +435,9 @@ class Regression:
                 gram = gram[np.ix_(fitted, fitted)]
             return gram / np.outer(norm, norm), right / norm
 
-        scale = white.scale(white.sse)[rows]
-        for _ in range(_REWEIGHTINGS if len(rows) > 1 else 1):
+        # From the sensors' noise on: weighted by what was there before anything is fitted, beliefs would hold back what the data say clearly.
+        scale = np.ones(len(rows))
+        for _ in range(_REWEIGHTINGS):
             gram, right = weighted(None)
             theta = bounded_least_squares(gram + held, right, lowest * norm)
             amounts[fitted] = theta / norm

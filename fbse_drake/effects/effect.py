@@ -21,6 +21,7 @@ import numpy as np
 from fbse_drake.errors import InputError
 from fbse_drake.library import require_new
 from fbse_drake.robot.description import RobotDescription
+from fbse_drake.robot.plant import Robot
 
 # A prismatic joint is to a revolute one as the end of a lever of this length to its axis [m]: plausible values are converted with it.
 _LEVER = 0.1
@@ -86,6 +87,8 @@ class Effect(ABC):
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "joint"
     # Other effects can say the same together; then the diagnosis does not try it.
     composite: ClassVar[bool] = False
+    # Its linear parameters enter linearly only about some values: a search makes it linear about those that fit.
+    linear_nearby: ClassVar[bool] = False
 
     @staticmethod
     def alternatives() -> tuple[type["Effect"], ...]:
@@ -105,6 +108,11 @@ class Effect(ABC):
     def largest_plausible(cls, unit: str = "Nm") -> float:
         """Largest plausible size of its first parameter, which says how strong it is; at a joint whose torque has this unit."""
         return max(abs(bound) for bound in next(iter(cls.parameters_at(unit).values())).plausible)
+
+    @classmethod
+    def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:  # noqa: ARG003
+        """Smallest possible values of its linear parameters on a target, (p,); a fit does not go below them."""
+        return np.array([p.bounds[0] for p in cls.parameters.values() if p.linear])
 
     @classmethod
     def from_values(cls, targets: Sequence[str], values: Mapping[str, Sequence[float]]) -> "Effect":

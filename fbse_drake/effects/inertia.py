@@ -14,6 +14,8 @@ from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.errors import InputError, located
 from fbse_drake.robot.plant import PointMass, Robot
 
+# The model's masses and centres of mass are suspected in bodies heavier than this share of the robot.
+_LIGHT_BODY = 0.03
 # Share of an inertia that may be lost in rounding.
 _ROUNDING = 1e-9
 
@@ -21,8 +23,23 @@ _ROUNDING = 1e-9
 @dataclass(frozen=True)
 class InertiaEffect(Effect):
     """Base of the inertia effects. One that acts on joints adds rotor inertia to them, one that acts on bodies adds point masses; a
-    subclass gives the one of the two functions that it needs. All its parameters are linear.
+    subclass gives the one of the two functions that it needs. All its parameters are linear, at least about some values.
     """
+
+    @staticmethod
+    def suspected_bodies(robot: Robot) -> list[str]:
+        """Bodies that the diagnosis tries it on: those that weigh something."""
+        total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+        return [
+            name
+            for name in robot.body_names
+            if robot.body(name).default_mass() > _LIGHT_BODY * total
+        ]
+
+    @staticmethod
+    def expansion_point(body: RigidBody) -> np.ndarray | None:  # noqa: ARG004
+        """Values about which it is linear enough for a search to begin with, shape (parameters,); None for zeros."""
+        return None
 
     @staticmethod
     def rotor_inertia(values: np.ndarray) -> np.ndarray:
@@ -94,7 +111,7 @@ class ReflectedInertia(InertiaEffect):
 @in_library
 @dataclass(frozen=True)
 class BodyMass(InertiaEffect):
-    """Mass at the centre of mass of a body; negative where the model has too much. A payload elsewhere is this with `BodyCentreOfMass`."""
+    """Mass at the centre of mass of a body; negative where the model has too much. Mass elsewhere is a `Payload`."""
 
     description: ClassVar[str] = "A body is heavier or lighter than the model says."
     signature: ClassVar[str] = (
@@ -107,6 +124,12 @@ class BodyMass(InertiaEffect):
     }
 
     mass: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:
+        """No body loses more than it weighs."""
+        bodies = [robot.body(target), *robot.added_to(target)]
+        return np.array([-sum(body.default_mass() for body in bodies)])
 
     @staticmethod
     def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:
@@ -143,6 +166,96 @@ class BodyCentreOfMass(InertiaEffect):
     def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:
         mass, com = body.default_mass(), body.default_com()
         return [PointMass(body.name(), -mass, com), PointMass(body.name(), mass, com + values)]
+
+
+# Half the distance of the masses that stand for a second moment [m]; what they add does not depend on it.
+_ARM = 0.1
+# Mass of the payload about which a search for one begins [kg].
+_SOME_MASS = 1.0
+
+
+@in_library
+@dataclass(frozen=True)
+class Payload(InertiaEffect):
+    """A rigid mass that a body B carries: its mass, the place p_BoP_B of its centre P, and its second moments about P along the axes
+    of B, as sxx = integral of (x - x_P)^2 dm; all of them 0 for a point mass.
+
+    Second moments that are not negative are those of some distribution of mass. The rotational inertia about P is
+    ixx = syy + szz and so on; products of inertia are left out.
+    """
+
+    description: ClassVar[str] = "A body carries something: a payload, a tool, a load on the back."
+    signature: ClassVar[str] = (
+        "Torque in all joints that carry the body, as of one weight at one place; under the feet its weight."
+    )
+    experiment: ClassVar[str] = (
+        "Move all joints that carry the body, through many postures and fast."
+    )
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
+    linear_nearby: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "mass": Parameter("kg", linear=True, plausible=(0.0, 10.0)),
+        **{
+            axis: Parameter("m", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf))
+            for axis in "xyz"
+        },
+        **{
+            f"s{axis}{axis}": Parameter("kg m^2", linear=True, plausible=(0.0, 0.5))
+            for axis in "xyz"
+        },
+    }
+
+    mass: dict[str, float] = field(default_factory=dict)
+    x: dict[str, float] = field(default_factory=dict)
+    y: dict[str, float] = field(default_factory=dict)
+    z: dict[str, float] = field(default_factory=dict)
+    sxx: dict[str, float] = field(default_factory=dict)
+    syy: dict[str, float] = field(default_factory=dict)
+    szz: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def suspected_bodies(robot: Robot) -> list[str]:
+        """Bodies that the diagnosis tries it on: those that weigh something."""
+        total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+        return [
+            name
+            for name in robot.body_names
+            if robot.body(name).default_mass() > _LIGHT_BODY * total
+        ]
+
+    @staticmethod
+    def suspected_bodies(robot: Robot) -> list[str]:
+        """Of bodies that are fixed to each other the heaviest, however light it is; none that is fixed to the world."""
+        plant, names = robot.plant, robot.body_names
+        at_rest = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+        carriers = (
+            max(
+                (b for b in plant.GetBodiesWeldedTo(robot.body(name)) if b.name() in names),
+                key=lambda body: body.default_mass(),
+            ).name()
+            for name in names
+            if name not in at_rest
+        )
+        return list(dict.fromkeys(carriers))
+
+    @staticmethod
+    def expansion_point(body: RigidBody) -> np.ndarray:
+        return np.array([_SOME_MASS, *body.default_com(), 0.0, 0.0, 0.0])
+
+    @staticmethod
+    def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:
+        mass, place, second_moments = values[0], values[1:4], values[4:]
+        result = [PointMass(body.name(), mass, place)]
+        for arm, moment in zip(_ARM * np.eye(3), second_moments, strict=True):
+            if moment:
+                # A pair of masses, and what they weigh taken off between them.
+                each = moment / (2 * _ARM**2)
+                result += [
+                    PointMass(body.name(), each, place + arm),
+                    PointMass(body.name(), each, place - arm),
+                    PointMass(body.name(), -2 * each, place),
+                ]
+        return result
 
 
 # Parameters of a body's inertia: mass, first moment and rotational inertia about the origin of the body's frame, in that frame.
