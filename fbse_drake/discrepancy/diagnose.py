@@ -205,8 +205,8 @@ def diagnose(
 
 
 def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
-    """For each member: explanations with another effect in its place, best first; one for each effect and targets. The same effect is a rival on
-    another body."""
+    """For each member: explanations with another effect in its place, or the same on another body, best first; one for each effect and
+    targets."""
     result = {}
     for k, member in enumerate(final.candidates):
         rest = proposals.fits.explain([c for c in final.candidates if c is not member])

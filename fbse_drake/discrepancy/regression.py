@@ -435,7 +435,8 @@ class Regression:
                 gram = gram[np.ix_(fitted, fitted)]
             return gram / np.outer(norm, norm), right / norm
 
-        # From the sensors' noise on: weighted by what was there before anything is fitted, beliefs would hold back what the data say clearly.
+        # From the sensors' noise on: weighted by what is there before anything is fitted,
+        # beliefs would hold back what the data say clearly.
         scale = np.ones(len(rows))
         for _ in range(_REWEIGHTINGS):
             gram, right = weighted(None)

@@ -215,16 +215,6 @@ class Payload(InertiaEffect):
 
     @staticmethod
     def suspected_bodies(robot: Robot) -> list[str]:
-        """Bodies that the diagnosis tries it on: those that weigh something."""
-        total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
-        return [
-            name
-            for name in robot.body_names
-            if robot.body(name).default_mass() > _LIGHT_BODY * total
-        ]
-
-    @staticmethod
-    def suspected_bodies(robot: Robot) -> list[str]:
         """Of bodies that are fixed to each other the heaviest, however light it is; none that is fixed to the world."""
         plant, names = robot.plant, robot.body_names
         at_rest = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
