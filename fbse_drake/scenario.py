@@ -23,6 +23,7 @@ from fbse_drake import resources, schema
 from fbse_drake.control.compensation import Compensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.geometry import joint_shifts
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
@@ -351,7 +352,7 @@ def build_robot(
     ground: Ground | None = None,
     implicit: ImplicitTorque | None = None,
 ) -> Robot:
-    """A robot's plant, with the inertia effects that the robot has.
+    """A robot's plant, with the inertia and geometry effects that the robot has.
 
     Args:
         builder, plant, ground, implicit: see `make_robot`.
@@ -368,6 +369,7 @@ def build_robot(
         config.description,
         rotor_inertia=dict(zip(bare.joint_names, rotor_inertia, strict=True)),
         point_masses=point_masses,
+        joint_shifts=joint_shifts(config.effects, bare),
         gantry_height=config.gantry_height,
         builder=builder,
         config=plant,

@@ -158,6 +158,7 @@ _RECIPES = {
     "BodyMass": Recipe((0.2, 4.0), _one("mass")),
     "BodyCentreOfMass": Recipe((4e-3, 3e-2), _vector("xyz")),
     "Payload": Recipe((0.3, 4.0), _load),
+    "LinkLength": Recipe((2e-3, 1e-2), _signed("length")),
     "GroundSlope": Recipe((4e-3, 4e-2), _vector("xy")),
     "GroundCompliance": Recipe((5e-7, 5e-6), _one("compliance")),
     "FootCreep": Recipe((1e-3, 2e-2), _one("creep")),

@@ -11,6 +11,7 @@ from scipy.signal import savgol_filter
 from fbse_drake.discrepancy.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.regression import Signature
 from fbse_drake.discrepancy.residual import (
+    EquationOfMotion,
     Instants,
     RecordedMotion,
     Residual,
@@ -31,6 +32,7 @@ from fbse_drake.effects.contact import (
     spring_force,
 )
 from fbse_drake.effects.effect import Effect, ResolvedEffect
+from fbse_drake.effects.geometry import GeometryEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import (
     JointMotion,
@@ -382,12 +384,22 @@ class Predictor:
         change = effect.from_values(
             [target], {name: [value] for name, value in zip(effect.parameters, linear, strict=True)}
         )
-        believed = self.scenario.believed
         try:
-            build_robot(replace(believed, effects={**believed.effects, "_change": change}))
+            self._with(change)
         except InputError:
             return False
         return True
+
+    def _with(self, change: Effect) -> EquationOfMotion:
+        """Of a model that has an effect as well.
+
+        Raises:
+            InputError: no robot has it.
+        """
+        believed = self.scenario.believed
+        return EquationOfMotion(
+            build_robot(replace(believed, effects={**believed.effects, "_change": change}))
+        )
 
     def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
         """What an inertia effect adds to the residual, (B, R)."""
@@ -410,13 +422,13 @@ class Predictor:
         nonlinear: np.ndarray,
         elsewhere: Signature,
     ) -> Signature:
-        """The signature of an inertia or sensor effect about values of its parameters, for what it adds is not quite linear.
+        """The signature of an inertia, geometry or sensor effect about values of its parameters, for what it adds is not quite linear.
 
         Args:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
             elsewhere: the signature about zero; it stays that of a contact effect.
         """
-        if not issubclass(effect, InertiaEffect | SensorEffect):
+        if not issubclass(effect, InertiaEffect | GeometryEffect | SensorEffect):
             return elsewhere
         values, offset = self._slopes(effect, target, linear, nonlinear)
         rows = elsewhere.rows
@@ -431,8 +443,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What an inertia or sensor effect adds per unit of each parameter about some values, (B, R, p), and what it adds with these
-        values beyond that, (B, R)."""
+        """What an inertia, geometry or sensor effect adds per unit of each parameter about some
+        values, (B, R, p), and what it adds with these values beyond that, (B, R)."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
         slopes = []
@@ -453,8 +465,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """What an inertia or sensor effect with these values adds to the residual, (B, R); an inertia effect also if the sensors' noise
-        were in its regressors once more."""
+        """What an inertia, geometry or sensor effect with these values adds to the residual, (B, R); an inertia effect also if the
+        sensors' noise were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -467,6 +479,8 @@ class Predictor:
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
             return self._inertia_addition(changed, noisier=noisier)
+        if issubclass(effect, GeometryEffect):
+            return self._residual_at_blocks - self._with(changed).residual(self._smooth_blocks)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self._undone(resolved, self._memory(effect, resolved))

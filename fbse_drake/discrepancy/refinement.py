@@ -14,6 +14,7 @@ from fbse_drake.discrepancy.inertial import (
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.regression import WhitenedResidual
+from fbse_drake.effects.geometry import GeometryEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.sensor import SensorEffect
@@ -135,14 +136,15 @@ def remeasured(fits: Fits) -> Fits:
 
 
 def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedResidual, np.ndarray]:
-    """An explanation when its inertia and sensor effects are in the model, where it has any; the residual that is measured by; and
-    what is left of it, whitened, (B, R).
+    """An explanation when its inertia, geometry and sensor effects are in the model, where it has any; the residual that is
+    measured by; and what is left of it, whitened, (B, R).
 
     An impact shows a heavy foot's mass only if accelerations are not smoothed, noise grows with the masses, and which soles stand is
     seen when the forces are set right.
     """
     if fits.dictionary.inertia is not None or not any(
-        issubclass(c.effect, InertiaEffect | SensorEffect) for c in explanation.candidates
+        issubclass(c.effect, InertiaEffect | GeometryEffect | SensorEffect)
+        for c in explanation.candidates
     ):
         return explanation, fits.white, fits.leftover(explanation)
     scenario = fits.dictionary.predictor.scenario

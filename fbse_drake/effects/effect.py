@@ -5,6 +5,7 @@ a log, and identifying its parameters. What kind of thing it is, is said by its 
 
     JointTorqueEffect   a torque loss in a joint: friction, springs, ripple; also of its actuation: gain, bias, delay   (joint_torque.py)
     InertiaEffect       reflected inertia, masses, centres of mass                                                      (inertia.py)
+    GeometryEffect      lengths of links                                                                                (geometry.py)
     SensorEffect        what a sensor reads beside the truth                                                            (sensor.py)
     ContactEffect       ground and soles                                                                                (contact.py)
 

@@ -20,6 +20,7 @@ from pydrake.multibody.plant import (
     MultibodyPlantConfig,
 )
 from pydrake.multibody.tree import (
+    FixedOffsetFrame,
     Frame,
     Joint,
     JointActuator,
@@ -283,6 +284,7 @@ def make_robot(
     *,
     rotor_inertia: Mapping[str, float] | None = None,
     point_masses: Sequence[PointMass] = (),
+    joint_shifts: Mapping[str, np.ndarray] | None = None,
     gantry_height: float | None = None,
     builder: DiagramBuilder | None = None,
     config: MultibodyPlantConfig | None = None,
@@ -295,6 +297,7 @@ def make_robot(
         description: name or path of a robot description (`models/*.yaml`).
         rotor_inertia: reflected rotor inertia [kg m^2] by joint, see `RobotDescription.per_joint`.
         point_masses: further masses on bodies of the model.
+        joint_shifts: how far joints are moved in the frames of the bodies that carry them, (3,) [m], by joint.
         gantry_height: hangs the base in a gantry: welds it to the world at this height [m], upright.
         builder: the diagram that gets the plant and its scene graph; by default one that is thrown away, which is what a
             model needs that is only computed with.
@@ -312,6 +315,7 @@ def make_robot(
         _add_model(plant, names, path)
         _check_names(plant, names)
         _hold_other_joints(plant, names)
+    _shift_joints(plant, joint_shifts or {})
     inertia = names.per_joint(rotor_inertia or {}, key="rotor_inertia", default=0.0)
     _add_actuators(plant, dict(zip(names.joint_names, inertia, strict=True)))
     implicit = implicit or ImplicitTorque.none(len(names.joint_names))
@@ -449,6 +453,36 @@ def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
         parent, child = joint.frame_on_parent(), joint.frame_on_child()
         plant.RemoveJoint(joint)
         plant.WeldFrames(parent, child, X_FM)
+
+
+def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> None:
+    """Moves joints in the frames of the bodies that carry them; they lose their actuators, which every named joint gets anyhow."""
+    for name, shift in shifts.items():
+        joint, body = plant.GetJointByName(name), plant.GetJointByName(name).parent_body()
+        X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
+        for index in plant.GetJointActuatorIndices():
+            if plant.get_joint_actuator(index).joint() is joint:
+                plant.RemoveJointActuator(plant.get_joint_actuator(index))
+        moved = FixedOffsetFrame(
+            f"{name}_shifted",
+            body.body_frame(),
+            RigidTransform(X_PF.rotation(), X_PF.translation() + shift),
+            joint.model_instance(),
+        )
+        axis = (
+            joint.revolute_axis() if isinstance(joint, RevoluteJoint) else joint.translation_axis()
+        )
+        again = type(joint)(
+            name,
+            plant.AddFrame(moved),
+            joint.frame_on_child(),
+            axis,
+            joint.position_lower_limits()[0],
+            joint.position_upper_limits()[0],
+        )
+        again.set_velocity_limits(joint.velocity_lower_limits(), joint.velocity_upper_limits())
+        plant.RemoveJoint(joint)
+        plant.AddJoint(again)
 
 
 def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) -> None:

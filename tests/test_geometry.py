@@ -1,0 +1,109 @@
+"""Links that are longer than the model says. Truth: models whose joints are placed elsewhere in the file."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig import BENT, robot_copy
+
+from fbse_drake import InputError, load_scenario, simulate
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.effects.effect import library
+from fbse_drake.effects.geometry import LinkLength
+from fbse_drake.robot.plant import Robot, make_robot
+from fbse_drake.scenario import RobotConfig, build_robot
+
+KNEE_TO_ANKLE = '<child link="left_ankle_link"/>\n    <origin xyz="0 0 -0.27"/>'
+
+
+def longer_shank(folder: Path, length: float) -> str:
+    """Description of a biped whose left ankle is further below the knee."""
+    return robot_copy(
+        folder,
+        lambda urdf: urdf.replace(KNEE_TO_ANKLE, KNEE_TO_ANKLE.replace("0.27", f"{0.27 + length}")),
+    )
+
+
+def mass_matrix_and_sole(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """In the order of our joints, and the place of the left sole, bent legs."""
+    context = robot.plant.CreateDefaultContext()
+    robot.set_joint_positions(context, BENT)
+    order = np.concatenate([np.arange(6), robot.velocity_index])
+    H = robot.plant.CalcMassMatrix(context)[np.ix_(order, order)]
+    return H, robot.sole("left").CalcPoseInWorld(context).translation()
+
+
+def test_the_effect_makes_the_robot_that_another_file_describes(tmp_path: Path) -> None:
+    changed = build_robot(RobotConfig(effects={"long": LinkLength({"left_shank": 0.008})}))
+    expected, _ = make_robot(longer_shank(tmp_path / "copy", 0.008))
+    for found, truth in zip(
+        mass_matrix_and_sole(changed), mass_matrix_and_sole(expected), strict=True
+    ):
+        np.testing.assert_allclose(found, truth, atol=1e-12)
+    # The shank leans by the angles of hip and knee: the sole is further along it.
+    lean = BENT[2] + BENT[3]
+    _, before = mass_matrix_and_sole(make_robot("biped")[0])
+    _, after = mass_matrix_and_sole(changed)
+    np.testing.assert_allclose(
+        after - before, 0.008 * np.array([-np.sin(lean), 0.0, -np.cos(lean)]), atol=1e-12
+    )
+
+
+def test_limits_and_the_order_of_joints_stay() -> None:
+    plain = build_robot(RobotConfig())
+    changed = build_robot(RobotConfig(effects={"long": LinkLength({"left_thigh": 0.01})}))
+    assert changed.position_index.tolist() == plain.position_index.tolist()
+    assert changed.plant.num_actuators() == plain.plant.num_actuators()
+    for name in plain.joint_names:
+        old, new = (robot.plant.GetJointByName(name) for robot in (plain, changed))
+        assert new.position_lower_limits() == old.position_lower_limits()
+        assert new.velocity_upper_limits() == old.velocity_upper_limits()
+
+
+def test_only_a_link_between_two_joints_has_a_length() -> None:
+    with pytest.raises(
+        InputError, match=r"effects\.long: trunk: expected a link between two joints .* left_thigh"
+    ):
+        build_robot(RobotConfig(effects={"long": LinkLength({"trunk": 0.01})}))
+    with pytest.raises(InputError, match="hand: the model has no body of this name"):
+        build_robot(RobotConfig(effects={"long": LinkLength({"hand": 0.01})}))
+
+
+def test_links_of_legs_are_suspected_and_no_others() -> None:
+    biped, _ = make_robot("biped")
+    assert LinkLength.suspected_bodies(biped) == [
+        f"{side}_{link}" for side in ("left", "right") for link in ("thigh", "shank")
+    ]
+    # Nothing but the torques would tell that a link of an arm is longer.
+    assert LinkLength.suspected_bodies(make_robot("arm")[0]) == []
+
+
+def test_a_longer_shank_is_found_in_a_walk(tmp_path: Path) -> None:
+    scenario = load_scenario(
+        "frictionless_walk", overrides=["duration=2.5", "reference.single_supports=1"]
+    )
+    scenario = dataclasses.replace(scenario, model=scenario.robot)
+    robot = dataclasses.replace(scenario.robot, description=longer_shank(tmp_path / "copy", 0.005))
+    log = simulate(dataclasses.replace(scenario, robot=robot)).log
+    assert log.meta["outcome"]["finished"]
+    rivals = [
+        library()[name]
+        for name in (
+            "LinkLength",
+            "EncoderOffset",
+            "TransmissionElasticity",
+            "GroundSlope",
+            "ImuMisalignment",
+            "BodyMass",
+            "BodyCentreOfMass",
+            "Payload",
+            "FootForceGain",
+            "TorqueGain",
+            "TorqueBias",
+        )
+    ]
+    found = diagnose(Predictor(scenario, log), rivals).chosen
+    assert [(f.effect, f.targets) for f in found] == [("LinkLength", ("left_shank",))]
+    assert found[0].parameters["length"].value == pytest.approx(0.005, abs=3e-4)
