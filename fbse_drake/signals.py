@@ -107,9 +107,19 @@ _TABLE: list[Signal] = [
     # What a real robot would not tell.
     Signal("", port="plant_state"),
     Signal("", port="generalized_acceleration"),
+    Signal("", port="net_actuation"),
+    Signal("", port="explicit_force"),
     Signal(r"truth/foot/\w+/pad_force", "N", ("m", 3), "true_pad_force"),
     Signal(r"truth/foot/\w+/wrench", "Nm, N", (6,), "true_pad_force"),
-    Signal("truth/joint/friction_torque", "Nm", ("n",), "torque_loss", late=True),
+    # Computed from the ports above: to read it at every tick takes longer.
+    Signal(
+        "truth/joint/friction_torque",
+        "Nm",
+        ("n",),
+        "torque_loss",
+        recorded=False,
+        late=True,
+    ),
     # What it is by the effects' laws, at the velocity that came out of the step.
     Signal("truth/joint/friction_law_torque", "Nm", ("n",)),
     # Estimates.

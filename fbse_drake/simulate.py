@@ -17,6 +17,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, 
 
 from fbse_drake import signals
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
+from fbse_drake.effects.system import loss_over_time
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
@@ -203,6 +204,9 @@ def _make_log(
     # A run that diverges may end in rows that are not numbers.
     finite = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
     ticks = dict(zip(names, np.split(record.data().T[finite], ends, axis=1), strict=True))
+    velocity = _joint_velocity(robot, ticks["plant_state"])
+    forces = (ticks["net_actuation"], ticks["explicit_force"])
+    ticks["torque_loss"] = loss_over_time(robot, velocity, *forces)
     # Of the plant steps those that ended are known.
     steps = max(int(finite.sum()) - 1, 1)
     rows = np.arange(0, steps, round(scenario.log.period / time_step))
@@ -247,6 +251,11 @@ def _make_log(
     return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
 
 
+def _joint_velocity(robot: Robot, state: np.ndarray) -> np.ndarray:
+    """Of the plant's states (N, size): (N, n) [rad/s]."""
+    return state[:, robot.plant.num_positions() + robot.velocity_index]
+
+
 def _law(scenario: Scenario, robot: Robot, ticks: Mapping[str, np.ndarray]) -> np.ndarray:
     """What the joints' effects are by their laws, of the velocity that came out, in every plant
     step, (N - 1, n) [Nm]; of a run of one tick what it is there.
@@ -258,7 +267,7 @@ def _law(scenario: Scenario, robot: Robot, ticks: Mapping[str, np.ndarray]) -> n
     state, command, loss = (
         ticks[name] for name in ("plant_state", "torque_command", "torque_loss")
     )
-    velocity = state[:, robot.plant.num_positions() + robot.velocity_index]
+    velocity = _joint_velocity(robot, state)
     count, time_step = max(len(state) - 1, 1), scenario.plant.time_step
     motion = JointMotion(
         velocity=velocity[-count:],

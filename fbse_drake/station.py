@@ -57,11 +57,14 @@ class Station(Diagram):
         - feedforward_torque
         - plant_state
         - generalized_acceleration
+        - net_actuation
+        - explicit_force
         - true_pad_force
         - torque_loss
 
     Sensor and controller ports come first, what a real robot would not tell (plant state,
-    acceleration, ideal pad forces, torque loss of the effects) comes last. `friction_estimate`
+    acceleration, net actuation, the effects' explicit force, ideal pad forces, torque loss of the
+    effects) comes last. `friction_estimate`
     (n,) [Nm] is added to the command and may be left unconnected; a station that compensates its
     own estimate does not have it. A station with an estimator also has a port for each of
     `estimator.channels`, see `EstimatorDiagram`; one with joint torque sensors has
@@ -149,8 +152,9 @@ def add_robot(
 
     Returns:
         With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
-        `torque_loss` of the effects in the step that ended (n,) [Nm], `plant_state`,
-        `generalized_acceleration` and those of the plant that sensors need: `body_poses`,
+        `torque_loss` of the effects in the step that ended (n,) [Nm] and what it is the sum of,
+        `net_actuation` and `explicit_force` (see `fbse_drake.effects.system.loss_over_time`),
+        `plant_state`, `generalized_acceleration` and those of the plant that sensors need: `body_poses`,
         `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.
 
     Raises:
@@ -175,6 +179,7 @@ def add_robot(
         "torque_command": command.get_output_port(),
         "plant_state": plant.get_state_output_port(),
         "generalized_acceleration": plant.get_generalized_acceleration_output_port(),
+        "net_actuation": plant.get_net_actuation_output_port(),
         "reaction_forces": plant.get_reaction_forces_output_port(),
     }
     for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
@@ -203,13 +208,15 @@ def add_joint_torques(
 ) -> dict[str, OutputPort]:
     """Adds what moves a robot's joints: commanded torque, and the losses of its effects.
 
+    Args:
+        ports: of the robot: `joint_state`, `torque_command` and `net_actuation`.
+
     Returns:
-        `torque_loss`.
+        `torque_loss` and `explicit_force`.
     """
     plant, instance = robot.plant, robot.base.model_instance()
     effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step))
-    net_actuation = plant.get_net_actuation_output_port()
-    connect_by_name(builder, {**ports, "net_actuation": net_actuation}, effects)
+    connect_by_name(builder, ports, effects)
     force = plant.get_applied_generalized_force_input_port()
     builder.Connect(effects.GetOutputPort("explicit_force"), force)
 
@@ -228,7 +235,7 @@ def add_joint_torques(
         builder.Connect(offset.get_output_port(), both.get_input_port(1))
         torque = both.get_output_port()
     builder.Connect(torque, plant.get_actuation_input_port())
-    return {"torque_loss": effects.GetOutputPort("torque_loss")}
+    return {name: effects.GetOutputPort(name) for name in ("torque_loss", "explicit_force")}
 
 
 def add_sensors(

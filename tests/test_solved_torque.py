@@ -33,6 +33,7 @@ from fbse_drake.effects.joint_torque import (
     law_over_time,
 )
 from fbse_drake.effects.law_table import LawTable, law_table, look_up
+from fbse_drake.effects.system import loss_over_time
 from fbse_drake.effects.transmission import Backlash, PreslidingHysteresis
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.plant import make_robot
@@ -126,6 +127,7 @@ class Wheel:
         ports = {
             "joint_state": state.get_output_port(),
             "torque_command": source.get_output_port(),
+            "net_actuation": self.plant.get_net_actuation_output_port(),
         }
         ports |= add_joint_torques(builder, self.robot, self.law, time_step, ports)
         record = [LogVectorOutput(port, builder, time_step) for port in ports.values()]
@@ -142,6 +144,9 @@ class Wheel:
         data = {name: sink.FindLog(context).data().T for name, sink in self.sinks.items()}
         position, velocity = np.split(data["joint_state"], 2, axis=1)
         command, loss = data["torque_command"][:-1], data["torque_loss"][1:]
+        forces = (data["net_actuation"], data["explicit_force"])
+        over_time = loss_over_time(self.robot, velocity, *forces)
+        np.testing.assert_allclose(over_time, data["torque_loss"], rtol=0, atol=0)
         motion = JointMotion(
             velocity=velocity[1:],
             position=position[:-1],

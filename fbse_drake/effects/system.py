@@ -83,6 +83,27 @@ def _loss(
     return loss
 
 
+def loss_over_time(
+    robot: Robot,
+    velocity: np.ndarray,
+    net_actuation: np.ndarray,
+    explicit_force: np.ndarray,
+) -> np.ndarray:
+    """What `torque_loss` told at ticks one after the other, (N, n) [Nm].
+
+    Args:
+        velocity: of the joints at every tick, (N, n) [rad/s].
+        net_actuation: of the plant, of the step that ended, (N, actuators) [Nm].
+        explicit_force: generalized force in the step that began, (N, velocities) [Nm], [N].
+    """
+    loss = np.zeros_like(velocity)
+    loss[1:] = -explicit_force[:-1, robot.velocity_index]
+    loss[1:] += robot.implicit.damping * velocity[1:]
+    has_clamp = robot.clamp_index >= 0
+    loss[1:, has_clamp] -= net_actuation[1:, robot.clamp_index[has_clamp]]
+    return loss
+
+
 @njit(cache=True)
 def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
     """Fills velocities and positions of a tick; returns the velocities that are expected at the
