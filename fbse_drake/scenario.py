@@ -261,8 +261,9 @@ class Scenario:
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
-    # Who estimates the friction: !NoEstimator, !Fbse, or a reference method: !TrueFriction, !TorqueSensor, !DisturbanceObserver or
-    # !FixedFriction.
+    # Who estimates the friction: !NoEstimator, !Fbse, a reference (!TrueFriction, !TorqueSensor), or
+    # a rival: !DisturbanceObserver, !FixedFriction, !AdaptiveFriction, !LuGreFriction,
+    # !RadialBasisFriction or !FuzzyFriction.
     estimator: Estimator = field(default_factory=NoEstimator)
     # What the controller makes of it: !NoCompensation, !IntegralCompensation or !FeedforwardCompensation.
     compensation: Compensation = field(default_factory=NoCompensation)

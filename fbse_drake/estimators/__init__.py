@@ -1,11 +1,25 @@
 """Estimators; importing the package fills their library."""
 
 from fbse_drake.estimators import (
+    adaptive_friction,
     disturbance_observer,
     fbse,
     fixed_friction,
+    fuzzy,
+    lugre,
+    radial_basis,
     torque_sensor,
     true_friction,
 )
 
-__all__ = ["disturbance_observer", "fbse", "fixed_friction", "torque_sensor", "true_friction"]
+__all__ = [
+    "adaptive_friction",
+    "disturbance_observer",
+    "fbse",
+    "fixed_friction",
+    "fuzzy",
+    "lugre",
+    "radial_basis",
+    "torque_sensor",
+    "true_friction",
+]

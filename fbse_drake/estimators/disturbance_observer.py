@@ -34,9 +34,13 @@ class DisturbanceObserver(Estimator):
         require_positive(self, "bandwidth")
 
     def add(self, chain: Chain) -> None:
+        self.add_observer(chain, "friction")
+
+    def add_observer(self, chain: Chain, name: str) -> None:
+        """Adds the observer, and before it what it needs, see `Fbse.add_base`."""
         Fbse().add_base(chain)
         chain.add(
-            "friction",
+            name,
             partial(MomentumObserver, self, chain.robot),
             measurements="sensor_monitor",
             attitude="attitude",
