@@ -212,6 +212,56 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("folder", metavar="DIR", type=Path, help="what hide wrote")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = commands.add_parser(
+        "campaign",
+        help="many runs at once, on this machine or a Dask cluster",
+        description="Does the runs of a campaign that are not done, each of which becomes a row of a table; the same command goes on.",
+    )
+    run.add_argument("campaign", metavar="CAMPAIGN", type=Path, help="a YAML file")
+    run.add_argument(
+        "--out",
+        metavar="DIR",
+        help="where the rows go: a folder, or an address as s3://... (default: out/ and the file's name)",
+    )
+    place = run.add_mutually_exclusive_group()
+    place.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask scheduler, as tcp://host:8786 (default: one is started here)",
+    )
+    place.add_argument(
+        "--workers",
+        metavar="N",
+        type=_positive_whole_number,
+        help="processes that are started here (default: one for each core)",
+    )
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = commands.add_parser(
+        "table",
+        help="what the rows of a campaign say",
+        description="Prints medians (of truth values: shares) with 95 %% intervals, by group; writes table.csv (all rows) and groups.csv.",
+    )
+    run.add_argument("folder", metavar="DIR", help="what campaign wrote")
+    run.add_argument(
+        "--by",
+        metavar="COLUMN",
+        action="append",
+        help="a column that makes groups; repeatable (default: the design's, if they have few values)",
+    )
+    run.add_argument(
+        "--value",
+        metavar="COLUMN",
+        action="append",
+        default=[],
+        help="a value to show, or the beginning of several's names; repeatable",
+    )
+    run.add_argument(
+        "--plot", metavar=("Y", "X"), nargs=2, help="writes a picture of one column over another"
+    )
+    run.add_argument("--out", metavar="DIR", type=Path, help="where files go (default: DIR)")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 

@@ -1,6 +1,7 @@
 """What the `fbse` commands do; each says whether it came to its end."""
 
 import argparse
+import csv
 import json
 import os
 import sys
@@ -31,7 +32,7 @@ from fbse_drake.discrepancy.sanity import check_sensors
 from fbse_drake.discrepancy.study import study, study_json, train_and_rest
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
-from fbse_drake.files import write_text
+from fbse_drake.files import write_atomically, write_text
 from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.log import Log
@@ -295,13 +296,18 @@ def _errors_located(options: argparse.Namespace) -> AbstractContextManager[None]
 
 
 @contextmanager
-def _told(console: Console, limit: float | None = None) -> Iterator[Progress]:
-    """Tells the progress of a search: in a line that changes, or without a terminal in lines below each other.
+def _told(
+    console: Console,
+    limit: float | None = None,
+    *,
+    first: str = "comparing the model with the log",
+) -> Iterator[Progress]:
+    """Tells the progress of long work: in a line that changes, or without a terminal in lines below each other.
 
     Args:
-        limit: time after which the search ends with what is known [s].
+        limit: time after which the work ends with what is known [s].
+        first: what is said before the work tells anything.
     """
-    first = "comparing the model with the log"
     if console.is_terminal and not console.quiet:
         with console.status(first) as status:
             lines = ProgressLines(
@@ -474,6 +480,95 @@ def _reveal(options: argparse.Namespace) -> bool:
     return True
 
 
+def _campaign(options: argparse.Namespace) -> bool:
+    with _extra_installed("campaigns"):
+        from fbse_drake.campaign.campaign import load_campaign
+        from fbse_drake.campaign.cluster import run_campaign
+    campaign = load_campaign(options.campaign)
+    place = options.out or str(Path("out") / options.campaign.stem)
+    console = Console(quiet=options.quiet)
+
+    def tell(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    with _told(console, first="starting") as progress:
+        outcome = run_campaign(
+            campaign,
+            place,
+            scheduler=options.scheduler,
+            workers=options.workers,
+            progress=progress,
+            tell=tell,
+        )
+    table = Table(show_header=False, title=campaign.title or place, title_justify="left")
+    table.add_row("runs", f"{outcome.total}")
+    table.add_row("done before, now", f"{outcome.before}, {outcome.done}")
+    table.add_row("failed now", f"{len(outcome.failed)}")
+    console.print(table)
+    if outcome.stopped is not None:
+        print(f"fbse: {outcome.stopped}; the same command goes on", file=sys.stderr)
+        return False
+    tell(f"Table: {place}/table.parquet, or fbse table {place}")
+    return True
+
+
+def _table(options: argparse.Namespace) -> bool:
+    with _extra_installed("tables of campaigns"):
+        from pyarrow.csv import write_csv
+
+        from fbse_drake.campaign import table as tables
+        from fbse_drake.campaign.rows import Folder, units_of
+    rows, out = Folder(options.folder).table(), options.out or Path(options.folder)
+    by = tables.usual_groups(rows) if options.by is None else options.by
+    found, values = tables.groups(rows, by), tables.figures(rows, options.value)
+    summaries = list(tables.summary_rows(found, values))
+    units, console = units_of(rows.schema), Console(quiet=options.quiet)
+    shown = Table(*by, "runs", "failed", title=options.folder, title_justify="left")
+    for value in values:
+        shown.add_column(f"{value} [{units[value]}]" if units[value] else value)
+    for row in summaries:
+        same, (count, failed), numbers = row[: len(by)], row[len(by) :][:2], row[len(by) + 2 :]
+        cells = (
+            f"{number(middle)} ({number(low)} to {number(high)})"
+            for middle, low, high in zip(*[iter(numbers)] * 3, strict=True)
+        )
+        shown.add_row(*map(str, same), str(count), str(failed), *cells)
+    console.print(shown)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomically(out / "table.csv", lambda partial: write_csv(rows, partial))
+        bounds = (f"{value}{end}" for value in values for end in ("", " from", " to"))
+        lines = [[*by, "runs", "failed", *bounds], *summaries]
+        write_atomically(out / "groups.csv", lambda partial: _write_lines(partial, lines))
+        if options.plot is not None:
+            y, x = options.plot
+            path = out / f"{y}_over_{x}.png"
+            figure = tables.picture(rows, y, x, by)
+            write_atomically(path, lambda partial: figure.savefig(partial, format="png", dpi=120))
+            console.print(f"Picture: {path}", highlight=False, soft_wrap=True)
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}") from None
+    console.print(f"Rows: {out / 'table.csv'}", highlight=False, soft_wrap=True)
+    return True
+
+
+def _write_lines(path: Path, lines: Sequence[Sequence[object]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows(lines)
+
+
+@contextmanager
+def _extra_installed(what: str) -> Iterator[None]:
+    """Says what to install if an import inside fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("fbse_drake"):
+            raise
+        needed = "pip install 'fbse_drake[cluster]'"
+        raise InputError(f"{what} need {error.name}: {needed}") from None
+
+
 def _write_results(
     console: Console, out: Path, name: str, scenario: Scenario, log: Log, metrics: dict[str, Any]
 ) -> None:
@@ -600,4 +695,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "add": _add,
     "hide": _hide,
     "reveal": _reveal,
+    "campaign": _campaign,
+    "table": _table,
 }

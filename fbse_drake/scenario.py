@@ -412,28 +412,79 @@ def read_scenario(
     scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()
 ) -> tuple[str, Scenario]:
     """As `load_scenario`; returns the scenario's name as well."""
-    path = resources.find(scenario, kind="scenarios")
-    file = schema.load_tree(path)
-    if name is None:
-        name = next(iter(file)) if len(file) == 1 else path.stem
-    if name not in file:
-        raise InputError(
-            f"{path}: no scenario called {name} (there are: {', '.join(map(str, file))})"
-        )
-    tree = file[name] if file[name] is not None else {}
-    source = str(path)
+    tree = ScenarioTree.read(scenario, name)
     for override in overrides:
-        tree = schema.merge(tree, _override(override))
-        source = f"{path} with {', '.join(overrides)}"
-    where = f"{source}: {name}"
-    if isinstance(tree, dict) and "effect_modules" in tree:
-        entries = schema.build(list[str], tree["effect_modules"], file=where, key="effect_modules")
+        tree = tree.overridden(override)
+    return tree.name, tree.build()
+
+
+@dataclass(frozen=True)
+class ScenarioTree:
+    """What a file says of a scenario, before defaults are filled in."""
+
+    name: str
+    path: Path
+    tree: Any
+    # What was put on top of the file, for messages.
+    changes: tuple[str, ...] = ()
+
+    @staticmethod
+    def read(scenario: str | Path, name: str | None = None) -> "ScenarioTree":
+        """Reads a file; see `load_scenario`.
+
+        Raises:
+            InputError: no such file, no YAML, or no scenario of this name in it.
+        """
+        path = resources.find(scenario, kind="scenarios")
+        file = schema.load_tree(path)
+        if name is None:
+            name = next(iter(file)) if len(file) == 1 else path.stem
+        if name not in file:
+            raise InputError(
+                f"{path}: no scenario called {name} (there are: {', '.join(map(str, file))})"
+            )
+        return ScenarioTree(name, path, file[name] if file[name] is not None else {})
+
+    def overridden(self, override: str) -> "ScenarioTree":
+        """With `a.b.c=value` on top, the value in YAML.
+
+        Raises:
+            InputError: this is no key and value.
+        """
+        key, value = _override(override)
+        return self.changed(key, value, override)
+
+    def changed(self, key: str, value: Any, text: str | None = None) -> "ScenarioTree":
+        """With the value of a key, as `a.b.c`, on top.
+
+        Args:
+            value: as `schema.load_tree` would have it.
+            text: the change, for messages.
+        """
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        text = text or f"{key}={value}"
+        return replace(self, tree=schema.merge(self.tree, value), changes=(*self.changes, text))
+
+    def build(self) -> Scenario:
+        """The scenario; see `load_scenario`.
+
+        Raises:
+            InputError: unknown key, wrong type, impossible value, unknown joint.
+        """
+        with_changes = f" with {', '.join(self.changes)}" if self.changes else ""
+        where, tree = f"{self.path}{with_changes}: {self.name}", self.tree
+        if isinstance(tree, dict) and "effect_modules" in tree:
+            entries = schema.build(
+                list[str], tree["effect_modules"], file=where, key="effect_modules"
+            )
+            with located(f"{where}: "):
+                modules = import_effect_modules(entries, self.path.parent)
+            tree = {**tree, "effect_modules": modules}
+        result = schema.build(Scenario, tree, file=where)
         with located(f"{where}: "):
-            tree = {**tree, "effect_modules": import_effect_modules(entries, path.parent)}
-    result = schema.build(Scenario, tree, file=where)
-    with located(f"{where}: "):
-        check_joints(result)
-    return name, result
+            check_joints(result)
+        return result
 
 
 def check_joints(scenario: Scenario) -> None:
@@ -463,16 +514,13 @@ def dump_scenario(scenario: Scenario, name: str) -> str:
     return schema.dump(scenario, child_name=name)
 
 
-def _override(text: str) -> dict[str, Any]:
+def _override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise InputError(
             f"--set {text}: expected KEY=VALUE, as in --set reference.step_length=0.05"
         )
     try:
-        tree: Any = yaml_load(data=f"value: {value}")["value"]
+        return key.strip(), yaml_load(data=f"value: {value}")["value"]
     except yaml.YAMLError:
         raise InputError(f"--set {text}: {value!r} is not valid YAML") from None
-    for part in reversed(key.strip().split(".")):
-        tree = {part: tree}
-    return tree

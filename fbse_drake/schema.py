@@ -78,13 +78,15 @@ def build(schema: type[T], tree: Any, *, file: str, key: str = "", default: T | 
     return _build(schema, tree, default, f"{file}: ", key)
 
 
-def dump(value: Any, *, child_name: str) -> str:
-    """YAML text of a dataclass as the child of a document; `build` of it gives an equal object.
+def dump(value: Any, *, child_name: str | None = None) -> str:
+    """YAML text of a dataclass, as the child of a document or as a document of its own; `build` of
+    it gives an equal object.
 
     Drake's own `yaml_dump_typed` leaves out the tag of the first alternative, which would tie a file to the order of alternatives.
     """
+    tree = _tree(type(value), value)
     return yaml.dump(
-        {child_name: _tree(type(value), value)},
+        tree if child_name is None else {child_name: tree},
         Dumper=_Dumper,
         sort_keys=False,
         default_flow_style=None,
@@ -121,13 +123,27 @@ def _tree(schema: Any, value: Any) -> Any:
         return [_tree(args[0], item) for item in value]
     if origin is dict:
         return {key: _tree(args[1], item) for key, item in value.items()}
+    if schema is Any:
+        return _tagged(value)
     if schema in _SCALARS:
         return value
     fields = {name: (kind, getattr(value, name)) for name, kind in _fields(schema).items()}
     return {name: _tree(kind, item) for name, (kind, item) in fields.items() if item is not None}
 
 
+def _tagged(value: Any) -> Any:
+    """A tree as `load_tree` has it, its tags as they are written."""
+    if isinstance(value, list):
+        return [_tagged(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    content = {key: _tagged(item) for key, item in value.items() if key != "_tag"}
+    return _Tagged(value["_tag"], content) if "_tag" in value else content
+
+
 def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
+    if schema is Any:
+        return value
     origin, args = typing.get_origin(schema), typing.get_args(schema)
     if schema in _SCALARS:
         return _scalar(schema, value, file, key)
