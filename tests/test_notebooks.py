@@ -60,12 +60,11 @@ def test_there_are_notebooks():
 @each_notebook
 def test_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
-    if (
-        "fbse" in notebook.metadata
-        and notebook.metadata.fbse.needs_data
-        and not os.environ.get("FBSE_DATA_DIR")
-    ):
+    needs = notebook.metadata.get("fbse", {})
+    if needs.get("needs_data") and not os.environ.get("FBSE_DATA_DIR"):
         pytest.skip("FBSE_DATA_DIR does not name the folder of the recordings that it shows")
+    for module in needs.get("needs_modules", []):
+        pytest.importorskip(module)
     run(notebook, path.parent, tmp_path)
     assert errors(notebook) == []
 
