@@ -13,9 +13,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from fbse_drake import Log, build_station, simulate
+from fbse_drake import Log, Scenario, build_station, simulate
+from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.report.metrics import stance_creep
 from fbse_drake.robot.plant import make_robot
+from fbse_drake.scenario import RobotConfig
+from fbse_drake.walking.reference import JointSines
 
 GRAVITY = 9.81
 Run = Callable[..., Log]
@@ -262,6 +265,34 @@ def test_walk_at_a_step_of_two_milliseconds_is_the_same_walk(run: Run):
     np.testing.assert_allclose(longer.time, shorter.time[::2], atol=1e-12)
     change = longer["truth/com/position"] - shorter["truth/com/position"][::2]
     assert np.abs(change).max() < 1e-3
+
+
+@pytest.mark.parametrize("step", [0.004, 0.002, 0.001])
+def test_a_sampled_position_loop_damps_by_its_closed_form(step: float):
+    """kd - kp (T - h) / 2 at control period T and plant step h, of models/pendulum.urdf."""
+    kp, period, inertia = 5.0, 0.004, 0.49 * 0.1**2 + 1.5e-4
+    lost = kp * (period - step) / 2
+
+    def growth(kd: float) -> float:
+        """Of the swing about the place where a loop without feed-forward lets the arm sag [1/s]."""
+        log = simulate(
+            Scenario(
+                robot=RobotConfig("pendulum"),
+                model=RobotConfig("pendulum"),
+                reference=JointSines(posture={"servo": 0.2}),
+                control=PositionLoopConfig(
+                    kp={"servo": kp}, kd={"servo": kd}, feedforward=False, period=period
+                ),
+                plant=MultibodyPlantConfig(time_step=step),
+                duration=2.0,
+            )
+        ).log
+        angle = log["truth/joint/position"][:, 0]
+        quarters = np.split(angle[: len(angle) // 4 * 4] - angle.mean(), 4)
+        return np.log(quarters[3].std() / quarters[0].std()) / 1.5
+
+    assert growth(kd=0.0) == pytest.approx(lost / (2 * inertia), rel=0.03, abs=5e-3)
+    assert growth(kd=lost) == pytest.approx(0.0, abs=5e-3)
 
 
 def law_error(log: Log) -> np.ndarray:

@@ -25,7 +25,8 @@ class PositionLoopConfig:
     torque_limit: dict[str, float] = field(default_factory=lambda: {"all": 300.0})
     # Is the reference's feed-forward torque (gravity and inertia) added?
     feedforward: bool = True
-    # Period of the control [s]; by default `Scenario.usual_period`.
+    # Period of the control [s]; by default `Scenario.usual_period`. The loop damps by
+    # kd - kp (period - plant step) / 2, for a held command is late.
     period: float | None = None
 
     def __post_init__(self) -> None:
