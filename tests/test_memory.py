@@ -57,10 +57,10 @@ def test_a_released_station_and_all_systems_in_it_are_freed(
     not _STATISTICS.exists(), reason="the memory of a process is read as Linux has it"
 )
 def test_memory_levels_off_over_simulations_and_estimates() -> None:
-    """Each run has 20 MiB and more of diagrams and records."""
-    walk = scenario("paper_walk_fbse", "duration=1")
+    """What is not freed of a run is 10 MiB of its station and 2 MiB of its estimators."""
+    walk = scenario("paper_walk_fbse", "duration=0.3")
     used = []
     for _ in range(7):
         estimate(walk, simulate(walk).log)
         used.append(resident())
-    assert used[-1] - used[2] < 16.0
+    assert used[-1] - used[2] < 6.0
