@@ -1,6 +1,7 @@
 """What is put into a log is found, with intervals that hold it; what is not is not; and what cannot be seen is said to be so."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import ClassVar
@@ -69,7 +70,17 @@ def log_with(hidden: str) -> Log:
 
 @cache
 def diagnosis_of(hidden: str) -> Diagnosis:
-    return diagnose(Predictor(scenario(), log_with(hidden)), effects())
+    diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), effects())
+    # Explanations on the way hold what they were fitted to.
+    return replace(diagnosis, path=())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten() -> Iterator[None]:
+    """Logs and diagnoses are kept for this file alone: its worker goes on with others."""
+    yield
+    for kept in (log_with, diagnosis_of):
+        kept.cache_clear()
 
 
 HIDDEN = {
