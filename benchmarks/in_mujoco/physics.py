@@ -169,16 +169,16 @@ class Payload(Physics):
 
     @property
     def answers(self) -> tuple[HiddenEffect, ...]:
-        return (
-            _values("BodyMass", (self.body,), self.mass),
-            _values("BodyCentreOfMass", (self.body,), self.mass),
-        )
+        place = dict(zip("xyz", self.place, strict=True))
+        return (_values("Payload", (self.body,), self.mass, mass=self.mass, **place),)
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         moment = 0.4 * self.mass * self.radius**2
         spec.body(self.body).add_body(
             name="payload",
             pos=self.place,
+            # What is not given here is taken from `pos`.
+            ipos=(0.0, 0.0, 0.0),
             mass=self.mass,
             inertia=[moment] * 3,
             explicitinertial=True,
