@@ -117,7 +117,11 @@ class Dictionary:
             for target in self._targets(effect):
                 usual = self.usual_at(effect, target)
                 raw = self.predictor.signature(effect, target, usual)
-                raw = replace(raw, lowest=effect.lowest_values(self.predictor.robot, target))
+                raw = replace(
+                    raw,
+                    lowest=effect.lowest_values(self.predictor.robot, target),
+                    prior=effect.linear_beliefs() ** -2,
+                )
                 if len(raw.rows):
                     noise = (
                         self.predictor.noise_in(effect, target, raw)

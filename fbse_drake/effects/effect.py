@@ -56,6 +56,9 @@ class Parameter:
     grid: int = 9
     # For a nonlinear one: the value with which there is no effect; targets that are not named get it.
     neutral: float | None = None
+    # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that a log which does not show it does not
+    # make it large; by default nothing is believed.
+    belief: float = np.inf
 
     @property
     def lever_factor(self) -> float:
@@ -109,6 +112,11 @@ class Effect(ABC):
     def largest_plausible(cls, unit: str = "Nm") -> float:
         """Largest plausible size of its first parameter, which says how strong it is; at a joint whose torque has this unit."""
         return max(abs(bound) for bound in next(iter(cls.parameters_at(unit).values())).plausible)
+
+    @classmethod
+    def linear_beliefs(cls) -> np.ndarray:
+        """Standard deviations of what is believed of its linear parameters, (p,)."""
+        return np.array([p.belief for p in cls.parameters.values() if p.linear])
 
     @classmethod
     def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:  # noqa: ARG003

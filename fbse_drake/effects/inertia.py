@@ -196,11 +196,13 @@ class Payload(InertiaEffect):
     parameters: ClassVar[dict[str, Parameter]] = {
         "mass": Parameter("kg", linear=True, plausible=(0.0, 10.0)),
         **{
-            axis: Parameter("m", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf))
+            axis: Parameter(
+                "m", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf), belief=0.5
+            )
             for axis in "xyz"
         },
         **{
-            f"s{axis}{axis}": Parameter("kg m^2", linear=True, plausible=(0.0, 0.5))
+            f"s{axis}{axis}": Parameter("kg m^2", linear=True, plausible=(0.0, 0.5), belief=0.1)
             for axis in "xyz"
         },
     }
