@@ -33,7 +33,7 @@ bench: $(INSTALLED)
 
 # How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores; then on walks that nobody tuned to,
 # with faults of the sensors, beside the smallest error that the sensors allow, and whether it is as sure as it says, a quarter of an hour
-# each at most.
+# each at most. Walks that are done are not walked again while nothing in the package changes.
 fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.fbse
 	$(VENV)/bin/python -m benchmarks.off_nominal

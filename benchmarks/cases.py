@@ -1,25 +1,18 @@
-"""Cases of hidden physics: how the benchmarks that hide it run, keep and show them."""
+"""Cases of hidden physics: what came out of them, and how it is judged."""
 
+import argparse
 import hashlib
 import json
-import multiprocessing
-import os
-import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table as ConsoleTable
 
 from fbse_drake.discrepancy.diagnose import diagnose
 from fbse_drake.effects.effect import library
-from fbse_drake.files import write_text
-from fbse_drake.report.html import Table, number
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 
@@ -29,29 +22,18 @@ class Case(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called, also as a file."""
+        """What it is called."""
 
 
-# Runs a case and tells its "answer", "score" and "diagnoses", as JSON has them.
-Judge = Callable[[Any], dict[str, Any]]
-
-
-def run(job: tuple[Case, Path, str, Judge]) -> None:
-    """Runs a case and writes what came out.
+def judged(case: Case, result: dict[str, Any], sources: str) -> dict[str, str]:
+    """Figures of a run, see `benchmarks.store.Store`.
 
     Args:
-        job: the case, the file that is written, a checksum of the sources, and who runs it.
+        result: "answer", "score" and "diagnoses" of the case.
+        sources: checksum of the sources that made it.
     """
-    case, path, sources, judge = job
-    try:
-        result = judge(case)
-    except Exception:  # One bad case must not stop the others.
-        result = {"error": traceback.format_exc()}
-    write_text(
-        path,
-        json.dumps({"sources": sources, "case": asdict(case), **result}, indent=1, default=float)
-        + "\n",
-    )
+    tree = {"sources": sources, "case": asdict(case), **result}
+    return {"sources": sources, "result": json.dumps(tree, default=float)}
 
 
 @dataclass(frozen=True)
@@ -200,53 +182,19 @@ def sources_checksum(*more: Path, note: str = "") -> str:
     return hashlib.sha256(b"".join([*contents, note.encode()])).hexdigest()
 
 
-class Store:
-    """The folder that holds a file for every case."""
+def add_options(parser: argparse.ArgumentParser, out: str, quick: str, names: str) -> None:
+    """Options of a benchmark of cases.
 
-    def __init__(self, folder: Path, sources: str, *, keep: bool):
-        """Makes the folder.
-
-        Args:
-            sources: checksum of the sources; files made by others do not count.
-            keep: they do count.
-        """
-        self._folder, self._sources, self._keep = folder, sources, keep
-        folder.mkdir(parents=True, exist_ok=True)
-
-    def read(self, cases: Iterable[Case]) -> list[Result]:
-        """Results of those cases that have been run."""
-        trees = [json.loads(path.read_text()) for path in map(self._path, cases) if path.exists()]
-        return [Result(tree) for tree in trees if self._keep or tree["sources"] == self._sources]
-
-    def run(
-        self, cases: Iterable[Case], judge: Judge, jobs: int, console: Console, title: str
-    ) -> None:
-        """Runs those cases that have not been run."""
-        cases = list(cases)
-        done = {result.name for result in self.read(cases)}
-        todo = [
-            (case, self._path(case), self._sources, judge)
-            for case in cases
-            if case.name not in done
-        ]
-        # Numerical libraries must not start threads of their own beside a process for every core.
-        os.environ |= dict.fromkeys(
-            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-        )
-        # The shells of systems written in Python are never freed: a process grows slowly.
-        with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=10) as pool:
-            for _ in track(pool.imap_unordered(run, todo), title, len(todo), console=console):
-                pass
-
-    def _path(self, case: Case) -> Path:
-        return self._folder / f"{case.name}.json"
-
-
-def print_table(console: Console, title: str, table: Table) -> None:
-    """Prints a table of texts and numbers."""
-    shown = ConsoleTable(title=title, title_justify="left")
-    for head in table.header:
-        shown.add_column(head)
-    for row in table.rows:
-        shown.add_row(*(cell if isinstance(cell, str) else number(cell) for cell in row))
-    console.print(shown)
+    Args:
+        out: where everything goes by default.
+        quick: what is done in short.
+        names: examples of parts of names.
+    """
+    parser.add_argument("--quick", action="store_true", help=quick)
+    only = f"run only cases with this in their names, as {names}"
+    parser.add_argument("--only", default="", metavar="NAME", help=only)
+    jobs = "cases that run at once (default: all cores)"
+    parser.add_argument("--jobs", type=int, default=None, help=jobs)
+    parser.add_argument("--keep", action="store_true", help="keep results of other sources")
+    where = f"where everything goes (default {out})"
+    parser.add_argument("--out", type=Path, default=Path(out), help=where)

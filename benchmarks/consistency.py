@@ -16,17 +16,17 @@ import argparse
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from benchmarks.fbse import print_table
+from benchmarks.console import print_table
+from benchmarks.store import Runs, package_checksum
 from fbse_drake import Log, load_scenario, simulate
+from fbse_drake.campaign.steps import Material
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import (
@@ -68,10 +68,22 @@ def normalised_errors(log: Log) -> Iterator[tuple[str, np.ndarray]]:
     yield "NEES of friction, swing", np.where(stands, np.nan, friction)
 
 
-def run(job: tuple[str, int]) -> tuple[str, dict[str, tuple[float, float, float]]]:
-    """Walks with a seed; returns the walk's name and, by state and update, the mean of the
-    normalised squares, the share of them in the band, and the share above it."""
-    walk, seed = job
+def work(material: Material) -> dict[str, str]:
+    """Does a run; see `benchmarks.store.Runs`."""
+    result = run(material.values["walk"], material.seed)
+    return {
+        "sources": _sources(),
+        "result": json.dumps({"walk": material.values["walk"], "figures": result}),
+    }
+
+
+def _sources() -> str:
+    return package_checksum(Path(__file__))
+
+
+def run(walk: str, seed: int) -> dict[str, tuple[float, float, float]]:
+    """Walks with a seed; returns, by state and update, the mean of the normalised squares, the
+    share of them in the band, and the share above it."""
     scenario, *overrides = WALKS[walk]
     log = simulate(load_scenario(scenario, overrides=[_DURATION, f"seed={seed}", *overrides])).log
     log = log.part(slice(int(np.searchsorted(log.time, _START - 1e-6)), None))
@@ -87,7 +99,7 @@ def run(job: tuple[str, int]) -> tuple[str, dict[str, tuple[float, float, float]
             within = (counted >= _BAND[0]) & (counted <= _BAND[1])
             shares = within.mean(), np.mean(counted > _BAND[1])
             result[name] = (float(counted.mean()), *map(float, shares))
-    return walk, result
+    return result
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -98,13 +110,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/fbse"), help="default out/fbse")
     options = parser.parse_args(arguments)
     console = Console(width=190)
-    jobs = [(walk, seed) for walk in WALKS for seed in range(options.seeds)]
+    values = [{"walk": walk, "seed": seed} for walk in WALKS for seed in range(options.seeds)]
+    runs = Runs(options.out / "consistency", "benchmarks.consistency:work", values, _sources())
+    runs.run(console, "walking", workers=options.jobs)
     found = defaultdict(list)
-    with Pool(options.jobs, maxtasksperchild=4) as pool:
-        walks = pool.imap(run, jobs)
-        for walk, result in track(walks, "walking", len(jobs), console=console):
-            for name, figures in result.items():
-                found[walk, name].append(figures)
+    for result in runs.results():
+        for name, figures in result["figures"].items():
+            found[result["walk"], name].append(figures)
     lines = [(*key, *np.mean(figures, axis=0).tolist()) for key, figures in found.items()]
     header = ("Walk", "quantity", "mean", "within the central 99 %", "above it")
     print_table(console, f"Consistency from {_START:g} s on", Table(header, tuple(lines)))

@@ -35,7 +35,7 @@ from rich.progress import track
 from scipy.ndimage import binary_dilation
 from scipy.signal import lfilter
 
-from benchmarks.fbse import print_table
+from benchmarks.console import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.estimate import Replay
 from fbse_drake.estimators.estimator import EstimatorDiagram, NoEstimator

@@ -11,23 +11,23 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from multiprocessing import Pool
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from rich.console import Console
-from rich.progress import track
-from rich.table import Table as ConsoleTable
 
-from fbse_drake import Log, load_scenario, simulate
+from benchmarks.console import print_table
+from benchmarks.store import Runs, package_checksum
+from fbse_drake import Log, load_scenario, schema, simulate
+from fbse_drake.campaign.steps import Material
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.identification import identify
 from fbse_drake.files import write_text
-from fbse_drake.report.html import Report, Section, Table, number, write_report
+from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.resources import folder
 
@@ -70,12 +70,21 @@ class Case:
     child: str | None = None
     overrides: tuple[str, ...] = ()
     # Estimators that are run over its log besides, by name: as in `--set estimator=...`, or the name of another child of the scenario.
-    watchers: Mapping[str, str] | None = None
+    watchers: dict[str, str] | None = None
 
 
-def run(job: tuple[Case, int]) -> tuple[str, dict[str, dict[str, Any]]]:
-    """Simulates a case; returns its name and the figures of the walk (under the case's name) and of each watcher."""
-    case, seed = job
+def walk(material: Material) -> dict[str, str]:
+    """Does a run; see `benchmarks.store.Runs`."""
+    case = schema.build(Case, material.values["case"], file="", key="case")
+    return {"sources": _sources(), "result": json.dumps(run(case, material.seed))}
+
+
+def _sources() -> str:
+    return package_checksum(Path(__file__))
+
+
+def run(case: Case, seed: int) -> dict[str, dict[str, Any]]:
+    """Simulates a case; returns the figures of the walk (under the case's name) and of each watcher."""
     with tempfile.TemporaryDirectory() as scratch:
         overrides = [
             f"seed={seed}",
@@ -99,7 +108,7 @@ def run(job: tuple[Case, int]) -> tuple[str, dict[str, dict[str, Any]]]:
             results[name] = _figures(
                 watched.log, result.failure, 1e6 * float(np.median(watched.tick_time))
             )
-    return case.name, results
+    return results
 
 
 def _start(log: Log, samples: int) -> Log:
@@ -117,7 +126,7 @@ def _figures(log: Log, failure: str | None, tick_us: float) -> dict[str, Any]:
         "base_velocity": list(metrics["base_velocity_rmse"].values()),
         "tracking": 1e3 * float(np.mean(list(metrics["joint_tracking_rms"].values()))),
         "com_error": [1e3 * value for value in metrics["com_rse_mean"].values()],
-        "com": log["truth/com/position"][:, :2],
+        "com": log["truth/com/position"][:, :2].tolist(),
         "tick_us": tick_us,
         "joints": log.joints,
     }
@@ -266,7 +275,7 @@ class Results:
         """Mean distance of the CoM to that of the same walk `other`, in x and y [mm]."""
         pairs = zip(self._runs[name], self._runs[other], strict=True)
         rows = [
-            np.abs(a["com"][: len(b["com"])] - b["com"][: len(a["com"])]).mean(axis=0)
+            np.abs(np.subtract(a["com"][: len(b["com"])], b["com"][: len(a["com"])])).mean(axis=0)
             for a, b in pairs
         ]
         return 1e3 * np.mean(rows, axis=0)
@@ -419,18 +428,6 @@ def tables(results: Results, robust: Results) -> dict[str, Table]:
     }
 
 
-def print_table(console: Console, title: str, table: Table) -> None:
-    """Prints a table, texts to the left and numbers to the right."""
-    shown = ConsoleTable(title=title, title_justify="left")
-    for head, cell in zip(table.header, table.rows[0], strict=True):
-        shown.add_column(head, justify="left" if isinstance(cell, str) else "right")
-    for row in table.rows:
-        shown.add_row(
-            *(str(cell) if isinstance(cell, (str, int)) else number(float(cell)) for cell in row)
-        )
-    console.print(shown)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs everything and prints the tables."""
     parser = argparse.ArgumentParser(description="Figures of merit of the friction estimate.")
@@ -453,19 +450,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     fixed = {
         scenario: fixed_friction(scenario) for scenario in ("paper_walk_fbse", "hrp2_walk_fbse")
     }
-    jobs = [(case, seed) for seed in range(options.seeds) for case in cases(fixed)]
-    robust_jobs = [
-        (case, seed) for seed in range(options.robustness_seeds) for case in robustness_cases()
-    ]
     results, robust = Results(), Results()
-    with Pool() as pool:
-        # In order, so that the runs of a seed stay together.
-        for _, figures in track(pool.imap(run, jobs), "walking", len(jobs), console=console):
-            results.add(figures)
-        for _, figures in track(
-            pool.imap(run, robust_jobs), "walking with errors", len(robust_jobs), console=console
-        ):
-            robust.add(figures)
+    for into, title, all_cases, seeds in (
+        (results, "walking", cases(fixed), options.seeds),
+        (robust, "walking with errors", robustness_cases(), options.robustness_seeds),
+    ):
+        values = [
+            {"case": asdict(case), "seed": seed} for seed in range(seeds) for case in all_cases
+        ]
+        runs = Runs(options.out / "runs", "benchmarks.fbse:walk", values, _sources())
+        runs.run(console, title, workers=None)
+        for figures in runs.results():
+            into.add(figures)
     made = tables(results, robust)
     for title, table in made.items():
         print_table(console, title, table)

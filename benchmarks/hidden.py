@@ -3,19 +3,17 @@
 
 Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also nothing, two effects at once, effects that
 the library does not have, and effects in robots that differ from their model in contact solver, plant step or friction law. Each log is
-diagnosed. Every case leaves DIR/cases/<case>.json; those that are there already, made by the same sources, are not run again. Prints the
-figures beside what was asked for and saves them as DIR/report.html with the confusion matrix, which is also DIR/confusion.png.
+diagnosed. Every case becomes a row of a campaign in DIR; those that are there already, made by the same sources, are not run again. Prints
+the figures beside what was asked for and saves them as DIR/report.html with the confusion matrix, which is also DIR/confusion.png.
 """
 
 import argparse
-import os
 import time
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -26,12 +24,15 @@ from benchmarks.cases import (
     NOTHING,
     UNKNOWN,
     Result,
-    Store,
-    print_table,
+    add_options,
+    judged,
     share,
     sources_checksum,
 )
-from fbse_drake import load_scenario
+from benchmarks.console import print_table
+from benchmarks.store import Store
+from fbse_drake import load_scenario, schema
+from fbse_drake.campaign.steps import Material
 from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import SIZES, Answer, HiddenEffect, make_exercise, record, score
 from fbse_drake.discrepancy.prediction import Predictor
@@ -239,6 +240,12 @@ def _run(case: Case) -> dict[str, Any]:
         "steps": found["steps"],
         "diagnoses": found["diagnoses"],
     }
+
+
+def judge(material: Material) -> dict[str, str]:
+    """Runs a case; see `benchmarks.store.Store`."""
+    case = schema.build(Case, material.values["case"], file="", key="case")
+    return judged(case, _run(case), sources_checksum())
 
 
 def stated_sizes(decoys: Sequence[Result]) -> dict[str, dict[str, float]]:
@@ -505,15 +512,8 @@ def _rollouts(result: Result) -> tuple[float, float]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs what has not been run, and prints the figures of all that has."""
     parser = argparse.ArgumentParser(description="How well missing physics is found.")
-    parser.add_argument(
-        "--quick", action="store_true", help="one seed, medium sizes, few of the other cases"
-    )
-    parser.add_argument(
-        "--only",
-        default="",
-        metavar="NAME",
-        help="run only cases with this in their names, as effect-TorqueGain or decoy",
-    )
+    quick = "one seed, medium sizes, few of the other cases"
+    add_options(parser, "out/hidden", quick, "effect-TorqueGain or decoy")
     parser.add_argument(
         "--seeds", type=int, default=3, help="number of seeds of each effect and size (default 3)"
     )
@@ -524,36 +524,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         default=SIZES,
         help="sizes of the effects (default all)",
     )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=os.cpu_count(),
-        help="cases that run at once (default: all cores)",
-    )
-    parser.add_argument("--keep", action="store_true", help="keep results of other sources")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/hidden"),
-        help="where everything goes (default out/hidden)",
-    )
     options = parser.parse_args(arguments)
     console = Console(width=190)
-    store = Store(options.out / "cases", sources_checksum(), keep=options.keep)
+    sources = None if options.keep else sources_checksum()
     seeds, sizes = (1, ("medium",)) if options.quick else (options.seeds, options.sizes)
-    drawn, lengths = cases(seeds, sizes, quick=options.quick), length_cases()
 
-    def wanted(some: Iterable[Case]) -> list[Case]:
-        return [case for case in some if options.only in case.name]
+    def store(name: str, some: Sequence[Case]) -> Store:
+        return Store(options.out / name, "benchmarks.hidden:judge", some, sources)
 
-    store.run(wanted(drawn), _run, options.jobs, console, "hiding and finding")
-    thresholds = threshold_cases(Figures.of_finished(store.read(drawn)).stated)
+    drawn = store("cases", cases(seeds, sizes, quick=options.quick))
+    drawn.run(console, "hiding and finding", only=options.only, workers=options.jobs)
+    stated = Figures.of_finished(drawn.read()).stated
+    thresholds = store("thresholds", threshold_cases(stated))
+    lengths = store("lengths", length_cases())
     if not options.quick:
-        store.run(wanted(thresholds), _run, options.jobs, console, "at the smallest sizes")
+        thresholds.run(console, "at the smallest sizes", only=options.only, workers=options.jobs)
         # Alone, since their times are compared.
-        store.run(wanted(lengths), _run, 1, console, "longer logs")
+        lengths.run(console, "longer logs", only=options.only, workers=1)
 
-    everything = store.read([*drawn, *thresholds, *lengths])
+    everything = [*drawn.read(), *thresholds.read(), *lengths.read()]
     figures = Figures.of_finished(everything)
     errors = [
         f"{result.name}:\n{result.tree['error']}" for result in everything if "error" in result.tree

@@ -49,7 +49,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.linalg import cho_factor, cho_solve
 
-from benchmarks.fbse import print_table
+from benchmarks.console import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError

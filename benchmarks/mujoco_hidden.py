@@ -3,21 +3,20 @@
 
 A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
 that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
-does not have. Each log is diagnosed. Every case leaves DIR/cases/<case>.json; those that are there
-already, made by the same sources, are not run again. Prints the figures beside what was asked for
+does not have. Each log is diagnosed. Every case becomes a row of a campaign in DIR; those that are
+there already, made by the same sources, are not run again. Prints the figures beside what was asked for
 and a line for each case that went wrong, and saves both as DIR/figures.json.
 """
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.cases import Result, Store, print_table, share
+from benchmarks.cases import Result, add_options, share
+from benchmarks.console import print_table
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 
@@ -97,40 +96,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description="How well missing physics is found in another simulator."
     )
-    parser.add_argument("--quick", action="store_true", help="every fourth case")
-    parser.add_argument(
-        "--only",
-        default="",
-        metavar="NAME",
-        help="run only cases with this in their names, as arm or decoy-biped",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=os.cpu_count(),
-        help="cases that run at once (default: all cores)",
-    )
-    parser.add_argument("--keep", action="store_true", help="keep results of other sources")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/mujoco"),
-        help="where everything goes (default out/mujoco)",
-    )
+    add_options(parser, "out/mujoco", "every fourth case", "arm or decoy-biped")
     options = parser.parse_args(arguments)
     if find_spec("mujoco") is None:
         print("MuJoCo is not installed (pip install 'fbse_drake[mujoco]'): no case runs in it.")
         return
-    from benchmarks.in_mujoco.cases import decoys, effects, judge, sources, strangers
+    from benchmarks.in_mujoco.cases import all_cases, sources
+    from benchmarks.store import Store
 
     console = Console(width=190)
-    every = 4 if options.quick else 1
-    cases = [case for group in (effects(), decoys(), strangers()) for case in group[::every]]
-    store = Store(options.out / "cases", sources(), keep=options.keep)
-    wanted = [case for case in cases if options.only in case.name]
-    store.run(wanted, judge, options.jobs, console, "hiding in MuJoCo and finding")
+    cases = [case for group in all_cases() for case in group[:: 4 if options.quick else 1]]
+    store = Store(
+        options.out / "cases",
+        "benchmarks.in_mujoco.cases:judge",
+        cases,
+        None if options.keep else sources(),
+    )
+    store.run(console, "hiding in MuJoCo and finding", only=options.only, workers=options.jobs)
 
-    everything = store.read(cases)
+    everything = store.read()
     table, lines = figures(everything), failures(everything)
     print_table(console, "Hidden physics in MuJoCo", table)
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)

@@ -16,15 +16,16 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing import Pool
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 
-from benchmarks.fbse import print_table
+from benchmarks.console import print_table
+from benchmarks.store import Runs, package_checksum
 from fbse_drake import Log, load_scenario, simulate
+from fbse_drake.campaign.steps import Material
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import Estimator
@@ -39,8 +40,6 @@ _BANDWIDTHS = (2.0, 5.0, 10.0, 20.0, 40.0)
 _START = 0.8
 # Standard deviations within which 99 % of the errors are to be.
 _CONFIDENCE = 2.58
-# Processes start afresh after so many walks: what Drake allocates adds up.
-_WALKS_PER_PROCESS = 4
 
 
 @dataclass(frozen=True)
@@ -185,9 +184,27 @@ class Walked:
     figures: dict[tuple[str, str], Figures]
 
 
-def run(job: tuple[Case, int, float]) -> Walked:
+def walk(material: Material) -> dict[str, str]:
+    """Does a run; see `benchmarks.store.Runs`."""
+    (case,) = (case for case in CASES if case.name == material.values["case"])
+    walked = run(case, material.seed, material.values["duration"])
+    figures = [[*watcher, vars(of_watcher)] for watcher, of_watcher in walked.figures.items()]
+    return {"sources": _sources(), "result": json.dumps([case.name, walked.failure, figures])}
+
+
+def _sources() -> str:
+    return package_checksum(Path(__file__))
+
+
+def read(case: str, failure: str | None, figures: Sequence[Sequence[Any]]) -> Walked:
+    """What `walk` has written."""
+    return Walked(
+        case, failure, {(method, variant): Figures(**of) for method, variant, of in figures}
+    )
+
+
+def run(case: Case, seed: int, duration: float) -> Walked:
     """Simulates a case with a seed for a duration [s], and has it watched."""
-    case, seed, duration = job
     common = [f"seed={seed}", f"duration={duration}", *case.told]
     nobody = ["estimator=!NoEstimator {}"]
     result = simulate(load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold]))
@@ -260,13 +277,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     console = Console(width=190)
     wanted = [case for case in CASES if case.name in (options.only or names)]
-    jobs = [(case, seed, options.duration) for case in wanted for seed in range(options.seeds)]
-    shown = {"description": "walking", "total": len(jobs), "console": console}
-    if options.jobs > 1:
-        with Pool(options.jobs, maxtasksperchild=_WALKS_PER_PROCESS) as pool:
-            walks = list(track(pool.imap(run, jobs), **shown))
-    else:
-        walks = list(track(map(run, jobs), **shown))
+    values = [
+        {"case": case.name, "duration": options.duration, "seed": seed}
+        for case in wanted
+        for seed in range(options.seeds)
+    ]
+    runs = Runs(options.out / "off_nominal", "benchmarks.off_nominal:walk", values, _sources())
+    runs.run(console, "walking", workers=options.jobs)
+    walks = [read(*result) for result in runs.results()]
     rows = all_rows(walks)
     title = f"Off the beaten path: friction from 1 s on, {options.seeds} seed(s)"
     print_table(console, title, table(best_rows(rows)))

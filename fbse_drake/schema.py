@@ -119,13 +119,13 @@ def _tree(schema: Any, value: Any) -> Any:
         tree = _tree(type(value), value)
         optional = len(args) == 2 and type(None) in args
         return tree if optional else _Tagged(f"!{type(value).__name__}", tree)
-    if origin is list:
+    if origin in (list, tuple):
         return [_tree(args[0], item) for item in value]
     if origin is dict:
         return {key: _tree(args[1], item) for key, item in value.items()}
     if schema is Any:
         return _tagged(value)
-    if schema in _SCALARS:
+    if schema in _SCALARS or origin is typing.Literal:
         return value
     fields = {name: (kind, getattr(value, name)) for name, kind in _fields(schema).items()}
     return {name: _tree(kind, item) for name, (kind, item) in fields.items() if item is not None}
@@ -149,12 +149,19 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         return _scalar(schema, value, file, key)
     if origin in (typing.Union, types.UnionType):
         return _alternative(args, value, default, file, key)
+    if origin is typing.Literal:
+        if value not in args:
+            allowed = ", ".join(map(str, args))
+            raise InputError(f"{file}{key}: expected one of {allowed}; found {_describe(value)}")
+        return value
     if _alternatives(schema):
         return _alternative(_alternatives(schema), value, default, file, key)
     if origin is list:
-        if not isinstance(value, list):
+        if not isinstance(value, (list, tuple)):
             raise InputError(f"{file}{key}: expected a list, found {_describe(value)}")
         return [_build(args[0], item, None, file, f"{key}[{i}]") for i, item in enumerate(value)]
+    if origin is tuple:
+        return tuple(_build(list[args[0]], value, None, file, key))
     if origin is dict:
         if not isinstance(value, dict):
             raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")

@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from distributed import LocalCluster
 
+from benchmarks import hidden
+from benchmarks.store import Runs
+from fbse_drake import schema
 from fbse_drake.campaign import cluster as campaign_cluster
 from fbse_drake.campaign.campaign import Campaign, dump_campaign, load_campaign
 from fbse_drake.campaign.cluster import Outcome, run_campaign
@@ -228,6 +232,7 @@ design: !Random
             "high: expected more than low",
         ),
         ("steps: {a: !Simulate {}}", "steps.a: this step needs a scenario"),
+        ("steps: {a: !Hide {size: huge}}", "expected one of small, medium, large; found 'huge'"),
     ],
 )
 def test_a_bad_file_gets_one_line(
@@ -308,3 +313,27 @@ def test_a_stopped_campaign_goes_on(tmp_path: Path, scheduler: str):
     assert {path.name: path.read_bytes() for path in files} == whole
     assert {path: path.stat().st_mtime_ns for path in files[2:]} == times
     assert len(pq.read_table(out / "rows")) == 6
+
+
+def test_cases_of_hidden_physics_come_back_from_plain_values():
+    """As a worker gets them."""
+    some = [*hidden.cases(1, ("large",), quick=True), *hidden.length_cases()]
+    assert any(case.answer is not None for case in some)
+    for case in some:
+        assert schema.build(hidden.Case, asdict(case), file="", key="case") == case
+
+
+def test_runs_of_a_benchmark_that_other_sources_made_are_forgotten(tmp_path: Path, scheduler: str):
+    (tmp_path / "walk.py").write_text(
+        "def walk(material):\n"
+        "    return {'sources': material.values['sources'], 'result': str(material.seed)}\n"
+    )
+    values = [{"seed": k, "sources": "new" if k else "old"} for k in range(3)]
+
+    def runs(sources: str | None) -> Runs:
+        return Runs(tmp_path / "out", f"{tmp_path}/walk.py:walk", values, sources)
+
+    run_campaign(runs(None).campaign, str(tmp_path / "out"), scheduler=scheduler)
+    assert runs(None).results() == [0, 1, 2]
+    assert runs("new").results() == [1, 2]
+    assert runs(None).results() == [1, 2]

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from benchmarks.cases import sources_checksum
+from benchmarks.cases import judged, sources_checksum
 from benchmarks.in_mujoco.loop import Run, record
 from benchmarks.in_mujoco.physics import (
     AccelerometerBias,
@@ -40,6 +40,7 @@ from benchmarks.in_mujoco.physics import (
 )
 from benchmarks.in_mujoco.robot import make_machine
 from fbse_drake import load_scenario
+from fbse_drake.campaign.steps import Material
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
 from fbse_drake.discrepancy.hidden import Answer, HiddenEffect, Score, score
@@ -226,7 +227,19 @@ def strangers() -> list[Case]:
     ]
 
 
-def judge(case: Case) -> dict[str, Any]:
+def all_cases() -> tuple[list[Case], list[Case], list[Case]]:
+    """Effects, decoys and strangers."""
+    return effects(), decoys(), strangers()
+
+
+def judge(material: Material) -> dict[str, str]:
+    """Runs the case of this name; see `benchmarks.store.Store`."""
+    name = material.values["case"]["name"]
+    (case,) = (case for group in all_cases() for case in group if case.name == name)
+    return judged(case, _run(case), sources())
+
+
+def _run(case: Case) -> dict[str, Any]:
     """Runs a case and diagnoses its log."""
     scenario, reference = (_arm if case.robot == "arm" else _biped)(case)
     run = Run(

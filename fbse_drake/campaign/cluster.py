@@ -45,6 +45,8 @@ def run_campaign(
     *,
     scheduler: str | None = None,
     workers: int | None = None,
+    only: Callable[[Run], bool] = lambda _: True,
+    others: bool = False,
     progress: Progress = silent,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Outcome:
@@ -55,6 +57,8 @@ def run_campaign(
             machines must reach it too.
         scheduler: address of a Dask scheduler; by default one is started, with workers.
         workers: how many are started; by default one for each core.
+        only: which of the runs are done now; by default all.
+        others: may the folder have rows of runs that this campaign does not have?
         progress: is told how much is done; if it interrupts, what is done is kept.
         tell: is told, in lines, what the reader should know.
 
@@ -64,16 +68,18 @@ def run_campaign(
     folder, runs, schema = Folder(place), campaign.runs, schema_of(campaign.columns)
     keys = {run.key for run in runs}
     done = folder.done()
-    if foreign := done - keys:
+    if (foreign := done - keys) and not others:
         raise InputError(
             f"--out {place}: has {len(foreign)} rows of runs that this campaign does not have; "
             "give another folder, or undo the change of the campaign"
         )
     folder.make(dump_campaign(campaign), schema)
     waiting = deque(
-        Job(run, campaign.steps, place, campaign.logs) for run in runs if run.key not in done
+        Job(run, campaign.steps, place, campaign.logs)
+        for run in runs
+        if run.key not in done and only(run)
     )
-    outcome = Outcome(len(runs), len(done))
+    outcome = Outcome(len(runs), len(done & keys))
     if waiting:
         with _client(scheduler, workers) as client:
             tell(f"Dask's dashboard: {client.dashboard_link}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from fbse_drake.campaign.columns import Column, run_columns, run_figures
 from fbse_drake.discrepancy.diagnose import diagnosis_json
-from fbse_drake.discrepancy.hidden import Answer, make_exercise, score
+from fbse_drake.discrepancy.hidden import Answer, Size, make_exercise, score
 from fbse_drake.discrepancy.study import study
 from fbse_drake.errors import InputError
 from fbse_drake.estimate import estimate
@@ -128,7 +128,7 @@ class Hide(Step):
     """Hides an effect in the scenario's robot, and simulates it; see `fbse hide`."""
 
     what: str = "any"
-    size: str | None = None
+    size: Size | None = None
     count: int = 1
 
     def columns(self, scenario: Scenario | None) -> list[Column]:  # noqa: ARG002
