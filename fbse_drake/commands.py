@@ -518,6 +518,8 @@ def _table(options: argparse.Namespace) -> bool:
 
         from fbse_drake.campaign import table as tables
         from fbse_drake.campaign.rows import Folder, units_of
+    if options.out is None and "://" in options.folder:
+        raise InputError(f"--out: needed, for files cannot be written to {options.folder}")
     rows, out = Folder(options.folder).table(), options.out or Path(options.folder)
     by = tables.usual_groups(rows) if options.by is None else options.by
     found, values = tables.groups(rows, by), tables.figures(rows, options.value)

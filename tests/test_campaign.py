@@ -294,6 +294,8 @@ def test_a_table_groups_by_the_design_and_draws(tmp_path: Path, scheduler: str):
     assert lines[0].startswith("side,runs,failed,square.area,square.area from")
     assert lines[2].startswith("2.0,8,1,4.0")
     assert main([*arguments[:2], "--value", "square.volume"]) == BAD_INPUT
+    assert main(["table", str(tmp_path)]) == BAD_INPUT
+    assert main(["table", "memory://nowhere"]) == BAD_INPUT
 
 
 def test_a_stopped_campaign_goes_on(tmp_path: Path, scheduler: str):

@@ -20,7 +20,7 @@ from fbse_drake.progress import Interrupted, Progress, silent
 # the next; and how many there are at least.
 _AHEAD, _LEAST = 4, 16
 # The command looks after itself so often [s].
-_PERIOD = 0.2
+_PERIOD = 0.5
 # Time to reach a scheduler [s].
 _REACH = 10.0
 
