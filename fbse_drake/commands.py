@@ -122,7 +122,7 @@ def _compare(options: argparse.Namespace) -> bool:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
     with _errors_located(options), console.status("comparing the model with the log"):
         predictor = _checked(scenario, train_and_rest(scenario, log)[0])
-        inputs = replace(inputs, hygiene=inspect(predictor.motion))
+        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
         comparison = compare(predictor)
     _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
     with console.status("writing the report"):
@@ -139,7 +139,7 @@ def _diagnose(options: argparse.Namespace) -> bool:
     with _errors_located(options), _told(console, options.time_limit) as progress:
         train = train_and_rest(scenario, log)[0]
         predictor = _checked(scenario, train)
-        inputs = replace(inputs, hygiene=inspect(predictor.motion))
+        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
         comparison = compare(predictor)
         trusted = inputs.hygiene.trusted(scenario, predictor.robot)
         diagnosis = diagnose(Predictor(trusted, train), progress=progress)
@@ -162,7 +162,9 @@ def _study(options: argparse.Namespace) -> bool:
     with _errors_located(options), _told(console, options.time_limit) as progress:
         predictor = _checked(scenario, train)
         inputs = replace(
-            inputs, hygiene=inspect(predictor.motion), tests=tuple(map(str, options.test))
+            inputs,
+            hygiene=inspect(predictor.motion, predictor.noise),
+            tests=tuple(map(str, options.test)),
         )
         comparison = compare(predictor)
         scenario = inputs.hygiene.trusted(scenario, predictor.robot)
@@ -212,7 +214,8 @@ def _identify(options: argparse.Namespace) -> bool:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_identify")
     train, tests = _train_and_tests(scenario, log, options)
     with _errors_located(options), _told(console) as progress:
-        inputs = replace(inputs, hygiene=inspect(_checked(scenario, train).motion))
+        predictor = _checked(scenario, train)
+        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
         result = identify(scenario, train, tests, progress=progress)
     _write_findings(out, "identify", identification_json(result), scenario, inputs)
     write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))

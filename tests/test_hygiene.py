@@ -32,7 +32,8 @@ def changed(log: Log, **channels: np.ndarray) -> Log:
 
 
 def findings(which: tuple[str, str], log: Log) -> list[HygieneFinding]:
-    return list(inspect(Predictor(scenario(*which), log).motion).findings)
+    predictor = Predictor(scenario(*which), log)
+    return list(inspect(predictor.motion, predictor.noise).findings)
 
 
 def only(found: list[HygieneFinding]) -> HygieneFinding:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fbse_drake.discrepancy.hygiene import inspect
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import Regression, Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual import Residual, Row, block_means, rms
+from fbse_drake.discrepancy.residual import RecordedMotion, Residual, Row, block_means, rms
 from fbse_drake.discrepancy.sanity import check_sensors
+from fbse_drake.discrepancy.structure import leftover_structure
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
@@ -68,6 +70,31 @@ def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None
     assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(
         50 * np.sqrt(8 / 10), rel=0.02
     )
+
+
+def test_more_noise_of_the_feet_than_is_believed_is_measured_and_no_structure(
+    walk: tuple[Scenario, Log],
+) -> None:
+    scenario, log = walk
+    random, deviation = np.random.default_rng(1), scenario.sensors.foot_force.noise
+    names = [f"foot/{side}/pad_force" for side in ("left", "right")]
+    # Twice the noise that is in the log.
+    forces = {
+        n: log[n] + np.sqrt(3) * deviation * random.standard_normal(log[n].shape) for n in names
+    }
+    noisier = replace(log, channels=log.channels | forces)
+    predictor = Predictor(scenario, noisier)
+    residual, motion = predictor.residual, predictor.motion
+    (finding,) = (f for f in inspect(motion, predictor.noise).findings if f.kind == "noise_level")
+    assert finding.where == tuple(names)
+    assert finding.size == pytest.approx(2.0, rel=0.1)
+    white = WhitenedResidual(residual)
+    assert not leftover_structure(motion, white, white.y)
+    # As believed, it would be structure in half of the rows.
+    believed = WhitenedResidual(
+        RecordedMotion(predictor.robot, scenario.sensors, scenario.recording, noisier).residual
+    )
+    assert len(leftover_structure(motion, believed, believed.y)) > 10
 
 
 def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:

@@ -53,7 +53,8 @@ def averaged_to_bandwidth(predictor: Predictor) -> tuple[Predictor, Averaging]:
     if times < 2:
         return predictor, Averaging(asked, asked, fastest)
     longer = replace(recording, block=times * asked)
-    wider = Predictor(replace(predictor.scenario, recording=longer), predictor.log)
+    # In longer blocks differences of neighbours are motion as well as noise.
+    wider = Predictor(replace(predictor.scenario, recording=longer), predictor.log, predictor.noise)
     return wider, Averaging(times * asked, asked, fastest)
 
 

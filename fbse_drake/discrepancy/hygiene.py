@@ -10,6 +10,7 @@ from typing import Any
 
 from fbse_drake.discrepancy import channel_checks, model_checks
 from fbse_drake.discrepancy.evidence import Evidence, HygieneFinding, NoiseLevel
+from fbse_drake.discrepancy.noise import Noise, noise_finding
 from fbse_drake.discrepancy.residual import RecordedMotion
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
@@ -75,18 +76,24 @@ class Hygiene:
         )
 
 
-def inspect(motion: RecordedMotion) -> Hygiene:
+def inspect(motion: RecordedMotion, noise: Noise | None = None) -> Hygiene:
     """Inspects a recording; no findings for one in which all is well.
 
     Args:
         motion: the log, seen by the model. Works for fixed and floating bases, with and without torques.
+        noise: what the log shows of the rows' noise, where that is to be said.
     """
     evidence = Evidence(motion)
-    findings = sorted(
-        (finding for check in _CHECKS for finding in check(evidence)),
-        key=lambda finding: _ORDER.index(finding.severity),
-    )
-    return Hygiene(tuple(findings), tuple(channel_checks.estimated_noise(motion)))
+    findings = [finding for check in _CHECKS for finding in check(evidence)]
+    if noise is not None and (noisy := noise_finding(motion, noise)) is not None:
+        findings.append(noisy)
+    findings.sort(key=lambda finding: _ORDER.index(finding.severity))
+    levels = channel_checks.estimated_noise(motion)
+    if noise is not None:
+        # What the scenario believes, not what is used instead.
+        believed = {level.channel: level.believed for level in noise.channels}
+        levels = [replace(n, believed=believed.get(n.channel, n.believed)) for n in levels]
+    return Hygiene(tuple(findings), tuple(levels))
 
 
 def hygiene_json(hygiene: Hygiene) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from scipy.ndimage import shift
 from scipy.signal import savgol_filter
 
 from fbse_drake.discrepancy.inertial import inertia_addition, inertial_regressor
+from fbse_drake.discrepancy.noise import Noise, measured_noise, measured_sensors
 from fbse_drake.discrepancy.regression import Signature
 from fbse_drake.discrepancy.residual import (
     EquationOfMotion,
@@ -61,8 +62,11 @@ _CHUNK = 5_000_000
 class Predictor:
     """A scenario's model over one log: its residual, and what further effects would add to it."""
 
-    def __init__(self, scenario: Scenario, log: Log):
+    def __init__(self, scenario: Scenario, log: Log, noise: Noise | None = None):
         """Reads the log.
+
+        Args:
+            noise: of the rows, beyond what is believed; by default it is measured.
 
         Raises:
             InputError: a log that does not fit the model.
@@ -76,13 +80,17 @@ class Predictor:
             for key, effect in scenario.believed.effects.items()
         ]
         log = with_command(scenario, log, names)
-        self.motion = RecordedMotion(self.robot, scenario.sensors, scenario.recording, log)
+        sensors, self._noisier_channels = measured_sensors(
+            scenario.sensors, scenario.recording, log
+        )
+        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
                 memory = known.effect.memory_over_time(
                     self.motion.signals, known, self.robot, self.motion.period
                 )
                 self.motion.signals = self._undone(known, memory)
+        self._given_noise = noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
 
@@ -93,7 +101,20 @@ class Predictor:
 
     @cached_property
     def residual(self) -> Residual:
-        """What the model, with its effects, leaves over."""
+        """What the model, with its effects, leaves over; with the noise that the log shows where
+        that is more than is believed."""
+        residual = self._believed_residual
+        return replace(residual, variance=residual.variance + self.noise.white / self.motion.length)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Of the rows, beyond what is believed."""
+        if self._given_noise is not None:
+            return self._given_noise
+        return measured_noise(self.motion, self._believed_residual, self._noisier_channels)
+
+    @cached_property
+    def _believed_residual(self) -> Residual:
         residual = self.motion.residual
         for known in self._known:
             residual = residual.minus(self.predict(known))
@@ -341,7 +362,7 @@ class Predictor:
             sensors.foot_force, self.robot, len(motion.signals.pad_force), random
         )
         torque = motion.signals.torque_command
-        deviation = np.sqrt(motion.torque_variance(torque))
+        deviation = np.sqrt(motion.torque_variance(torque) + self.noise.white[: torque.shape[1]])
         noisy_torque = torque + deviation * random.standard_normal(torque.shape)
         return replace(motion.signals, pad_force=noisy_force, torque_command=noisy_torque, **added)
 

@@ -718,6 +718,15 @@ class RecordedMotion:
         return noise**2 + (share * torque) ** 2
 
     @cached_property
+    def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Believed variance of a step's white noise and of the integral over time of what is
+        differenced white noise, (B, R) each."""
+        white, differenced = self.equation.noise(self.blocks, self.sensors)
+        torque = self.torque_variance(self.blocks.torque_command)
+        white[:, : torque.shape[1]] += torque
+        return white, differenced
+
+    @cached_property
     def residual(self) -> Residual:
         """The residual of the model's rigid bodies; what its effects explain is not taken off.
 
@@ -739,9 +748,7 @@ class RecordedMotion:
             value = block_means(measured, self.length) + self.averages(value - measured)
         else:
             value = block_means(value, self.length)
-        white, differenced = self.equation.noise(self.blocks, self.sensors)
-        torque = self.torque_variance(self.blocks.torque_command)
-        white[:, : torque.shape[1]] += torque
+        white, differenced = self.step_noise
         duration = self.length * self.period
         variance = white / self.length + 2 * differenced / duration**2
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2

@@ -84,9 +84,7 @@ def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dic
         result["position"] = hat_functions(blocks.joint_position[:, row])
         # Fine near standstill, coarse elsewhere.
         result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
-        load = blocks.torque_command[:, row]
-        noisy = motion.torque_variance(blocks.torque_command)[:, row].any()
-        result["load"] = hat_functions(without_own_noise(load) if noisy else load)
+        result["load"] = hat_functions(without_own_noise(blocks.torque_command[:, row]))
         result["acceleration"] = hat_functions(
             np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row]))
         )
