@@ -18,9 +18,12 @@ from fbse_drake.scenario import RecordingConfig, SensorsConfig
 _ORDER, _WINDOW, _EFFICIENCY = 4, 20, 0.64
 # Orders at which a channel's noise is measured; of what is not white, the lower shows this factor more.
 _ORDERS, _WHITE = (3, 6), 1.1
-# Smallest factor of the noise that is worth a word, and probability of saying so of any row by chance.
+# Smallest factor of a row's noise that is worth a word, and probability of saying so of any by chance.
 _LEAST, _FALSE_ALARM = 1.15, 1e-3
-# A channel is as noisy as this share of its components: joints that tremble are no noise of sensors.
+# The same of a channel, in which motion that is as fast as noise may be most of the excess.
+_LEAST_OF_CHANNEL = 1.3
+# A channel is as noisy as the quieter ones of its windows and components, this share of them:
+# impacts and trembling joints are no noise of sensors.
 _QUIET = 0.25
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
@@ -51,14 +54,19 @@ class Power:
 
 
 def noise_power(
-    values: np.ndarray, known: np.ndarray, believed: np.ndarray, order: int = _ORDER
+    values: np.ndarray,
+    known: np.ndarray,
+    believed: np.ndarray,
+    order: int = _ORDER,
+    quantile: float = 0.5,
 ) -> Power:
-    """Compares differences of neighbours with what is believed of them.
+    """Compares differences of neighbours with what is believed of them, in windows.
 
     Args:
         values, known: (N, R) each.
         believed: mean square of a difference, normalised for white noise, (N, R).
         order: of the differences.
+        quantile: of the windows that counts.
     """
     differences = np.diff(values, order, axis=0) / np.sqrt(comb(2 * order, order))
     gaps = np.cumsum(np.vstack([np.zeros((1, known.shape[1])), ~known]), axis=0)
@@ -69,7 +77,7 @@ def noise_power(
     )
     # Of the mean of so many squares that are correlated like this.
     freedom = _WINDOW**2 / (toeplitz(correlation) ** 2).sum()
-    middle = chi2.median(freedom) / freedom
+    typical = chi2.ppf(quantile, freedom) / freedom
     ratio, windows = np.full((2, known.shape[1]), np.nan)
     for row in range(known.shape[1]):
         index = np.flatnonzero(whole[:, row])
@@ -79,7 +87,7 @@ def noise_power(
         index = index[: count * _WINDOW].reshape(count, _WINDOW)
         expected = believed[index + order // 2, row].mean(axis=1)
         power = (differences[index, row] ** 2).mean(axis=1)
-        ratio[row] = np.median(power / np.maximum(expected, _ROUNDING)) / middle
+        ratio[row] = np.quantile(power / np.maximum(expected, _ROUNDING), quantile) / typical
         windows[row] = count
     return Power(ratio, _EFFICIENCY * freedom * windows)
 
@@ -106,7 +114,7 @@ def measured_sensors(
     noisier = []
     for name, expected in believed.items():
         level = channel_noise(log, name) if name in log else np.nan
-        if level > _LEAST * expected:
+        if level > _LEAST_OF_CHANNEL * expected:
             noisier.append(NoiseLevel(name, level, log.unit(name), expected))
     level_of = believed | {noise.channel: noise.level for noise in noisier}
     feet_level = max((v for name, v in level_of.items() if name.startswith("foot/")), default=0.0)
@@ -132,7 +140,8 @@ def channel_noise(log: Log, name: str) -> float:
     known[1:] = np.diff(log.time) < 1.5 * float(log.meta["period"])
     known = np.repeat(known[:, None], values.shape[1], axis=1)
     low, high = (
-        np.sqrt(noise_power(values, known, np.ones(values.shape), order).ratio) for order in _ORDERS
+        np.sqrt(noise_power(values, known, np.ones(values.shape), order, _QUIET).ratio)
+        for order in _ORDERS
     )
     white = low < _WHITE * high
     return float(np.quantile(high[white], _QUIET)) if white.any() else np.nan

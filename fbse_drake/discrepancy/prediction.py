@@ -6,7 +6,7 @@ from functools import cache, cached_property, partial
 
 import numpy as np
 from scipy.ndimage import shift
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_filter, welch
 
 from fbse_drake.discrepancy.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.noise import Noise, measured_noise, measured_sensors
@@ -51,6 +51,8 @@ from fbse_drake.sensors.foot_force import force_noise
 _SMOOTHING = 9
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
 _LAW_DOUBT = 8.0
+# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times it.
+_SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
@@ -219,7 +221,8 @@ class Predictor:
         motion = self.motion
         velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
         time = motion.start + np.arange(len(velocity) - 1) * motion.period
-        at = motion.steps_of(replace(signals, joint_velocity=velocity))
+        torque = self._without_noise(signals.torque_command)
+        at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
         return JointMotion(
             velocity=within_steps(velocity, motion.law_share),
             position=at.joint_position,
@@ -229,6 +232,32 @@ class Predictor:
             # A model whose inertia is not trusted does not know the load.
             load=at.torque_command - (0.0 if self.scenario.identify.inertia else self._loss),
         )
+
+    def _without_noise(self, torque: np.ndarray) -> np.ndarray:
+        """Torques (N, n) without frequencies in which the log has little but white noise: in a
+        regressor it would take off the noise of the residual, which is the same (errors in
+        variables). A command of exactly zero stays, for it may be a drive that is off."""
+        result = np.empty_like(torque)
+        for joint, corner in enumerate(self._torque_corners):
+            result[:, joint] = self.motion.low_passed(torque[:, joint], corner)
+        return np.where(torque == 0, 0.0, result)
+
+    @cached_property
+    def _torque_corners(self) -> list[float]:
+        """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
+        motion = self.motion
+        torque, rate = motion.signals.torque_command, 1.0 / motion.period
+        # What is missing in the model has next to no part in the noise of the rows.
+        noise = measured_noise(motion, motion.residual, ()).white[: torque.shape[1]]
+        variance = motion.torque_variance(torque).mean(axis=0) + noise
+        window = min(len(torque), round(_SPECTRUM * rate))
+        frequency, power = welch(torque, rate, nperseg=window, axis=0)
+        corners = []
+        for density, white in zip(power.T, 2 * variance / rate, strict=True):
+            above = np.flatnonzero(density > _ABOVE_NOISE * white)
+            last = above[-1] + 1 if len(above) else 1
+            corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
+        return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
 
     @cached_property
     def _loss(self) -> np.ndarray:

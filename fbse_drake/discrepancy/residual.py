@@ -637,6 +637,10 @@ class RecordedMotion:
         """Steps of other signals on the same grid."""
         return steps(signals, self.period, self.recording.rows, self.integration_step)
 
+    def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
+        """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0 Hz."""
+        return _low_passed(values, corner, self.period, _stretches(self.measured))
+
     def averages(self, predicted: np.ndarray) -> np.ndarray:
         """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
         return block_means(

@@ -1,0 +1,120 @@
+"""White noise of a measured torque is in the residual and in the regressors of what depends on the torque alike."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlantConfig
+
+from fbse_drake.control.position_loop import PositionLoopConfig
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.dictionary import Dictionary
+from fbse_drake.discrepancy.explanation import Explanation
+from fbse_drake.discrepancy.fits import Fits
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.log import Log
+from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
+from fbse_drake.sensors.encoders import EncoderConfig
+from fbse_drake.simulate import simulate
+from fbse_drake.walking.reference import JointSines
+
+# As large as the torque's own deviation, which is what a current sensor gives of a light joint [Nm].
+NOISE = 0.4
+_RUNS = 5
+HIDDEN = {
+    "gain": (TorqueGain, 0.03),
+    "lag": (TorqueLag, 0.006),
+    "delay": (TorqueDelay, 0.006),
+}
+
+
+@cache
+def run(hidden: str) -> tuple[Scenario, Log]:
+    """A double pendulum with something hidden in its elbow, and what is believed of it."""
+    effect, value = HIDDEN[hidden]
+    (parameter,) = effect.parameters
+    body = RobotConfig(
+        "double_pendulum", effects={"hidden": effect(**{parameter: {"elbow": value}})}
+    )
+    scenario = Scenario(
+        duration=5.0,
+        robot=body,
+        plant=MultibodyPlantConfig(
+            time_step=0.002, contact_model="point", discrete_contact_approximation="lagged"
+        ),
+        reference=JointSines(
+            amplitude={"shoulder": 0.8, "elbow": 1.0},
+            frequency={"shoulder": 0.6, "elbow": 1.3},
+            ramp=0.5,
+        ),
+        control=PositionLoopConfig(kp={"all": 20.0}, kd={"all": 0.5}),
+        sensors=SensorsConfig(encoders=EncoderConfig(velocity_noise=2e-4)),
+    )
+    believed = replace(
+        scenario,
+        model=RobotConfig("double_pendulum"),
+        recording=RecordingConfig(torque_noise={"all": NOISE}),
+    )
+    return believed, simulate(scenario).log
+
+
+def noisy(hidden: str, seed: int) -> Predictor:
+    scenario, log = run(hidden)
+    torque = log["joint/torque_command"]
+    torque = torque + NOISE * np.random.default_rng(seed).standard_normal(torque.shape)
+    return Predictor(
+        scenario, replace(log, channels=log.channels | {"joint/torque_command": torque})
+    )
+
+
+def fitted(
+    predictor: Predictor, effect: type[JointTorqueEffect], start: Sequence[float]
+) -> Explanation:
+    """The effect alone in the elbow, linearised again where it was found."""
+    fits, nonlinear = Fits(Dictionary(predictor, [effect])), np.array(start)
+    nothing = fits.remainder(fits.explain([]))
+    for _ in range(3):
+        candidate = fits.candidate(effect, ("elbow",), nonlinear, nothing)
+        explanation = fits.explain([candidate])
+        values, _ = explanation.values(candidate)
+        nonlinear = np.array([values[name] for name in candidate.nonlinear_names])
+    return explanation
+
+
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_noise_of_the_torque_biases_no_value(hidden: str) -> None:
+    effect, value = HIDDEN[hidden]
+    start = () if effect is TorqueGain else (value,)
+    found, inside = [], 0
+    for seed in range(_RUNS):
+        explanation = fitted(noisy(hidden, seed), effect, start)
+        (estimates, intervals) = explanation.values(explanation.candidates[0])
+        (name,) = effect.parameters
+        found.append(estimates[name])
+        inside += intervals[name][0] < value < intervals[name][1]
+    # Within three standard deviations of their mean.
+    assert abs(np.mean(found) - value) < 3 * np.std(found) / np.sqrt(_RUNS)
+    assert inside >= _RUNS - 1
+
+
+def test_noise_speaks_for_no_lag_where_a_delay_is() -> None:
+    """A lag that smoothes the noise away would win against the delay by hundreds."""
+    for seed in range(2):
+        predictor = noisy("delay", seed)
+        lag, delay = (
+            fitted(predictor, effect, (0.006,)).deviance for effect in (TorqueLag, TorqueDelay)
+        )
+        assert abs(lag - delay) < 10
+
+
+@pytest.mark.parametrize("hidden", ["lag", "delay"])
+def test_lag_and_delay_are_confusable_where_noise_hides_the_difference(hidden: str) -> None:
+    tried: list[type[Effect]] = [TorqueLag, TorqueDelay, TorqueGain, TorqueBias]
+    (finding,) = diagnose(noisy(hidden, 1), tried).chosen
+    assert finding.targets == ("elbow",)
+    assert {finding.effect, *finding.confusable_with} >= {"TorqueLag", "TorqueDelay"}
