@@ -13,18 +13,17 @@ from fbse_drake.discrepancy.residual import RecordedMotion, Residual, residual_r
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
-# Order of the differences of neighbours, and their number in a window. Half of the windows may be
-# disturbed: their median counts, which is as good as the mean of this share of them.
-_ORDER, _WINDOW, _EFFICIENCY = 4, 20, 0.64
+# Order of the differences of neighbours, and their number in a window.
+_ORDER, _WINDOW = 4, 20
+# Impacts and trembling joints are no noise: this quantile of windows, and of a channel's components,
+# counts. It is as good as the mean of that share of the windows.
+_QUIET, _EFFICIENCY = 0.25, 0.54
 # Orders at which a channel's noise is measured; of what is not white, the lower shows this factor more.
 _ORDERS, _WHITE = (3, 6), 1.1
 # Smallest factor of a row's noise that is worth a word, and probability of saying so of any by chance.
 _LEAST, _FALSE_ALARM = 1.15, 1e-3
 # The same of a channel, in which motion that is as fast as noise may be most of the excess.
 _LEAST_OF_CHANNEL = 1.3
-# A channel is as noisy as the quieter ones of its windows and components, this share of them:
-# impacts and trembling joints are no noise of sensors.
-_QUIET = 0.25
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 # Share of the torque below which noise that nobody believes in is not worth a word.
@@ -58,7 +57,6 @@ def noise_power(
     known: np.ndarray,
     believed: np.ndarray,
     order: int = _ORDER,
-    quantile: float = 0.5,
 ) -> Power:
     """Compares differences of neighbours with what is believed of them, in windows.
 
@@ -66,7 +64,6 @@ def noise_power(
         values, known: (N, R) each.
         believed: mean square of a difference, normalised for white noise, (N, R).
         order: of the differences.
-        quantile: of the windows that counts.
     """
     differences = np.diff(values, order, axis=0) / np.sqrt(comb(2 * order, order))
     gaps = np.cumsum(np.vstack([np.zeros((1, known.shape[1])), ~known]), axis=0)
@@ -77,7 +74,7 @@ def noise_power(
     )
     # Of the mean of so many squares that are correlated like this.
     freedom = _WINDOW**2 / (toeplitz(correlation) ** 2).sum()
-    typical = chi2.ppf(quantile, freedom) / freedom
+    typical = chi2.ppf(_QUIET, freedom) / freedom
     ratio, windows = np.full((2, known.shape[1]), np.nan)
     for row in range(known.shape[1]):
         index = np.flatnonzero(whole[:, row])
@@ -87,7 +84,7 @@ def noise_power(
         index = index[: count * _WINDOW].reshape(count, _WINDOW)
         expected = believed[index + order // 2, row].mean(axis=1)
         power = (differences[index, row] ** 2).mean(axis=1)
-        ratio[row] = np.quantile(power / np.maximum(expected, _ROUNDING), quantile) / typical
+        ratio[row] = np.quantile(power / np.maximum(expected, _ROUNDING), _QUIET) / typical
         windows[row] = count
     return Power(ratio, _EFFICIENCY * freedom * windows)
 
@@ -140,8 +137,7 @@ def channel_noise(log: Log, name: str) -> float:
     known[1:] = np.diff(log.time) < 1.5 * float(log.meta["period"])
     known = np.repeat(known[:, None], values.shape[1], axis=1)
     low, high = (
-        np.sqrt(noise_power(values, known, np.ones(values.shape), order, _QUIET).ratio)
-        for order in _ORDERS
+        np.sqrt(noise_power(values, known, np.ones(values.shape), order).ratio) for order in _ORDERS
     )
     white = low < _WHITE * high
     return float(np.quantile(high[white], _QUIET)) if white.any() else np.nan
