@@ -33,7 +33,7 @@ def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
     """
     client = NotebookClient(
         notebook,
-        timeout=300,
+        timeout=1200,
         kernel_name="python3",
         kernel_manager_class=ThisInterpretersKernel,
         resources={"metadata": {"path": str(folder)}},
