@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -14,11 +15,13 @@ from fbse_drake.discrepancy.detectability import smallest_detectable
 from fbse_drake.discrepancy.diagnose import Diagnosis, _equals, diagnose, diagnosis_json
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.explanation import Candidate
 from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
+from fbse_drake.discrepancy.regression import Signature
 from fbse_drake.discrepancy.rollout import rollout
-from fbse_drake.discrepancy.selection import best_additions
+from fbse_drake.discrepancy.selection import best_additions, is_significant
 from fbse_drake.discrepancy.study import study, study_json
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
@@ -422,3 +425,35 @@ def test_ground_that_gives_a_little_more_is_nobodys_concern(
     diagnosis = diagnose(Predictor(scenario(), log), [library()["GroundCompliance"]])
     assert bool(diagnosis.chosen) == matters
     assert diagnosis.verdict == ("effect_found" if matters else "nothing_missing")
+
+
+@pytest.mark.parametrize(
+    ("offset", "deviation", "can_be"),
+    [(0.02, 0.001, True), (0.031, 0.001, True), (0.1, 0.001, False), (0.62, 0.2, False)],
+)
+def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
+    offset: float, deviation: float, can_be: bool
+) -> None:
+    """An encoder's zero is off by some hundredths of a radian; an interval that reaches there from 0.62 rad does not make it so."""
+    effect = library()["EncoderOffset"]
+    signature = Signature(np.array([0]), np.zeros((5, 1, 1)))
+    candidate = Candidate(
+        effect, ("knee",), effect.parameters, np.zeros(0), signature, source=signature
+    )
+    fit = SimpleNamespace(
+        parameters=np.array([offset]),
+        deviation=np.array([deviation]),
+        interval=lambda: offset + 2 * deviation * np.array([[-1.0, 1.0]]),
+    )
+    fits = SimpleNamespace(
+        white=SimpleNamespace(sse=np.array([1e4])),
+        required=lambda _: 20.0,
+        dictionary=SimpleNamespace(
+            per_step=True, predictor=SimpleNamespace(is_possible=lambda *_: True)
+        ),
+    )
+    base, wider = (
+        SimpleNamespace(deviance=d, sse=np.array([d]), fit=fit, start=lambda _: 0)
+        for d in (1e4, 1e2)
+    )
+    assert is_significant(fits, base, wider, candidate) is can_be

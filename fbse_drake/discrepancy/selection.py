@@ -148,10 +148,14 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         if low <= value <= high and abs(value) <= widest:
             continue
         deviation, (least, most) = wider.fit.deviation[part][k], wider.fit.interval()[part][k]
+        allowed = 3 * deviation
+        if not issubclass(added.effect, JointTorqueEffect):
+            # Masses, places and offsets have sizes that a bad fit does not widen.
+            allowed = min(allowed, _IMPLAUSIBLE * widest)
         if (
             value < low
             or value > high + 3 * deviation
-            or abs(value) > _IMPLAUSIBLE * widest + 3 * deviation
+            or abs(value) > _IMPLAUSIBLE * widest + allowed
         ):
             return False
         # What is not told from nothing may not be implausible as well.
