@@ -105,7 +105,7 @@ def _work_off(
     if somebody still held the result.
     """
     finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
-    running: dict[str, Job] = {}
+    running: dict[str, tuple[Job, Future]] = {}
     todo, text = len(waiting), f"running {len(waiting)} runs"
     try:
         while waiting or running:
@@ -113,14 +113,14 @@ def _work_off(
             while waiting and len(running) < max(_LEAST, _AHEAD * threads):
                 job = waiting.popleft()
                 future = client.submit(work, job, key=job.run.key, pure=False)
-                running[future.key] = job
+                running[future.key] = job, future
                 future.add_done_callback(finished.put)
             progress(text if threads else "waiting for a worker", outcome.done / todo)
             try:
                 future = finished.get(timeout=_PERIOD)
             except queue.Empty:
                 continue
-            job = running.pop(future.key)
+            job, future = running.pop(future.key)
             failure = _failure_of(future, job)
             outcome.done += 1
             if failure is not None:
