@@ -12,7 +12,7 @@ import pytest
 
 from fbse_drake.discrepancy.add import add, read_findings
 from fbse_drake.discrepancy.detectability import smallest_detectable
-from fbse_drake.discrepancy.diagnose import Diagnosis, _equals, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.experiment import planned_log
 from fbse_drake.discrepancy.explanation import Candidate
@@ -20,6 +20,7 @@ from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.regression import Signature
+from fbse_drake.discrepancy.rivals import equals
 from fbse_drake.discrepancy.rollout import rollout
 from fbse_drake.discrepancy.selection import best_additions, is_significant
 from fbse_drake.discrepancy.study import study, study_json
@@ -329,10 +330,12 @@ def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_dif
     spring, bias = (
         next(e for e in additions if e.candidates[0].effect is c) for c in (JointSpring, TorqueBias)
     )
-    for charge, equals in ((11.0, True), (60.0, False)):
-        assert _equals(fits, bias, replace(spring, deviance=bias.deviance - charge)) == equals
+    for charge, as_good in ((11.0, True), (60.0, False)):
+        better = replace(spring, deviance=bias.deviance - charge)
+        assert equals(fits, bias, better) == as_good
         # The other way round, parameters that are not needed are none in its favour.
-        assert not _equals(fits, spring, replace(bias, deviance=spring.deviance - charge))
+        better = replace(bias, deviance=spring.deviance - charge)
+        assert not equals(fits, spring, better)
 
 
 @pytest.mark.parametrize(

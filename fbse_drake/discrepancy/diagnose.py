@@ -17,7 +17,8 @@ from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import added, consistent, remeasured
 from fbse_drake.discrepancy.regression import WhitenedResidual
-from fbse_drake.discrepancy.selection import best_additions, select
+from fbse_drake.discrepancy.rivals import equals, rival_name, rivals, settled
+from fbse_drake.discrepancy.selection import select
 from fbse_drake.discrepancy.significance import Significance
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
 from fbse_drake.effects.effect import Effect, library
@@ -156,6 +157,12 @@ def diagnose(
         partial = str(stop)
     fits = proposals.fits
     white = fits.white
+    alternatives: dict[int, list[Explanation]] = {}
+    try:
+        if partial is None and dictionary.inertia is None:
+            path[-1], alternatives = settled(proposals, path[-1])
+    except Interrupted as stop:
+        partial = str(stop)
     final, inertia = consistent(fits, path[-1])
     path[-1], remaining, left = added(fits, final)
     final = path[-1]
@@ -166,15 +173,15 @@ def diagnose(
         if not significance.left_share(structure, remaining) < tolerance
     ]
     shares = {c: significance.share(final, c) for c in final.candidates}
-    rivals: dict[int, list[Explanation]] = {}
     statuses: dict[str, EffectStatus] = {}
     try:
         if partial is None:
-            rivals = _rivals(proposals, final)
+            if dictionary.inertia is not None:
+                alternatives = rivals(proposals, final)
             experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
-                statuses[effect.__name__] = _status(fits, final, effect, rivals, experiments)
+                statuses[effect.__name__] = _status(fits, final, effect, alternatives, experiments)
     except Interrupted as stop:
         partial = str(stop)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
@@ -191,7 +198,7 @@ def diagnose(
     return Diagnosis(
         verdict,
         (
-            *(_sized(f, tolerance) for f in _ranking(fits, path, rivals, shares)),
+            *(_sized(f, tolerance) for f in _ranking(fits, path, alternatives, shares)),
             *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
@@ -202,29 +209,6 @@ def diagnose(
         averaging,
         partial,
     )
-
-
-def _rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
-    """For each member: explanations with another effect in its place, or the same on another body, best first; one for each effect and
-    targets."""
-    result = {}
-    for k, member in enumerate(final.candidates):
-        rest = proposals.fits.explain([c for c in final.candidates if c is not member])
-        additions = [
-            e
-            for e in best_additions(proposals, rest, member.signature.rows)
-            if len(e.candidates) == len(final.candidates)
-        ]
-        result[k] = [e for e in additions if _rival_name(e.candidates[-1], member)]
-    return result
-
-
-def _rival_name(rival: Candidate, member: Candidate) -> str:
-    """What a rival of a member is called: another effect, or the same on another body; empty if it is neither."""
-    if rival.effect is not member.effect:
-        return rival.name
-    on_bodies = rival.effect.acts_on == "body" and rival.targets != member.targets
-    return f"{rival.name} on {rival.targets[0]}" if on_bodies else ""
 
 
 def _sized(finding: Finding, tolerance: float) -> Finding:
@@ -240,7 +224,7 @@ def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = sl
 def _ranking(
     fits: Fits,
     path: list[Explanation],
-    rivals: dict[int, list[Explanation]],
+    alternatives: dict[int, list[Explanation]],
     shares: Mapping[Candidate, float],
 ) -> list[Finding]:
     final, white = path[-1], fits.white
@@ -253,14 +237,16 @@ def _ranking(
         member, rest = final.candidates[k], without[k]
         equal = tuple(
             dict.fromkeys(
-                _rival_name(e.candidates[-1], member) for e in rivals[k] if _equals(fits, e, final)
+                rival_name(e.candidates[-1], member)
+                for e in alternatives[k]
+                if equals(fits, e, final)
             )
         )
         finding = finding_of(white, rest, final, member, equal, chosen=True)
         findings.append(replace(finding, share=shares[member]))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
-        (e for alternatives in rivals.values() for e in alternatives), key=lambda e: e.deviance
+        (e for of_member in alternatives.values() for e in of_member), key=lambda e: e.deviance
     )
     for explanation in others:
         member = explanation.candidates[-1]
@@ -357,7 +343,7 @@ def _status(
     fits: Fits,
     final: Explanation,
     effect: type[Effect],
-    rivals: dict[int, list[Explanation]],
+    alternatives: dict[int, list[Explanation]],
     experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
@@ -365,8 +351,8 @@ def _status(
     scenario = None
     mistaken_for = [
         final.candidates[k]
-        for k, alternatives in rivals.items()
-        if any(e.candidates[-1].effect is effect and _equals(fits, e, final) for e in alternatives)
+        for k, of_member in alternatives.items()
+        if any(e.candidates[-1].effect is effect and equals(fits, e, final) for e in of_member)
     ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"
@@ -390,12 +376,6 @@ def _status(
     return EffectStatus(
         verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
     )
-
-
-def _equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
-    """Does a rival explain as much? One with fewer parameters does also if chance may have brought what the final explanation has more."""
-    more = len(final.fit.parameters) - len(rival.fit.parameters)
-    return rival.deviance < final.deviance + (fits.threshold[min(12, more)] if more > 0 else MARGIN)
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -57,6 +57,8 @@ _SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
 _EVALUATIONS = 8
+# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of those that we did.
+_EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
 
@@ -88,10 +90,7 @@ class Predictor:
         self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
-                memory = known.effect.memory_over_time(
-                    self.motion.signals, known, self.robot, self.motion.period
-                )
-                self.motion.signals = self._undone(known, memory)
+                self.motion.signals = self._undone(known, self._remembered(known))
         self._given_noise = noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
@@ -246,18 +245,11 @@ class Predictor:
     def _torque_corners(self) -> list[float]:
         """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
         motion = self.motion
-        torque, rate = motion.signals.torque_command, 1.0 / motion.period
+        torque = motion.signals.torque_command
         # What is missing in the model has next to no part in the noise of the rows.
         noise = measured_noise(motion, motion.residual, ()).white[: torque.shape[1]]
         variance = motion.torque_variance(torque).mean(axis=0) + noise
-        window = min(len(torque), round(_SPECTRUM * rate))
-        frequency, power = welch(torque, rate, nperseg=window, axis=0)
-        corners = []
-        for density, white in zip(power.T, 2 * variance / rate, strict=True):
-            above = np.flatnonzero(density > _ABOVE_NOISE * white)
-            last = above[-1] + 1 if len(above) else 1
-            corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
-        return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
+        return noise_corners(torque, variance, motion.period)
 
     @cached_property
     def _loss(self) -> np.ndarray:
@@ -431,25 +423,26 @@ class Predictor:
         """Can a robot have an effect with these values? Not every inertia is that of a body."""
         if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
             return True
-        change = effect.from_values(
-            [target], {name: [value] for name, value in zip(effect.parameters, linear, strict=True)}
-        )
+        values = dict(zip(effect.parameters, ([value] for value in linear), strict=True))
+        return self.can_have([effect.from_values([target], values)])
+
+    def can_have(self, effects: Iterable[Effect]) -> bool:
+        """Can a robot have these effects beside those of the model?"""
         try:
-            self._with(change)
+            self._with(*effects)
         except InputError:
             return False
         return True
 
-    def _with(self, change: Effect) -> EquationOfMotion:
-        """Of a model that has an effect as well.
+    def _with(self, *changes: Effect) -> EquationOfMotion:
+        """Of a model that has some effects as well.
 
         Raises:
-            InputError: no robot has it.
+            InputError: no robot has them.
         """
         believed = self.scenario.believed
-        return EquationOfMotion(
-            build_robot(replace(believed, effects={**believed.effects, "_change": change}))
-        )
+        more = {f"_change_{k}": change for k, change in enumerate(changes)}
+        return EquationOfMotion(build_robot(replace(believed, effects=believed.effects | more)))
 
     def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
         """What an inertia effect adds to the residual, (B, R)."""
@@ -547,10 +540,29 @@ class Predictor:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone, where `undone` needs it."""
         key = (effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
-            self._memories[key] = effect.memory_over_time(
-                self.motion.signals, resolved, self.robot, self.motion.period
-            )
+            self._memories[key] = self._remembered(resolved)
         return self._memories[key]
+
+    def _remembered(self, effect: ResolvedEffect) -> np.ndarray:
+        """What an effect remembers over the log, of torques without their white noise: it would become an acceleration.
+
+        A simulation of ours begins with no memory; any other log begins as if it had always been as it is then.
+        """
+        motion, signals = self.motion, self.motion.signals
+        torque = signals.torque_command
+        corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
+        smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]
+        signals = replace(signals, torque_command=np.stack(smooth, axis=1))
+        ours = self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
+        earlier = 0 if ours else round(_EARLIER / motion.period)
+        longer = {
+            name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
+            for name, values in vars(signals).items()
+        }
+        memory = effect.effect.memory_over_time(
+            SensorSignals(**longer), effect, self.robot, motion.period
+        )
+        return memory[:, earlier:]
 
     def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
         """By the motion of the standing soles that the effect predicts, (B, R, p)."""
@@ -641,6 +653,22 @@ class Predictor:
         """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""
         sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
+
+
+def noise_corners(torque: np.ndarray, variance: np.ndarray, period: float) -> list[float]:
+    """Frequency above which each joint's torque (N, n) is little but white noise [Hz]; 0 for none.
+
+    Args:
+        variance: of the noise of a sample, (n,).
+    """
+    window = min(len(torque), round(_SPECTRUM / period))
+    frequency, power = welch(torque, 1.0 / period, nperseg=window, axis=0)
+    corners = []
+    for density, white in zip(power.T, 2 * variance * period, strict=True):
+        above = np.flatnonzero(density > _ABOVE_NOISE * white)
+        last = above[-1] + 1 if len(above) else 1
+        corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
+    return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
 
 
 def _joined(motion: JointMotion, steps: int) -> JointMotion:
