@@ -211,8 +211,13 @@ def test_an_interrupted_report_leaves_no_half_written_file(
         return replace(path, target)
 
     monkeypatch.setattr(Path, "replace", interrupted)
+    # Where the tests run in the background, it would be ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     options = ["--set", "duration=0.05", "--out", str(tmp_path), "--quiet"]
-    assert main(["simulate", "squat", *options]) == FAILED
+    try:
+        assert main(["simulate", "squat", *options]) == FAILED
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert capsys.readouterr().err == "fbse: interrupted; no file was left half-written\n"
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == [name for name in FILES if name != "report.html"]
