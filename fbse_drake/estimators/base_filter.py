@@ -72,8 +72,9 @@ _UNKNOWN_RATE, _UNKNOWN_ACCELERATION = 0.3, 3.0
 _GATE = 18.5
 # Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
 _MEMORY = 0.1
-# They stay within so many of the standard deviations that they had so long ago [s]: they hardly
-# walk, and a sensor that drifts faster is at fault. A deviation is at least so many random walks.
+# They stay within so many standard deviations of what was known of them so long ago [s]: they hardly
+# walk, and a sensor that drifts faster is at fault. What a filter finds out moves its estimate by a
+# variance as large as what it takes from its own; and at least by so many random walks.
 _LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
@@ -703,13 +704,15 @@ def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray
                 at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
                 walk = config.gyro_walk if sensor == 0 else config.accelerometer_walk
                 least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
-                leash[1, 2 + sensor, i] = math.sqrt(max(P[at, at], least**2))
+                leash[1, 2 + sensor, i] = P[at, at] + least**2
         if first:
             leash[0] = leash[1]
     for sensor in range(2):
         bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
         for i in range(3):
-            middle, reach = leash[0, sensor, i], _LEASH * leash[0, 2 + sensor, i]
+            at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
+            middle, learned = leash[0, sensor, i], max(0.0, leash[0, 2 + sensor, i] - P[at, at])
+            reach = _LEASH * math.sqrt(learned)
             bias[i] = min(max(bias[i], middle - reach), middle + reach)
 
 

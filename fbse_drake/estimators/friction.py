@@ -20,7 +20,7 @@ from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import leg_of_joint
 
@@ -172,10 +172,17 @@ class FrictionRegressor:
     def _all_nonlinear(self) -> np.ndarray:
         return np.hstack([f * self.nonlinear for f in (1.0, *self.factors)])
 
-    def __call__(self, velocity: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Basis torque of each parameter: of all joints as adopted, then with each factor."""
+    def __call__(
+        self, velocity: np.ndarray
+    ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Basis torque of each parameter, and its slope over the velocity.
+
+        Of all joints as adopted, then with each factor.
+        """
         motion = JointMotion(np.concatenate([velocity] * (1 + len(self.factors))))
-        return tuple(self.effect.basis(motion, self._all_nonlinear)[0])
+        torques, slopes = self.effect.basis(motion, self._all_nonlinear)
+        zero = np.zeros_like(motion.velocity)
+        return tuple(torques), tuple([slope + zero for slope in slopes])
 
 
 def recursive_least_squares(
@@ -259,7 +266,7 @@ class FrictionEstimator(RecursiveEstimator):
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:
         n, feet = len(robot.joint_names), len(robot.description.sides)
-        measured = ("residual", "torque_variance", "impulse_variance", "valid")
+        measured = ("residual", "torque_variance", "impulse_variance", "own_inertia", "valid")
         return {
             # Joints of no leg ask for the last one's, so there is at least one.
             "measurements": record_type(
@@ -317,7 +324,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if age == math.inf or (reset and age >= reset * (1 - 1e-9)):
             P[:], age = config.covariance * np.eye(P.shape[1]), 0.0
         posterior["age"] = age
-        phi = np.array(self._regressor(measured["joint_velocity"])).T
+        phi = np.array(self._regressor(measured["joint_velocity"])[0]).T
         valid = link_torque["valid"] > 0
         if config.swing == "model":
             valid &= measured["support"][self._leg] > 0
@@ -360,21 +367,31 @@ def smoothing_time(noise: float, period: float) -> float:
 
 @njit(cache=True)
 def smooth_velocity(
-    posterior: np.ndarray, last: np.ndarray, measured: np.ndarray, elapsed: float, time: float
-) -> None:
-    """Low-pass of first order over joint velocities.
+    posterior: np.ndarray,
+    last: np.ndarray,
+    measured: np.ndarray,
+    elapsed: float,
+    share: float,
+    time: float,
+) -> float:
+    """Velocity that a friction law sees: a joint's over the tick, behind a low-pass of first order.
 
     Args:
         posterior, last: of `ModelAidedEstimator`, now, whose `velocity` is filled, and a tick ago.
         measured: posterior of `SensorMonitor`.
+        share: of the velocity where the tick began in that over the tick, see `start_share`.
         time: time constant of the low-pass [s], 0 does not smooth.
+
+    Returns:
+        Share of what is measured now.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     keep = math.exp(-elapsed / time) if time > 0 else 0.0
     for joint in range(len(posterior.velocity)):
-        # The joint's velocity over the tick is the mean of those at its ends.
-        mean = 0.5 * (measured.joint_velocity[joint] + last.last_velocity[joint])
-        posterior.velocity[joint] = keep * last.velocity[joint] + (1 - keep) * mean
+        now, before = measured.joint_velocity[joint], last.joint_velocity[joint]
+        over_tick = now + share * (before - now)
+        posterior.velocity[joint] = keep * last.velocity[joint] + (1 - keep) * over_tick
+    return (1.0 - keep) * (1.0 - share)
 
 
 @njit(cache=True)
@@ -385,7 +402,9 @@ def _estimate_friction(
     measured: np.ndarray,
     link_torque: np.ndarray,
     phi: tuple[np.ndarray, ...],
+    slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
+    seen: float,
     known: np.ndarray,
 ) -> None:
     """One tick of `ModelAidedEstimator` but the first: a Kalman filter for each joint.
@@ -393,9 +412,11 @@ def _estimate_friction(
     Fills the posterior but for its `velocity`.
 
     Args:
-        phi, shaped: see `FrictionRegressor`.
+        phi, slopes, shaped: see `FrictionRegressor`.
+        seen: share of the velocity that is measured now in that which the model sees.
         known: record with the numbers of `ModelAided` as `config`; `joint_leg` (n,), which leg each
-            joint belongs to; `measures_swing`, whether the measurement counts while the leg swings.
+            joint belongs to; `measures_swing`, whether the measurement counts while the leg swings;
+            and `velocity_variance` of the encoders' noise [rad^2/s^2].
     """
     posterior, last, known = posterior[()], last[()], known[()]
     measured, link, config = measured[()], link_torque[()], known.config
@@ -410,20 +431,25 @@ def _estimate_friction(
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
-        # Weights of the model and disturbance, whose regressor is one.
+        x[:m] = last.weights[joint]
+        x[m] = last.disturbance[joint]
+        # Weights of the model and disturbance, whose regressor is one; and by how much the friction
+        # rises with the velocity.
+        slope = 0.0
         for k in range(parameters):
             regressor[k] = phi[k][joint]
+            slope += x[k] * slopes[k][joint]
         k, other = parameters, n + joint
         while k < m:
             for at in shaped:
                 regressor[k] = phi[at][other] - phi[at][joint]
+                slope += x[k] * (slopes[at][other] - slopes[at][joint])
                 k += 1
             other += n
-        x[:m] = last.weights[joint]
-        x[m] = last.disturbance[joint]
+        slope = max(0.0, seen * slope)
         P, noise = posterior.covariance[joint], last.noise[joint]
         impulse_uncertainty = P[0, 0]
-        # Prediction: the impulse error grows by the friction's error times the tick.
+        # Prediction: the impulse error grows by the friction's error times the tick ...
         innovation = last.impulse[joint] + elapsed * link.residual[joint]
         added = elapsed**2 * noise * link.torque_variance[joint]
         for k in range(m + 1):
@@ -435,6 +461,11 @@ def _estimate_friction(
             P[i, 0] += c
             if i > 0:
                 added += elapsed * regressor[i - 1] * c
+        # ... which also comes of the noise in the velocity that the model sees. The measured
+        # impulse has it, too, as it is made of the same velocity.
+        velocity_variance = noise * known.velocity_variance
+        through_model, through_link = elapsed * slope, link.own_inertia[joint]
+        added += through_model**2 * velocity_variance
         # Its own row and column are the same.
         P[0, 0] += P[0, 0] - impulse_uncertainty + added
         P[size - 1, size - 1] += config.disturbance_walk**2 * elapsed
@@ -444,8 +475,10 @@ def _estimate_friction(
         P[0, size - 1] = P[size - 1, 0]
         # Update.
         column[:] = P[:, 0]
-        S = column[0] + noise * link.impulse_variance[joint]
-        impulse = innovation
+        shared = through_model * through_link * velocity_variance
+        column[0] += shared
+        S = column[0] + shared + noise * link.impulse_variance[joint]
+        impulse, velocity_error = innovation, 0.0
         if valid:
             likely = min(1.0, _GATE * math.sqrt(S) / max(abs(innovation), 1e-300))
             S_gate = S / likely**2
@@ -460,6 +493,9 @@ def _estimate_friction(
                 for k in range(size):
                     if learns or not (is_weight and 0 < k <= m):
                         P[i, k] -= gain * column[k]
+            of_velocity = -(through_model + through_link) * velocity_variance
+            velocity_error = of_velocity / S_gate * innovation
+            velocity_variance -= of_velocity**2 / S_gate
             # Differences of innovations show the noise, whatever the model is wrong by ...
             change = innovation - last.innovation[joint]
             rough = (
@@ -478,24 +514,30 @@ def _estimate_friction(
             x[m] = impulse = posterior.agreement[joint] = 0.0
             P[0, :] = 0.0
             P[:, 0] = 0.0
-        total, variance = 0.0, 0.0
+        total = -slope * velocity_error
+        variance = slope**2 * max(0.0, velocity_variance)
         for i in range(m + 1):
             total += regressor[i] * x[i]
             for k in range(m + 1):
                 variance += regressor[i] * regressor[k] * P[1 + i, 1 + k]
+        unsettled = 0.0
         for k in range(m):
             posterior.weights[joint, k] = x[k]
+            settled = keep_doubt * last.settled[joint, k] + (1.0 - keep_doubt) * x[k]
+            posterior.settled[joint, k] = settled
+            unsettled += regressor[k] * (x[k] - settled)
         for k in range(parameters):
             posterior.parameters[joint, k] = x[k]
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
-        doubt = max(abs(x[m]), keep_doubt * last.doubt[joint])
+        # What the model learned just now is not confirmed yet.
+        doubt = max(abs(x[m]) + abs(unsettled), keep_doubt * last.doubt[joint])
         posterior.doubt[joint] = doubt
         posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt**2)
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse
         posterior.innovation[joint] = innovation if valid else 0.0
         posterior.innovation_variance[joint] = S
-        posterior.last_velocity[joint] = measured.joint_velocity[joint]
+        posterior.joint_velocity[joint] = measured.joint_velocity[joint] - velocity_error
 
 
 class ModelAidedEstimator(FrictionEstimator):
@@ -512,12 +554,13 @@ class ModelAidedEstimator(FrictionEstimator):
         - (one for each field)
 
     Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
-    [Nm s], after the update; `velocity` that the model sees and `last_velocity` as measured
-    [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
+    [Nm s], after the update; `velocity` that the model sees and `joint_velocity`, that measured
+    less what is known of its noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
     [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
     shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
     the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
-    the running mean of the innovation [Nm s]; `doubt` (n,) the largest disturbance of late [Nm].
+    the running mean of the innovation [Nm s]; `settled` (n, ...) the weights of some time ago;
+    `doubt` (n,) the largest disturbance of late, with what has been learned since then [Nm].
     """
 
     def __init__(
@@ -531,10 +574,10 @@ class ModelAidedEstimator(FrictionEstimator):
     ):
         n = len(robot.joint_names)
         regressor = FrictionRegressor.of(config.model, robot, config.factors)
-        further = ("disturbance", "impulse", "velocity", "last_velocity", "friction_std")
+        further = ("disturbance", "impulse", "velocity", "joint_velocity", "friction_std")
         further += ("noise", "agreement", "doubt")
         shapes = dict.fromkeys(further, (n,))
-        shapes["weights"] = (n, regressor.weights)
+        shapes["weights"] = shapes["settled"] = (n, regressor.weights)
         super().__init__(
             regressor, robot, measurements, link_torque, clock, regressor.weights + 2, **shapes
         )
@@ -542,7 +585,13 @@ class ModelAidedEstimator(FrictionEstimator):
         if self._smoothing is None:
             self._smoothing = smoothing_time(sensors.joint_velocity_noise, clock.period)
         measures_swing = config.swing == "measurement"
-        self._known = record(config=config, joint_leg=self._leg, measures_swing=measures_swing)
+        self._known = record(
+            config=config,
+            joint_leg=self._leg,
+            measures_swing=measures_swing,
+            velocity_variance=sensors.joint_velocity_noise**2,
+        )
+        self._reading = clock.reading
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
@@ -551,11 +600,12 @@ class ModelAidedEstimator(FrictionEstimator):
         if math.isnan(elapsed):
             self._start(posterior, measured)
             return
-        smooth_velocity(posterior, last, measured, elapsed, self._smoothing)
-        phi = self._regressor(posterior["velocity"])
+        share = start_share(elapsed, self._reading)
+        seen = smooth_velocity(posterior, last, measured, elapsed, share, self._smoothing)
+        phi, slopes = self._regressor(posterior["velocity"])
         shaped = self._regressor.shaped
         _estimate_friction(
-            posterior, last, elapsed, measured, link_torque, phi, shaped, self._known
+            posterior, last, elapsed, measured, link_torque, phi, slopes, shaped, seen, self._known
         )
 
     def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
@@ -565,6 +615,7 @@ class ModelAidedEstimator(FrictionEstimator):
         posterior[...] = np.zeros((), self.posterior_type)
         posterior["status"] = measured["trust"].max()
         posterior["parameters"] = posterior["weights"][:, :m] = self._regressor.initial
+        posterior["settled"] = posterior["weights"]
         posterior["noise"] = 1.0
         posterior["covariance"] = np.diag([0.0, *uncertainty, config.disturbance_uncertainty**2])
-        posterior["velocity"] = posterior["last_velocity"] = measured["joint_velocity"]
+        posterior["velocity"] = posterior["joint_velocity"] = measured["joint_velocity"]

@@ -29,6 +29,7 @@ def _clear(posterior: np.ndarray, status: float) -> None:
     posterior.residual[:] = 0.0
     posterior.torque_variance[:] = 0.0
     posterior.impulse_variance[:] = 0.0
+    posterior.own_inertia[:] = 0.0
     posterior.valid[:] = 0.0
 
 
@@ -125,6 +126,7 @@ def _estimate_link_torque(
         posterior.residual[i] = torque_command[i] - link_torque
         posterior.torque_variance[i] = torque_variance
         posterior.impulse_variance[i] = impulse_variance
+        posterior.own_inertia[i] = to_sensors[6 + i]
         posterior.valid[i] = acceleration.known[i] if trusted else 0.0
 
 
@@ -164,6 +166,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
                            [Nm^2]
         impulse_variance   of that part's time integral that is white: gyro and encoders, which are
                            differentiated [(Nm s)^2]
+        own_inertia        by which noise of the joint's own velocity is in that integral [kg m^2]
         valid              1 where all that the residual needs was known
 
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
@@ -194,6 +197,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             residual=(n,),
             torque_variance=(n,),
             impulse_variance=(n,),
+            own_inertia=(n,),
             valid=(n,),
             force_noise=(len(legs),),
             wrench=(len(legs), 6),
