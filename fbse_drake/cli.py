@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         _add_scenario(run)
         _add_log(run)
-        if name in ("study", "identify"):
+        if name != "compare":
             run.add_argument(
                 "--test",
                 metavar="LOG",

@@ -30,6 +30,7 @@ from fbse_drake.discrepancy.identify import identifiability_text, identification
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.sanity import check_sensors
 from fbse_drake.discrepancy.study import study, study_json, train_and_rest
+from fbse_drake.discrepancy.validation import validated
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_atomically, write_text
@@ -121,7 +122,8 @@ def _estimate(options: argparse.Namespace) -> bool:
 def _compare(options: argparse.Namespace) -> bool:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
     with _errors_located(options), console.status("comparing the model with the log"):
-        predictor = _checked(scenario, train_and_rest(scenario, log)[0])
+        # Nothing is fitted, so nothing is set aside.
+        predictor = _checked(scenario, log)
         inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
         comparison = compare(predictor)
     _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
@@ -136,13 +138,22 @@ def _compare(options: argparse.Namespace) -> bool:
 
 def _diagnose(options: argparse.Namespace) -> bool:
     console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
+    train, tests = _train_and_tests(scenario, log, options)
     with _errors_located(options), _told(console, options.time_limit) as progress:
-        train = train_and_rest(scenario, log)[0]
         predictor = _checked(scenario, train)
-        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
+        inputs = replace(
+            inputs, hygiene=inspect(predictor.motion, predictor.noise), tests=tuple(map(str, options.test))
+        )
         comparison = compare(predictor)
         trusted = inputs.hygiene.trusted(scenario, predictor.robot)
         diagnosis = diagnose(Predictor(trusted, train), progress=progress)
+        if diagnosis.chosen:
+            completed = add(trusted, diagnosis.chosen)
+            set_aside = {
+                name: validated(Predictor(trusted, test), Predictor(completed, test))
+                for name, test in tests.items()
+            }
+            diagnosis = replace(diagnosis, set_aside=set_aside)
     _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
     with console.status("writing the report"):
         write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)

@@ -159,8 +159,8 @@ class RecordingConfig:
     # Rows of the residual, as compare.json names them (* stands for any text), that cannot close, for a channel of theirs is not to be
     # trusted: nothing is fitted to them, and nothing is said about them.
     unused_rows: list[str] = field(default_factory=list)
-    # Models are fitted to this first share of the log and tested on the rest.
-    train_share: float = 1.0
+    # Models are fitted to this first share of the log; the rest is set aside to test them.
+    train_share: float = 0.8
 
     def __post_init__(self) -> None:
         require_positive(self, "block")

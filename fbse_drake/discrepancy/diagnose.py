@@ -1,7 +1,7 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.experiment import Experiments
 from fbse_drake.discrepancy.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
+from fbse_drake.discrepancy.parsimony import frugal
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import added, consistent, remeasured
@@ -21,6 +22,7 @@ from fbse_drake.discrepancy.rivals import equals, rival_name, rivals, settled
 from fbse_drake.discrepancy.selection import select
 from fbse_drake.discrepancy.significance import Significance
 from fbse_drake.discrepancy.structure import Structure, leftover_structure
+from fbse_drake.discrepancy.validation import Validation, validation_json
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -105,6 +107,9 @@ class Diagnosis:
     averaging: Averaging | None = None
     # Why the search ended before it was through; None if it was. What a partial diagnosis does not name was not ruled out.
     partial: str | None = None
+    # By log that was set aside: is the model with what was chosen better there? See `study` for a
+    # search that goes on.
+    set_aside: Mapping[str, Validation] = field(default_factory=dict)
 
     @property
     def chosen(self) -> list[Finding]:
@@ -153,6 +158,7 @@ def diagnose(
     try:
         for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
             progress("looking for what explains more")
+        path[-1] = frugal(proposals, path[-1])
     except Interrupted as stop:
         partial = str(stop)
     fits = proposals.fits
@@ -387,6 +393,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "held_out_before": diagnosis.held_out_before,
         "held_out_after": diagnosis.held_out_after,
         "train_after": diagnosis.train_after,
+        "set_aside": {name: validation_json(one) for name, one in diagnosis.set_aside.items()},
         "noise_floor": 1.0,
         "block": None if diagnosis.averaging is None else diagnosis.averaging.block,
         "ranking": [

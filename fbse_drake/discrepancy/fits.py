@@ -22,7 +22,7 @@ from fbse_drake.discrepancy.remainder import Remainder
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Probability of any false alarm on a log that hides nothing.
-_FALSE_ALARM = 1e-3
+FALSE_ALARM = 1e-3
 # Explanations whose deviances differ by less are not told apart (a likelihood ratio of some 150).
 MARGIN = 10.0
 # What a parameter must earn beyond what it costs on held-out data.
@@ -148,7 +148,7 @@ class Fits:
         for effect in self.dictionary.joint_effects:
             sets = self.dictionary.points(effect).shape[1]
             tests += len(self.dictionary.groups) * max(1, sets // 4)
-        return np.array([np.inf, *(chi2.isf(_FALSE_ALARM / tests, k) for k in range(1, 13))])
+        return np.array([np.inf, *(chi2.isf(FALSE_ALARM / tests, k) for k in range(1, 13))])
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:
         """Fits candidates together."""

@@ -109,17 +109,18 @@ class Proposals:
                         for c in explanation.candidates
                         if (c.effect, c.targets) != (effect, (joint,))
                     ]
-                    best = self._best_beside(self.fits.explain(others), effect, joint)
-                    explanation = self.fits.explain([*others, best])
+                    explanation = self.beside(self.fits.explain(others), effect, (joint,))
         return explanation
 
-    def _best_beside(
-        self, base: Explanation, effect: type[JointTorqueEffect], joint: str
-    ) -> Candidate:
-        """A joint torque effect with the nonlinear values that fit best beside an explanation."""
-        beside, place = self.fits.remainder(base), self.fits.dictionary.joints.index(joint)
-        gain = self._gain(effect, [place], beside)
-        return self._best_on(effect, (joint,), int(gain.argmax()), beside)
+    def beside(
+        self, base: Explanation, effect: type[JointTorqueEffect], targets: tuple[str, ...]
+    ) -> Explanation:
+        """An explanation with one more joint torque effect, with the nonlinear values that fit best beside it."""
+        remainder = self.fits.remainder(base)
+        places = [self.fits.dictionary.joints.index(joint) for joint in targets]
+        gain = self._gain(effect, places, remainder)
+        best = self._best_on(effect, targets, int(gain.argmax()), remainder)
+        return self.fits.explain([*base.candidates, best])
 
     def _gain(
         self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder

@@ -54,9 +54,6 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
             fits, proposals = weighed, Proposals(weighed)
         path.append(polished(fits, explanation))
         yield [*path], proposals
-    if fits.dictionary.inertia is None:
-        path[-1] = _pruned(fits, path[-1])
-        yield [*path], proposals
 
 
 def best_additions(

@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.diagnose import Diagnosis, Finding, diagnose, diagno
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import rms
 from fbse_drake.discrepancy.rollout import RolloutError, rollout
+from fbse_drake.discrepancy.validation import Validation, validated, validation_json
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, silent
@@ -23,6 +24,8 @@ from fbse_drake.walking.reference import Recorded
 _LEAST_GAIN = 0.01
 # The same where no more than the sensors' noise was left: what is found there is mostly noise, unless more noise is believed than there is.
 _LEAST_GAIN_IN_NOISE = 0.1
+# Less of a log than this many blocks is not set aside.
+_SHORTEST_REST = 40
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
 
@@ -56,17 +59,16 @@ def model_error(predictor: Predictor) -> ModelError:
 
 
 def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
-    """The share of a log that models are fitted to, and the rest if there is one; see `RecordingConfig.train_share`."""
-    split = int(
-        np.searchsorted(
-            log.time,
-            log.time[0] + scenario.recording.train_share * (log.time[-1] - log.time[0]),
-            side="right",
-        )
-    )
-    return log.part(slice(0, split)), log.part(slice(split, None)) if split < len(
-        log.time
-    ) else None
+    """The share of a log that models are fitted to, and the rest; see `RecordingConfig.train_share`.
+
+    The rest is None, and all of the log is fitted, where it would be too short to be read.
+    """
+    recording, start, end = scenario.recording, log.time[0], log.time[-1]
+    if (1.0 - recording.train_share) * (end - start) < _SHORTEST_REST * recording.block:
+        return log, None
+    split = start + recording.train_share * (end - start)
+    place = int(np.searchsorted(log.time, split, side="right"))
+    return log.part(slice(0, place)), log.part(slice(place, None))
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,8 @@ class Study:
     scenario: Scenario
     # Was it interrupted? Then `stopped_because` says why.
     partial: bool = False
+    # By log that was set aside: is the completed model better there? Empty if nothing was added.
+    set_aside: Mapping[str, Validation] = field(default_factory=dict)
 
     @property
     def found(self) -> list[Finding]:
@@ -133,10 +137,14 @@ def study(
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
 
+    # Of the tests, by every model.
+    tested: list[dict[str, Predictor]] = []
+
     def measured_step(
         added: Sequence[Finding], held_out_rmse: float, train_rmse: float, *, simulated: bool
     ) -> StudyStep:
         others = {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
+        tested.append(others)
         errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
         rolled, test_rolled = None, {}
         if simulated:
@@ -179,7 +187,12 @@ def study(
         predictor = Predictor(scenario, log)
         step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after)
     because = _reason(diagnoses) if interrupted is None else interrupted
-    return Study(tuple(steps), tuple(diagnoses), because, scenario, interrupted is not None)
+    set_aside = {}
+    if len(steps) > 1:
+        set_aside = {name: validated(tested[0][name], one) for name, one in tested[-1].items()}
+    return Study(
+        tuple(steps), tuple(diagnoses), because, scenario, interrupted is not None, set_aside
+    )
 
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
@@ -189,7 +202,7 @@ def _reason(diagnoses: list[Diagnosis]) -> str:
     if last.verdict == "unknown_effect":
         rows = ", ".join(words(structure.row) for structure in last.unexplained)
         return f"no effect of the library explains what is left in {rows}"
-    if last.verdict == "not_visible":
+    if last.verdict == "not_visible" and last.held_out_before > 1.0:
         return "this data does not excite what could still be missing"
     left = f"what is left is {last.held_out_before:.2f} times the sensors' noise"
     return f"the noise floor is reached: {left} and no effect explains a worthwhile part of it"
@@ -227,6 +240,7 @@ def study_json(result: Study) -> dict[str, Any]:
         "unit": "multiples of the sensors' noise",
         "partial": result.partial,
         "stopped_because": result.stopped_because,
+        "set_aside": {name: validation_json(one) for name, one in result.set_aside.items()},
         "verdict": result.diagnoses[0].verdict,
         "diagnoses": [diagnosis_json(diagnosis) for diagnosis in result.diagnoses],
     }

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Reduction, Rise
 
 _COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
 _VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
@@ -82,6 +82,46 @@ class ViscousFriction(JointTorqueEffect):
 
 @in_library
 @dataclass(frozen=True)
+class CoulombViscousFriction(JointTorqueEffect):
+    """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb tanh(w / transition) + viscous w."""
+
+    description: ClassVar[str] = (
+        "Friction of constant size against the motion, plus a part that grows with speed."
+    )
+    signature: ClassVar[str] = (
+        "Torque jumps when the velocity changes sign and rises linearly with it."
+    )
+    experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
+    of_velocity_alone: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "coulomb": _COULOMB,
+        "viscous": _VISCOUS,
+        "transition": _TRANSITION,
+    }
+    composite: ClassVar[bool] = True
+    reductions: ClassVar[tuple[Reduction, ...]] = (
+        Reduction({"viscous": 0.0}, (CoulombFriction,)),
+        Reduction({"coulomb": 0.0}, (ViscousFriction,)),
+    )
+
+    coulomb: dict[str, float] = field(default_factory=dict)
+    viscous: dict[str, float] = field(default_factory=dict)
+    transition: dict[str, float] = field(default_factory=_sharp)
+
+    @staticmethod
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (sign, motion.velocity), (slope, 1.0)
+
+    @staticmethod
+    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
+        return Rise(linear[1], (nonlinear[0],))
+
+
+@in_library
+@dataclass(frozen=True)
 class StribeckFriction(JointTorqueEffect):
     """Continuously differentiable friction with static, Stribeck, Coulomb and viscous parts (Makkar et al. 2005, paper eq. 56):
 
@@ -106,6 +146,12 @@ class StribeckFriction(JointTorqueEffect):
         "gamma5": Parameter("s/rad", linear=False, plausible=(20.0, 500.0)),
         "gamma6": Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0)),
     }
+    reductions: ClassVar[tuple[Reduction, ...]] = (
+        Reduction({"gamma1": 0.0, "gamma6": 0.0}, (CoulombFriction,)),
+        Reduction({"gamma1": 0.0, "gamma4": 0.0}, (ViscousFriction,)),
+        Reduction({"gamma1": 0.0}, (CoulombViscousFriction,)),
+        Reduction({"gamma1": 0.0}, (CoulombFriction, ViscousFriction)),
+    )
 
     # Defaults are the paper's Table I where all joints share a value.
     gamma1: dict[str, float] = field(default_factory=dict)
@@ -128,42 +174,6 @@ class StribeckFriction(JointTorqueEffect):
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
         with np.errstate(divide="ignore"):
             return Rise(linear[2], (1.0 / nonlinear[0], 1.0 / nonlinear[2]))
-
-
-@in_library
-@dataclass(frozen=True)
-class CoulombViscousFriction(JointTorqueEffect):
-    """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb tanh(w / transition) + viscous w."""
-
-    description: ClassVar[str] = (
-        "Friction of constant size against the motion, plus a part that grows with speed."
-    )
-    signature: ClassVar[str] = (
-        "Torque jumps when the velocity changes sign and rises linearly with it."
-    )
-    experiment: ClassVar[str] = "Move each joint to and fro at several constant speeds."
-    of_velocity_alone: ClassVar[bool] = True
-    parameters: ClassVar[dict[str, Parameter]] = {
-        "coulomb": _COULOMB,
-        "viscous": _VISCOUS,
-        "transition": _TRANSITION,
-    }
-    composite: ClassVar[bool] = True
-
-    coulomb: dict[str, float] = field(default_factory=dict)
-    viscous: dict[str, float] = field(default_factory=dict)
-    transition: dict[str, float] = field(default_factory=_sharp)
-
-    @staticmethod
-    def basis(
-        motion: JointMotion, nonlinear: np.ndarray
-    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
-        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
-        return (sign, motion.velocity), (slope, 1.0)
-
-    @staticmethod
-    def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
-        return Rise(linear[1], (nonlinear[0],))
 
 
 @in_library
@@ -315,6 +325,7 @@ class ThermalDrift(JointTorqueEffect):
         ),
         "transition": _TRANSITION,
     }
+    reductions: ClassVar[tuple[Reduction, ...]] = (Reduction({"warm_up": 0.0}, (CoulombFriction,)),)
 
     change: dict[str, float] = field(default_factory=dict)
     warm_up: dict[str, float] = field(default_factory=lambda: {"all": 60.0})

@@ -9,7 +9,7 @@ is one basis torque as it stands.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -53,6 +53,16 @@ class Rise(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Reduction:
+    """How a law turns into simpler ones."""
+
+    # Parameters, and the values at which it does.
+    at: Mapping[str, float]
+    # Of the library; what the law says there is what these say together.
+    effects: tuple[type["JointTorqueEffect"], ...]
+
+
+@dataclass(frozen=True)
 class JointTorqueEffect(Effect):
     """Base of the joint torque effects.
 
@@ -66,6 +76,8 @@ class JointTorqueEffect(Effect):
     has_memory: ClassVar[bool] = False
     # Does the torque depend on nothing but the velocity? (Then it is simulated faster.)
     of_velocity_alone: ClassVar[bool] = False
+    # Simpler laws that it contains, the simplest first: a diagnosis names the smallest that holds.
+    reductions: ClassVar[tuple[Reduction, ...]] = ()
 
     @staticmethod
     @abstractmethod

@@ -7,8 +7,16 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
+from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise, affine_recursion
+from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    Reduction,
+    Rise,
+    affine_recursion,
+)
 
 
 @in_library
@@ -58,6 +66,7 @@ class JointSpring(JointTorqueEffect):
         # The torque at angle zero.
         "preload": Parameter("Nm", linear=True, plausible=(-30.0, 30.0), bounds=(-np.inf, np.inf)),
     }
+    reductions: ClassVar[tuple[Reduction, ...]] = (Reduction({"stiffness": 0.0}, (TorqueBias,)),)
 
     stiffness: dict[str, float] = field(default_factory=dict)
     preload: dict[str, float] = field(default_factory=dict)
@@ -96,6 +105,9 @@ class PreslidingHysteresis(JointTorqueEffect):
         ),
     }
     has_memory: ClassVar[bool] = True
+    reductions: ClassVar[tuple[Reduction, ...]] = (
+        Reduction({"displacement": 0.0}, (CoulombFriction,)),
+    )
 
     coulomb: dict[str, float] = field(default_factory=dict)
     displacement: dict[str, float] = field(default_factory=lambda: {"all": 0.005})

@@ -16,6 +16,7 @@ from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.residual import joint_velocity_noise
 from fbse_drake.discrepancy.structure import Structure
 from fbse_drake.discrepancy.study import Study, StudyStep
+from fbse_drake.discrepancy.validation import Measured, Validation
 from fbse_drake.effects.effect import library
 from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures
@@ -107,6 +108,7 @@ def write_diagnosis_report(
         _applicable(diagnosis.effects),
     )
     rows = (
+        *_on_set_aside(diagnosis.set_aside),
         (
             "How sure",
             how_sure(
@@ -134,7 +136,11 @@ def write_diagnosis_report(
         _hygiene(predictor, inputs),
         _reproduce("diagnose", predictor, inputs),
     ]
-    passed = diagnosis.partial is None and diagnosis.verdict in _PASSED
+    passed = (
+        diagnosis.partial is None
+        and diagnosis.verdict in _PASSED
+        and _is_confirmed(diagnosis.set_aside)
+    )
     write_report(
         path,
         Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)),
@@ -157,6 +163,7 @@ def write_study_report(
     """
     first, last, statuses = study.steps[0], study.steps[-1], _statuses(study)
     rows = (
+        *_on_set_aside(study.set_aside),
         *_relative_fall(study),
         ("Why it stopped there", _sentence(study.stopped_because)),
         (
@@ -188,7 +195,11 @@ def write_study_report(
         _hygiene(before[0], inputs),
         _reproduce("study", before[0], inputs, completed),
     ]
-    passed = not study.partial and study.diagnoses[-1].verdict in _PASSED
+    passed = (
+        not study.partial
+        and study.diagnoses[-1].verdict in _PASSED
+        and _is_confirmed(study.set_aside)
+    )
     write_report(
         path,
         Report(
@@ -215,9 +226,64 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     """The verdict in one or two sentences."""
     if diagnosis.partial is not None:
         return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
+    parts = [_verdict(diagnosis)]
     if diagnosis.averaging is not None and diagnosis.averaging.text:
-        return f"{_verdict(diagnosis)} {diagnosis.averaging.text}"
-    return _verdict(diagnosis)
+        parts.append(diagnosis.averaging.text)
+    return _headline(" ".join(parts), diagnosis.set_aside)
+
+
+def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
+    """A result with what it is worth on data that was set aside; if that is nothing, it comes first."""
+    refuted = {name: one for name, one in set_aside.items() if one.course != "falls"}
+    confirmed = {name: one for name, one in set_aside.items() if one.course == "falls"}
+    before = [f"Not confirmed: {_course(name, one)}." for name, one in refuted.items()]
+    after = [f"{_sentence(_course(name, one))}" for name, one in confirmed.items()]
+    return " ".join([*before, result, *after])
+
+
+_COURSES = {
+    "falls": "the error falls",
+    "rises": "the error rises",
+    "unclear": "the error does not fall beyond doubt",
+}
+
+
+def _course(log: str, validation: Validation) -> str:
+    """As `on the rest of the log, which was set aside, the error falls from 4.20 to 0.99 (0.95 to 1.03) times the sensors' noise`."""
+    before, after = validation.before, validation.after
+    text = (
+        f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: from {number(before.value)} to "
+        f"{number(after.value)} ({_between(after, 1.0)}) times the sensors' noise"
+    )
+    if np.isfinite(validation.relative_after.value):
+        shares = validation.relative_before, validation.relative_after
+        text += f", from {number(100 * shares[0].value)} to {number(100 * shares[1].value)} % ({_between(shares[1], 100.0)}) of the torque"
+    return text
+
+
+def _between(measured: Measured, factor: float) -> str:
+    """As `0.95 to 1.03`."""
+    low, high = (factor * bound for bound in measured.interval)
+    return f"{number(low)} to {number(high)}" if np.isfinite(high) else "too short for an interval"
+
+
+def _set_aside_name(log: str) -> str:
+    return f"the {log}" if log == "rest of the log" else log
+
+
+def _on_set_aside(set_aside: Mapping[str, Validation]) -> list[tuple[str, str]]:
+    """What data that was set aside says, as a row of the summary."""
+    if not set_aside:
+        return []
+    texts = [
+        f"{_sentence(_course(name, one))} That is {number(one.change.value)} ({_between(one.change, 1.0)}) of it."
+        for name, one in set_aside.items()
+    ]
+    return [("On data set aside", " ".join([*texts, "Intervals are 95 %, by batch means."]))]
+
+
+def _is_confirmed(set_aside: Mapping[str, Validation]) -> bool:
+    return all(one.course == "falls" for one in set_aside.values())
 
 
 def _too_small(findings: Sequence[Finding]) -> list[tuple[str, str]]:
@@ -274,17 +340,19 @@ def study_outcome(study: Study) -> str:
 def _study_result(study: Study) -> str:
     if not study.found:
         return diagnosis_outcome(study.diagnoses[-1])
-    first, last = study.steps[0], study.steps[-1]
-    course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
-    rest = (
-        f" {_unexplained(study.diagnoses[-1])}"
-        if study.diagnoses[-1].verdict == "unknown_effect"
-        else ""
-    )
-    return (
-        f"The model lacked {_listed(study.found)}. With it, the held-out error {course} from {number(first.held_out_rmse)} to "
-        f"{number(last.held_out_rmse)} times the sensors' noise.{rest}"
-    )
+    result = f"The model lacked {_listed(study.found)}."
+    if study.set_aside:
+        result = _headline(result, study.set_aside)
+    else:
+        first, last = study.steps[0], study.steps[-1]
+        course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
+        result += (
+            f" With it, the held-out error {course} from {number(first.held_out_rmse)} to {number(last.held_out_rmse)} times "
+            "the sensors' noise; no data was set aside to test that."
+        )
+    if study.diagnoses[-1].verdict == "unknown_effect":
+        result += f" {_unexplained(study.diagnoses[-1])}"
+    return result
 
 
 def how_sure(
@@ -293,13 +361,13 @@ def how_sure(
     """What supports a verdict.
 
     Args:
-        before, after, train: error on held-out data without and with what was found, and on the data that it was fitted to, in multiples of
-            the sensors' noise.
+        before, after, train: error on blocks held out in turn without and with what was found, and
+            on the data that it was fitted to, in multiples of the sensors' noise.
         partial: the search ended before it was through.
     """
     if found:
         return (
-            f"On data that nothing was fitted to, the error of all channels falls from {number(before)} to {number(after)} times the "
+            f"On blocks that were held out in turn, the error of all channels falls from {number(before)} to {number(after)} times the "
             f"sensors' noise ({number(train)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
         )
     nothing = (

@@ -1,0 +1,182 @@
+"""The smallest explanation: effective samples, laws that contain simpler ones, pooling, and what does not pay.
+
+Truth comes from planned motions and from torques that are added to them here, by formulas of this file.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from fbse_drake import Log, Scenario, load_scenario
+from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.parsimony import blocks_per_sample
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.effects.effect import library
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    Reduction,
+    basis_over_time,
+)
+from fbse_drake.scenario import RecordingConfig
+
+NOISE = 0.05
+LEFT, RIGHT = "left_knee_pitch", "right_knee_pitch"
+FRICTION = ("CoulombFriction", "ViscousFriction", "StribeckFriction", "PreslidingHysteresis")
+Law = Callable[[np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[Scenario, Log]:
+    """Legs that swing in a gantry without any friction, as planned."""
+    scenario = load_scenario("leg_swing_gantry", overrides=["duration=12", "log.period=0.01"])
+    bare = dataclasses.replace(scenario.robot, effects={})
+    believed = dataclasses.replace(scenario, robot=bare, model=bare)
+    return dataclasses.replace(
+        believed,
+        recording=RecordingConfig(rows="instantaneous", block=0.02, torque_noise={"all": NOISE}),
+    ), planned_log(believed)
+
+
+def diagnosis_of(
+    swing: tuple[Scenario, Log], laws: Mapping[str, Law], effects: tuple[str, ...] = FRICTION
+) -> Diagnosis:
+    """What is found in the planned motion with laws of the velocity in some joints, and noise."""
+    scenario, log = swing
+    random = np.random.default_rng(3)
+    channels = dict(log.channels)
+    torque = channels["joint/torque_command"].copy()
+    velocity = channels["joint/velocity"]
+    for joint, law in laws.items():
+        place = log.joints.index(joint)
+        torque[:, place] += law(velocity[:, place])
+    torque += NOISE * random.standard_normal(torque.shape)
+    channels["joint/torque_command"] = torque
+    return diagnose(
+        Predictor(scenario, Log(channels, log.meta)), [library()[name] for name in effects]
+    )
+
+
+def found(diagnosis: Diagnosis) -> dict[str, tuple[str, ...]]:
+    return {finding.effect: finding.targets for finding in diagnosis.chosen}
+
+
+def coulomb(size: float) -> Law:
+    return lambda velocity: size * np.tanh(velocity / 0.01)
+
+
+def test_blocks_per_sample_is_the_integrated_autocorrelation_time():
+    """White noise: 1. A first-order autoregression: (1 + a) / (1 - a); times a wave, 1 / its spectrum there."""
+    random, count = np.random.default_rng(0), 20_000
+    white = random.standard_normal((count, 3))
+    coloured = white.copy()
+    for k in range(1, count):
+        coloured[k, 1:] = 0.8 * coloured[k - 1, 1:] + white[k, 1:]
+    wave = np.cos(0.2 * np.arange(count))
+    scores = coloured * np.stack([np.ones(count), np.ones(count), wave], axis=1)
+    of_wave = (1 - 0.8**2) / (1 - 2 * 0.8 * np.cos(0.2) + 0.8**2)
+    assert blocks_per_sample(scores) == pytest.approx([1.0, 9.0, of_wave], rel=0.2)
+
+
+REDUCTIONS = [
+    (effect, reduction)
+    for effect in library().values()
+    if issubclass(effect, JointTorqueEffect)
+    for reduction in effect.reductions
+]
+
+
+@pytest.mark.parametrize(
+    ("effect", "reduction"),
+    REDUCTIONS,
+    ids=lambda value: "-".join(value.at) if isinstance(value, Reduction) else value.__name__,
+)
+def test_a_law_turns_into_the_simpler_ones_that_it_declares(
+    effect: type[JointTorqueEffect], reduction: Reduction
+):
+    """At the declared values its torque is one that the simpler laws can have together."""
+    time = np.arange(2e-3, 4.0, 2e-3)[:, None]
+    position = np.sin(2.0 * time) + 0.3 * np.sin(7.0 * time)
+    velocity = 2.0 * np.cos(2.0 * time) + 2.1 * np.cos(7.0 * time)
+    motion = JointMotion(velocity, position, time=time, time_step=2e-3)
+
+    def columns(law: type[JointTorqueEffect], nonlinear: np.ndarray) -> np.ndarray:
+        return basis_over_time(law, motion, nonlinear[:, None])[..., 0].T
+
+    values = {}
+    for k, (name, parameter) in enumerate(effect.parameters.items()):
+        usual = getattr(effect(), name).get("all", 0.7 + 0.3 * k)
+        values[name] = reduction.at.get(name, usual)
+        if name in reduction.at and not parameter.linear:
+            values[name] = max(reduction.at[name], 1e-9)
+    linear, nonlinear = (
+        np.array([v for name, v in values.items() if effect.parameters[name].linear is kind])
+        for kind in (True, False)
+    )
+    torque = columns(effect, nonlinear) @ linear
+    searched = [sum(not p.linear for p in law.parameters.values()) for law in reduction.effects]
+
+    def left(logarithms: np.ndarray) -> float:
+        parts = np.split(np.exp(logarithms), np.cumsum(searched)[:-1])
+        X = np.concatenate(
+            [columns(law, part) for law, part in zip(reduction.effects, parts, strict=True)], axis=1
+        )
+        return float(np.linalg.norm(torque - X @ np.linalg.lstsq(X, torque)[0]))
+
+    starts = (np.full(sum(searched), np.log(start)) for start in (0.01, 1e-6))
+    best = min(
+        minimize(left, start, method="Nelder-Mead").fun if sum(searched) else left(start)
+        for start in starts
+    )
+    assert best < 1e-3 * np.linalg.norm(torque)
+
+
+def test_coulomb_and_viscous_friction_is_not_called_stribeck(swing: tuple[Scenario, Log]):
+    law = coulomb(1.5)
+    diagnosis = diagnosis_of(swing, {LEFT: lambda v: law(v) + 1.2 * v})
+    assert found(diagnosis) == {"CoulombFriction": (LEFT,), "ViscousFriction": (LEFT,)}
+    values = {f.effect: next(iter(f.parameters.values())) for f in diagnosis.chosen}
+    assert values["CoulombFriction"].value == pytest.approx(1.5, rel=0.03)
+    assert values["ViscousFriction"].value == pytest.approx(1.2, rel=0.03)
+
+
+def test_a_law_with_a_hump_is_called_stribeck(swing: tuple[Scenario, Log]):
+    diagnosis = diagnosis_of(
+        swing,
+        {LEFT: lambda v: 1.5 * (np.tanh(100 * v) - np.tanh(10 * v)) + np.tanh(100 * v) + v},
+    )
+    assert found(diagnosis) == {"StribeckFriction": (LEFT,)}
+
+
+def test_knees_that_agree_are_one_finding_and_knees_that_differ_are_two(
+    swing: tuple[Scenario, Log],
+):
+    alike, unlike = (
+        diagnosis_of(swing, {LEFT: coulomb(1.0), RIGHT: coulomb(other)}, FRICTION[:2])
+        for other in (1.0, 1.6)
+    )
+    assert [(f.effect, f.targets) for f in alike.chosen] == [("CoulombFriction", (LEFT, RIGHT))]
+    assert sorted(f.targets for f in unlike.chosen) == [(LEFT,), (RIGHT,)]
+    values = {f.targets[0]: f.parameters["coulomb"] for f in unlike.chosen}
+    assert values[LEFT].interval[1] < values[RIGHT].interval[0]
+
+
+def test_slow_errors_of_the_model_are_no_findings(swing: tuple[Scenario, Log]):
+    """A friction that is found, beside a slow random walk of the torque that the library does not have."""
+    walk = np.cumsum(np.random.default_rng(1).standard_normal(len(swing[1].time)))
+    walk *= 0.5 / walk.std()
+    effects = (*FRICTION, "TorqueRipple", "JointSpring", "QuadraticDrag", "ThermalDrift")
+    diagnosis = diagnosis_of(swing, {LEFT: lambda v: 3.0 * np.tanh(v / 0.01) + walk}, effects)
+    assert set(found(diagnosis)) == {"CoulombFriction"}
+    assert diagnosis.verdict == "unknown_effect"
+    (coulomb_found,) = diagnosis.chosen
+    low, high = coulomb_found.parameters["coulomb"].interval
+    assert low < 3.0 < high
+
+
+def test_nothing_is_found_in_noise(swing: tuple[Scenario, Log]):
+    assert diagnosis_of(swing, {}).verdict == "nothing_missing"

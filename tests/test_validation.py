@@ -1,0 +1,175 @@
+"""Data that was set aside before anything was fitted: errors with intervals, and what heads a result."""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from fbse_drake import Log, Scenario, load_scenario
+from fbse_drake.cli import DONE, main
+from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.study import study, train_and_rest
+from fbse_drake.discrepancy.validation import batch_length, root_of_ratio, validated
+from fbse_drake.effects.actuation import TorqueBias
+from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.files import write_text
+from fbse_drake.report.discrepancy import diagnosis_outcome, study_outcome
+from fbse_drake.scenario import RecordingConfig, dump_scenario
+
+NOISE, KNEE = 0.05, "left_knee_pitch"
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[Scenario, Log]:
+    """Legs that swing in a gantry, as planned, with noise of the torques."""
+    scenario = load_scenario("leg_swing_gantry", overrides=["duration=12", "log.period=0.01"])
+    bare = dataclasses.replace(scenario.robot, effects={})
+    recording = RecordingConfig(rows="instantaneous", block=0.02, torque_noise={"all": NOISE})
+    scenario = dataclasses.replace(scenario, robot=bare, model=bare, recording=recording)
+    log = planned_log(scenario)
+    noise = NOISE * np.random.default_rng(5).standard_normal((len(log.time), len(log.joints)))
+    return scenario, with_torque(log, noise)
+
+
+def with_torque(log: Log, added: np.ndarray) -> Log:
+    name = "joint/torque_command"
+    return Log(log.channels | {name: log[name] + added}, log.meta)
+
+
+def rubbing(log: Log, size: float, size_at_the_end: float) -> Log:
+    """With Coulomb friction in one joint that has another size in the last fifth of the log."""
+    added = np.zeros_like(log["joint/velocity"])
+    place = log.joints.index(KNEE)
+    late = log.time > 0.8 * log.time[-1]
+    sizes = np.where(late, size_at_the_end, size)
+    added[:, place] = sizes * np.tanh(log["joint/velocity"][:, place] / 0.01)
+    return with_torque(log, added)
+
+
+def believing(scenario: Scenario, *effects: object) -> Scenario:
+    model = dataclasses.replace(
+        scenario.believed, effects={f"effect_{k}": effect for k, effect in enumerate(effects)}
+    )
+    return dataclasses.replace(scenario, model=model)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9])
+def test_intervals_hold_the_truth_as_often_as_they_say(memory: float):
+    """Squares of first-order autoregressions of known variances: the root of the ratio of these."""
+    random, held = np.random.default_rng(1), 0
+    for _ in range(300):
+        above, below = (
+            size * lfilter([1.0], [1.0, -memory], random.standard_normal(1500))
+            for size in (1.3, 1.0)
+        )
+        low, high = root_of_ratio(above**2, below**2, batch_length(1500, 0.01)).interval
+        held += low < 1.3 < high
+    assert 0.87 < held / 300 < 0.985
+
+
+def test_errors_are_those_of_norms_and_the_change_is_surer_than_either(
+    swing: tuple[Scenario, Log],
+):
+    scenario, log = swing
+    rubbed = rubbing(log, 1.0, 1.0)
+    given, right = (
+        Predictor(one, rubbed)
+        for one in (scenario, believing(scenario, CoulombFriction({KNEE: 1.0})))
+    )
+    result = validated(given, right)
+    assert result.course == "falls"
+    first, last = given.residual, right.residual
+    torque = first.signals.torque_command
+    for error, residual in (("relative_before", first), ("relative_after", last)):
+        expected = np.linalg.norm(residual.value) / np.linalg.norm(torque)
+        assert getattr(result, error).value == pytest.approx(expected)
+    ratio = np.sqrt(
+        (last.value**2 / first.variance).sum() / (first.value**2 / first.variance).sum()
+    )
+    assert result.change.value == pytest.approx(ratio)
+    assert result.change.value == pytest.approx(result.after.value / result.before.value)
+    # A bias that is tiny beside all else does not show beyond doubt, nor does a model beside itself.
+    same = validated(given, given)
+    assert same.course == "unclear"
+    assert same.change.interval == pytest.approx((1.0, 1.0))
+    wrong = validated(right, Predictor(believing(scenario, TorqueBias({KNEE: 0.4})), rubbed))
+    assert wrong.course == "rises"
+
+
+def test_a_log_too_short_to_be_parted_is_fitted_whole(swing: tuple[Scenario, Log]):
+    scenario, log = swing
+    train, rest = train_and_rest(scenario, log)
+    assert rest is not None
+    assert len(train.time) + len(rest.time) == len(log.time)
+    assert rest.time[0] == pytest.approx(0.8 * log.time[-1], abs=0.02)
+    short = log.part(slice(0, 150))
+    train, rest = train_and_rest(scenario, short)
+    assert rest is None
+    assert len(train.time) == len(short.time)
+
+
+FEW = [CoulombFriction, TorqueBias]
+
+
+@pytest.mark.parametrize(("at_the_end", "course"), [(2.0, "falls"), (-2.0, "rises")])
+def test_a_study_is_headed_by_what_was_set_aside(
+    swing: tuple[Scenario, Log], at_the_end: float, course: str
+):
+    """What held-out blocks of the fitted part say is not enough: friction whose sign changes later on."""
+    scenario, log = swing
+    train, rest = train_and_rest(scenario, rubbing(log, 2.0, at_the_end))
+    result = study(scenario, train, FEW, rollouts=False, tests={"rest of the log": rest})
+    assert [finding.effect for finding in result.found] == ["CoulombFriction"]
+    assert result.steps[-1].held_out_rmse < 0.3 * result.steps[0].held_out_rmse
+    validation = result.set_aside["rest of the log"]
+    assert validation.course == course
+    low, high = validation.change.interval
+    assert (high < 0.5) if course == "falls" else (low > 1.5)
+    outcome = study_outcome(result)
+    assert outcome.startswith("Not confirmed: on the rest of the log") == (course == "rises")
+    assert f"which was set aside, the error {course}: from " in outcome
+
+
+@pytest.mark.parametrize("command", ["diagnose", "study"])
+def test_terminal_json_and_report_are_headed_by_what_was_set_aside(
+    command: str,
+    swing: tuple[Scenario, Log],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The rest of the log gets worse, another log better."""
+    if command == "diagnose":
+        monkeypatch.setattr(
+            "fbse_drake.commands.write_diagnosis_report",
+            lambda path, diagnosis, *_: path.write_text(diagnosis_outcome(diagnosis)),
+        )
+    function = {"diagnose": diagnose, "study": functools.partial(study, rollouts=False)}[command]
+    monkeypatch.setattr(f"fbse_drake.commands.{command}", functools.partial(function, effects=FEW))
+    scenario, log = swing
+    write_text(tmp_path / "legs.yaml", dump_scenario(scenario, "legs"))
+    rubbing(log, 2.0, -2.0).save(tmp_path / "log.npz")
+    rubbing(log, 2.0, 2.0).save(tmp_path / "other.npz")
+    out = tmp_path / "out"
+    paths = [str(tmp_path / name) for name in ("legs.yaml", "log.npz", "other.npz")]
+    assert main([command, *paths[:2], "--test", paths[2], "--out", str(out)]) == DONE
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Not confirmed: on the rest of the log, which was set aside, the error rises" in printed
+    assert "On other, which was set aside, the error falls" in printed
+    kind = {"diagnose": "diagnosis", "study": "study"}[command]
+    content = json.loads((out / f"{kind}.json").read_text())
+    courses = {name: one["course"] for name, one in content["set_aside"].items()}
+    assert courses == {"rest of the log": "rises", "other": "falls"}
+    rest = content["set_aside"]["rest of the log"]
+    low, high = rest["change"]["interval"]
+    assert 1.0 < low < rest["change"]["value"] < high
+    assert rest["level"] == 0.95
+    report = (out / "report.html").read_text()
+    assert "Not confirmed: on the rest of the log" in report
+    assert "On data set aside" in report or command == "diagnose"
