@@ -210,7 +210,7 @@ def diagnose(
         statuses,
         tuple(unexplained),
         tuple(path),
-        *(_rms(white, sse) for sse in (before, final.held_out_sse, final.sse)),
+        *(root_mean_square(white, sse) for sse in (before, final.held_out_sse, final.sse)),
         inertia,
         averaging,
         partial,
@@ -223,7 +223,10 @@ def _sized(finding: Finding, tolerance: float) -> Finding:
     return replace(finding, chosen=finding.chosen and not small, too_small=small)
 
 
-def _rms(white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)) -> float:
+def root_mean_square(
+    white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)
+) -> float:
+    """Of a whitened residual with these sums of squares, (R,), in some rows together."""
     return float(np.sqrt(sse[rows].sum() / max(1, white.count[rows].sum())))
 
 
@@ -287,8 +290,8 @@ def finding_of(
     return Finding(
         member.name,
         member.targets,
-        _rms(white, before.held_out_sse, rows),
-        _rms(white, after.held_out_sse, rows),
+        root_mean_square(white, before.held_out_sse, rows),
+        root_mean_square(white, after.held_out_sse, rows),
         parameters,
         equal,
         chosen,
@@ -321,7 +324,7 @@ def inertia_findings(
             )
             for name, value, width in zip(PARAMETERS, values, widths, strict=True)
         }
-        errors = (_rms(white, sse) for sse in (before, alone.held_out_sse))
+        errors = (root_mean_square(white, sse) for sse in (before, alone.held_out_sse))
         findings.append(
             Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True)
         )

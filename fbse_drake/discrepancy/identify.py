@@ -7,14 +7,19 @@ from typing import Any
 import numpy as np
 
 from fbse_drake.discrepancy.add import add
-from fbse_drake.discrepancy.diagnose import Finding, finding_of, inertia_findings
+from fbse_drake.discrepancy.diagnose import (
+    Finding,
+    finding_of,
+    inertia_findings,
+    root_mean_square,
+)
 from fbse_drake.discrepancy.dictionary import Dictionary
 from fbse_drake.discrepancy.fits import Fits
 from fbse_drake.discrepancy.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import consistent, remeasured
-from fbse_drake.discrepancy.study import ModelError, model_error
+from fbse_drake.discrepancy.validation import ModelError, model_error
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
@@ -32,6 +37,10 @@ class Identification:
     # By log, `train` being the one that was fitted: errors of the model as given, and of the identified one.
     before: dict[str, ModelError]
     after: dict[str, ModelError]
+    # Root mean square of the residual in multiples of the sensors' noise: on held-out blocks, and on
+    # those that were fitted.
+    held_out_rmse: float
+    train_rmse: float
     # With all that in its model.
     scenario: Scenario
 
@@ -73,7 +82,8 @@ def identify(
         {name: model_error(Predictor(one, other)) for name, other in logs.items()}
         for one in (scenario, completed)
     ]
-    return Identification(inertia, tuple(findings), *errors, completed)
+    rmse = (root_mean_square(fits.white, sse) for sse in (fitted.held_out_sse, fitted.sse))
+    return Identification(inertia, tuple(findings), *errors, *rmse, completed)
 
 
 def identifiability_text(inertia: IdentifiedInertia) -> str:

@@ -25,6 +25,9 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Level of the region of confidence that must not contain "no effect".
 _CONFIDENCE = 0.95
+# Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what is
+# required speaks for itself.
+_PLAIN = 3.0
 # Shares of the upper end of a plausible range: a value there, with no smaller one in its interval.
 _AT_THE_END, _NEAR_THE_END = 0.98, 0.9
 # A finding takes off a row at least this share of what then is left there beyond the noise: what
@@ -117,11 +120,12 @@ class _Judge:
         if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
             # Every joint has it: what identification begins with needs no proof against chance.
             return is_significant(fits, rest, again, member)
+        gain, required = self.gain(rest, whole), fits.required(member)
         return (
-            self.gain(rest, whole) >= fits.required(member)
+            gain >= required
             and self.gain_by_row(rest, whole)[rows].min() > -MARGIN
             and self._stands_out(rest, whole, rows)
-            and is_more_than_nothing(whole, member)
+            and (gain >= _PLAIN * required or is_more_than_nothing(whole, member))
             and not _is_beyond_its_range(whole, member)
             and is_significant(fits, rest, again, member)
         )

@@ -10,10 +10,17 @@ import numpy as np
 from fbse_drake.discrepancy.add import add
 from fbse_drake.discrepancy.compare import words
 from fbse_drake.discrepancy.diagnose import Diagnosis, Finding, diagnose, diagnosis_json
+from fbse_drake.discrepancy.identify import identify
 from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import rms
+from fbse_drake.discrepancy.regression import WhitenedResidual
 from fbse_drake.discrepancy.rollout import RolloutError, rollout
-from fbse_drake.discrepancy.validation import Validation, validated, validation_json
+from fbse_drake.discrepancy.validation import (
+    ModelError,
+    Validation,
+    model_error,
+    validated,
+    validation_json,
+)
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, silent
@@ -28,34 +35,6 @@ _LEAST_GAIN_IN_NOISE = 0.1
 _SHORTEST_REST = 40
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
-
-
-@dataclass(frozen=True)
-class ModelError:
-    """What a model leaves over on one log, averaged over blocks (`recording.block`)."""
-
-    # |residual| / |torque|, 2-norms over all joints, and of each joint; NaN without torques.
-    relative: float
-    relative_by_joint: dict[str, float]
-    # Root mean square of every row, in its unit.
-    rms: dict[str, float]
-
-
-def model_error(predictor: Predictor) -> ModelError:
-    """What the model of a predictor leaves over on its log."""
-    residual, n = predictor.residual, len(predictor.robot.joint_names)
-    known = residual.known[:, :n]
-    left, torque = (
-        rms(values[:, :n], known) * np.sqrt(known.sum(axis=0))
-        for values in (residual.value, residual.signals.torque_command)
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_joint = dict(zip(predictor.robot.joint_names, (left / torque).tolist(), strict=True))
-        relative = float(np.sqrt(np.nansum(left**2)) / np.sqrt(np.nansum(torque**2)))
-    of_rows = rms(residual.value, residual.known).tolist()
-    return ModelError(
-        relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True))
-    )
 
 
 def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
@@ -183,9 +162,20 @@ def study(
         )
         if not diagnosis.chosen or not worthwhile:
             break
-        scenario = add(scenario, diagnosis.chosen)
-        predictor = Predictor(scenario, log)
-        step(diagnosis.chosen, diagnosis.held_out_after, diagnosis.train_after)
+        found, completed = diagnosis.chosen, add(scenario, diagnosis.chosen)
+        errors = diagnosis.held_out_after, diagnosis.train_after
+        believed = Predictor(completed, log)
+        if len(diagnoses) == 1 and scenario.identify.inertia and interrupted is None:
+            plain = identify(scenario, log, progress=progress)
+            rival = Predictor(plain.scenario, log)
+            if is_better(rival, believed):
+                found, completed, believed = list(plain.findings), plain.scenario, rival
+                errors = plain.held_out_rmse, plain.train_rmse
+        # What a search promises, with laws made linear, a model need not keep.
+        if len(diagnoses) > 1 and not is_better(believed, predictor):
+            break
+        scenario, predictor = completed, believed
+        step(found, *errors)
     because = _reason(diagnoses) if interrupted is None else interrupted
     set_aside = {}
     if len(steps) > 1:
@@ -193,6 +183,17 @@ def study(
     return Study(
         tuple(steps), tuple(diagnoses), because, scenario, interrupted is not None, set_aside
     )
+
+
+def is_better(model: Predictor, other: Predictor) -> bool:
+    """Does a model leave less of a log than another, every row measured by how much it has improved?
+
+    By the likelihood of both with the noise of the other, so that a row with a large error does not
+    decide alone.
+    """
+    white = WhitenedResidual(other.residual)
+    left = [white.whiten(row, values) for row, values in enumerate(model.residual.value.T)]
+    return white.deviance((np.array(left) ** 2).sum(axis=1)) < white.deviance(white.sse)
 
 
 def _reason(diagnoses: list[Diagnosis]) -> str:

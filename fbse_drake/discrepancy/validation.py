@@ -1,4 +1,4 @@
-"""Is a completed model better on data that was set aside before anything was looked at?
+"""Errors of models: is a completed one better on data that was set aside before anything was looked at?
 
 Both models are put against the same blocks, weighted by the same noise, so that what both do not
 know cancels in the change of the error. Its intervals are those of a ratio of sums by batch means:
@@ -14,6 +14,7 @@ from scipy.stats import t as student
 
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.regression import STRETCH
+from fbse_drake.discrepancy.residual import rms
 
 # Of the intervals.
 LEVEL = 0.95
@@ -51,6 +52,34 @@ class Validation:
         if any(c.interval[0] > 1.0 for c in changes):
             return "rises"
         return "falls" if self.change.interval[1] < 1.0 else "unclear"
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """What a model leaves over on one log, averaged over blocks (`recording.block`)."""
+
+    # |residual| / |torque|, 2-norms over all joints, and of each joint; NaN without torques.
+    relative: float
+    relative_by_joint: dict[str, float]
+    # Root mean square of every row, in its unit.
+    rms: dict[str, float]
+
+
+def model_error(predictor: Predictor) -> ModelError:
+    """What the model of a predictor leaves over on its log."""
+    residual, n = predictor.residual, len(predictor.robot.joint_names)
+    known = residual.known[:, :n]
+    left, torque = (
+        rms(values[:, :n], known) * np.sqrt(known.sum(axis=0))
+        for values in (residual.value, residual.signals.torque_command)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_joint = dict(zip(predictor.robot.joint_names, (left / torque).tolist(), strict=True))
+        relative = float(np.sqrt(np.nansum(left**2)) / np.sqrt(np.nansum(torque**2)))
+    of_rows = rms(residual.value, residual.known).tolist()
+    return ModelError(
+        relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True))
+    )
 
 
 def validated(given: Predictor, completed: Predictor) -> Validation:
