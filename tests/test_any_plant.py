@@ -294,9 +294,8 @@ def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(
     assert error.relative_by_joint["slide"] == pytest.approx(
         np.linalg.norm(residual.value[:, 1]) / np.linalg.norm(torque[:, 1])
     )
-    assert (
-        train_and_rest(dataclasses.replace(scenario, recording=RecordingConfig()), log)[1] is None
-    )
+    whole = dataclasses.replace(scenario, recording=RecordingConfig(train_share=1.0))
+    assert train_and_rest(whole, log)[1] is None
 
 
 def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: Path):

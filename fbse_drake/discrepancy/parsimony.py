@@ -28,8 +28,8 @@ _CONFIDENCE = 0.95
 # Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what is
 # required speaks for itself.
 _PLAIN = 3.0
-# Shares of the upper end of a plausible range: a value there, with no smaller one in its interval.
-_AT_THE_END, _NEAR_THE_END = 0.98, 0.9
+# Share of the upper end of a range from which on a value counts as at its end.
+_AT_THE_END = 0.98
 # A finding takes off a row at least this share of what then is left there beyond the noise: what
 # explains a large rest would also change what is small beside it.
 _LEAST_OF_REST = 0.1
@@ -120,13 +120,14 @@ class _Judge:
         if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
             # Every joint has it: what identification begins with needs no proof against chance.
             return is_significant(fits, rest, again, member)
-        gain, required = self.gain(rest, whole), fits.required(member)
+        gain = self.gain(rest, whole)
+        required = fits.threshold[min(12, member.signature.values.shape[2])]
         return (
             gain >= required
             and self.gain_by_row(rest, whole)[rows].min() > -MARGIN
             and self._stands_out(rest, whole, rows)
             and (gain >= _PLAIN * required or is_more_than_nothing(whole, member))
-            and not _is_beyond_its_range(whole, member)
+            and not _is_beyond_its_range(member)
             and is_significant(fits, rest, again, member)
         )
 
@@ -179,18 +180,13 @@ def is_more_than_nothing(explanation: Explanation, member: Candidate) -> bool:
     return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
 
 
-def _is_beyond_its_range(explanation: Explanation, member: Candidate) -> bool:
-    """Is a parameter that says what the effect is, not how large, pinned to the end of its plausible range?
-
-    Then the best value lies beyond it: something else is there.
-    """
-    if not issubclass(member.effect, JointTorqueEffect):
-        return False
-    values, intervals = explanation.values(member)
+def _is_beyond_its_range(member: Candidate) -> bool:
+    """Is a parameter at the upper end of a range that it cannot leave? Then something else is there."""
+    values = dict(zip(member.nonlinear_names, member.nonlinear, strict=True))
     return any(
-        values[name] > _AT_THE_END * high and intervals[name][0] > _NEAR_THE_END * high
-        for name, high in ((n, member.parameters[n].plausible[1]) for n in member.nonlinear_names)
-        if member.parameters[name].neutral is None
+        parameter.closed and values[name] > _AT_THE_END * parameter.plausible[1]
+        for name, parameter in member.parameters.items()
+        if name in values
     )
 
 

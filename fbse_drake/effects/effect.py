@@ -59,6 +59,8 @@ class Parameter:
     # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that a log which does not show it does not
     # make it large; by default nothing is believed.
     belief: float = np.inf
+    # For a nonlinear one: is what would lie beyond its plausible range something else?
+    closed: bool = False
 
     @property
     def lever_factor(self) -> float:

@@ -33,7 +33,9 @@ class TorqueRipple(JointTorqueEffect):
         "sine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
         "cosine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
         # Over 1 rad of motion, a factor of 1.02 near the upper end is a quarter of a wave off.
-        "cycles": Parameter("1/revolution", linear=False, plausible=(6.0, 400.0), grid=200),
+        "cycles": Parameter(
+            "1/revolution", linear=False, plausible=(6.0, 400.0), grid=200, closed=True
+        ),
     }
 
     sine: dict[str, float] = field(default_factory=dict)
