@@ -66,12 +66,14 @@ def test_plain_friction_and_inertia(identified: Identification) -> None:
 
 def test_what_the_diagnosis_names_holds_on_the_rest(recording: tuple[Scenario, Log, Log]) -> None:
     scenario, train, rest = recording
-    diagnosis = diagnose(Predictor(scenario, train), [library()[name] for name in EFFECTS])
-    assert {"CoulombViscousFriction", "LoadDependentFriction"} <= {
-        f.effect for f in diagnosis.chosen
-    }
+    predictor = Predictor(scenario, train)
+    diagnosis = diagnose(predictor, [library()[name] for name in EFFECTS])
+    # Friction that grows with the load would explain a little more, but its interval holds zero.
+    friction = [f for f in diagnosis.chosen if f.effect == "CoulombViscousFriction"]
+    assert {joint for f in friction for joint in f.targets} == set(predictor.robot.joint_names)
+    assert {f.effect for f in diagnosis.chosen} <= {*EFFECTS[::2], "InertialParameters"}
     completed = add(scenario, diagnosis.chosen)
     fitted, tested = (model_error(Predictor(completed, log)) for log in (train, rest))
     assert fitted.relative < 0.038
     assert tested.relative_by_joint[FIRST] < 0.054
-    assert tested.relative < 0.045
+    assert tested.relative < 0.05

@@ -11,8 +11,9 @@ from scipy.signal import lfilter
 
 from fbse_drake import Log, Scenario, load_scenario
 from fbse_drake.cli import DONE, main
-from fbse_drake.discrepancy.diagnose import diagnose
+from fbse_drake.discrepancy.diagnose import Estimate, Finding, diagnose
 from fbse_drake.discrepancy.experiment import planned_log
+from fbse_drake.discrepancy.identify import identify
 from fbse_drake.discrepancy.prediction import Predictor
 from fbse_drake.discrepancy.study import study, train_and_rest
 from fbse_drake.discrepancy.validation import batch_length, root_of_ratio, validated
@@ -20,7 +21,7 @@ from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.files import write_text
 from fbse_drake.report.discrepancy import diagnosis_outcome, study_outcome
-from fbse_drake.scenario import RecordingConfig, dump_scenario
+from fbse_drake.scenario import IdentifyConfig, RecordingConfig, dump_scenario
 
 NOISE, KNEE = 0.05, "left_knee_pitch"
 
@@ -173,3 +174,33 @@ def test_terminal_json_and_report_are_headed_by_what_was_set_aside(
     report = (out / "report.html").read_text()
     assert "Not confirmed: on the rest of the log" in report
     assert "On data set aside" in report or command == "diagnose"
+
+
+def test_a_study_keeps_plain_identification_where_that_leaves_less(
+    swing: tuple[Scenario, Log], monkeypatch: pytest.MonkeyPatch
+):
+    """A search that finds the wrong thing: inertia and plain friction are taken in its place."""
+    scenario, log = swing
+    scenario = dataclasses.replace(scenario, identify=IdentifyConfig(inertia=["left_shank"]))
+    log = rubbing(log, 2.0, 2.0)
+    plain = identify(scenario, log)
+    wrong = dataclasses.replace(
+        diagnose(Predictor(scenario, log), FEW),
+        ranking=(
+            Finding(
+                "TorqueBias", (KNEE,), 9.0, 1.0, {"bias": Estimate(1.5, (1.4, 1.6), "Nm")}, (), True
+            ),
+        ),
+        held_out_after=0.5,
+    )
+    monkeypatch.setattr("fbse_drake.discrepancy.study.diagnose", lambda *_, **__: wrong)
+    result = study(scenario, log, FEW, rollouts=False)
+    first, last = (result.steps[k].errors["train"].relative_by_joint[KNEE] for k in (0, -1))
+    assert last < 0.2 * first
+    assert last == pytest.approx(plain.after["train"].relative_by_joint[KNEE], rel=1e-6)
+    assert {f.effect for f in result.steps[1].added} >= {
+        "InertialParameters",
+        "CoulombViscousFriction",
+    }
+    # What such a search proposes next makes it worse, and is left.
+    assert len(result.steps) == 2
