@@ -20,6 +20,7 @@ from fbse_drake.discrepancy.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import polished
 from fbse_drake.discrepancy.selection import is_significant
+from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -120,13 +121,15 @@ class _Judge:
         if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
             # Every joint has it: what identification begins with needs no proof against chance.
             return is_significant(fits, rest, again, member)
-        gain = self.gain(rest, whole)
+        gain, repeated = self.gain(rest, whole), _is_repeated(rest, member)
         required = fits.threshold[min(12, member.signature.values.shape[2])]
         return (
             gain >= required
             and self.gain_by_row(rest, whole)[rows].min() > -MARGIN
             and self._stands_out(rest, whole, rows)
-            and (gain >= _PLAIN * required or is_more_than_nothing(whole, member))
+            and (
+                (gain >= _PLAIN * required and not repeated) or is_more_than_nothing(whole, member)
+            )
             and not _is_beyond_its_range(member)
             and is_significant(fits, rest, again, member)
         )
@@ -178,6 +181,21 @@ def is_more_than_nothing(explanation: Explanation, member: Candidate) -> bool:
     scaled = values / deviation
     square = scaled @ np.linalg.pinv(covariance, hermitian=True) @ scaled
     return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
+
+
+def _is_repeated(rest: Explanation, member: Candidate) -> bool:
+    """Is there a law for the same joint that contains a member's, or that it contains?"""
+
+    def contains(effect: type[Effect], other: type[Effect]) -> bool:
+        return issubclass(effect, JointTorqueEffect) and any(
+            other in reduction.effects for reduction in effect.reductions
+        )
+
+    return any(
+        set(c.targets) & set(member.targets)
+        and (contains(c.effect, member.effect) or contains(member.effect, c.effect))
+        for c in rest.candidates
+    )
 
 
 def _is_beyond_its_range(member: Candidate) -> bool:
