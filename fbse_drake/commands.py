@@ -142,7 +142,9 @@ def _diagnose(options: argparse.Namespace) -> bool:
     with _errors_located(options), _told(console, options.time_limit) as progress:
         predictor = _checked(scenario, train)
         inputs = replace(
-            inputs, hygiene=inspect(predictor.motion, predictor.noise), tests=tuple(map(str, options.test))
+            inputs,
+            hygiene=inspect(predictor.motion, predictor.noise),
+            tests=tuple(map(str, options.test)),
         )
         comparison = compare(predictor)
         trusted = inputs.hygiene.trusted(scenario, predictor.robot)
