@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.fits import MARGIN, Fits
 from fbse_drake.discrepancy.proposals import Proposals
 from fbse_drake.discrepancy.refinement import polished
 from fbse_drake.discrepancy.selection import best_additions
+from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
 
@@ -65,9 +66,10 @@ def settled(
     for _ in range(_ROUNDS):
         better = [
             e
-            for of_member in found.values()
+            for k, of_member in found.items()
             for e in of_member
             if e.deviance < final.deviance - MARGIN
+            and not _contains(e.candidates[-1].effect, final.candidates[k].effect)
             and fits.dictionary.predictor.can_have(e.effects)
         ]
         if not better:
@@ -75,6 +77,11 @@ def settled(
         final = min(better, key=lambda e: e.deviance)
         found = rivals(proposals, final)
     return final, found
+
+
+def _contains(law: type[Effect], other: type[Effect]) -> bool:
+    """Is a law a larger one? Whether it pays was asked before."""
+    return issubclass(law, JointTorqueEffect) and any(other in r.effects for r in law.reductions)
 
 
 def fitted(fits: Fits, explanation: Explanation) -> Explanation:
