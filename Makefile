@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell cat fbse_drake/*/*.py | cksum | cut -d' ' -f1)
+export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
 .PHONY: walk test lint format bench fbse hidden clean
 

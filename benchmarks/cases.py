@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnose import diagnose
+import fbse_drake
 from fbse_drake.effects.effect import library
 
 NOTHING, UNKNOWN = "nothing", "unknown"
@@ -176,8 +176,10 @@ def sources_checksum(*more: Path, note: str = "") -> str:
         more: files beside those of diagnosis and effects.
         note: whatever else it depends on.
     """
-    folder = Path(diagnose.__code__.co_filename).parent
-    files = sorted([*folder.glob("*.py"), *(folder.parent / "effects").glob("*.py")])
+    package = Path(fbse_drake.__file__).parent
+    files = sorted(
+        file for room in ("discrepancy", "effects") for file in (package / room).rglob("*.py")
+    )
     contents = [file.read_bytes() for file in (*files, *more)]
     return hashlib.sha256(b"".join([*contents, note.encode()])).hexdigest()
 

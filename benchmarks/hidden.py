@@ -33,11 +33,18 @@ from benchmarks.console import print_table
 from benchmarks.store import Store
 from fbse_drake import load_scenario, schema
 from fbse_drake.campaign.steps import Material
-from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
-from fbse_drake.discrepancy.hidden import SIZES, Answer, HiddenEffect, make_exercise, record, score
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.strangers import STRANGERS
-from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import study, study_json
+from fbse_drake.discrepancy.exercises.hidden import (
+    SIZES,
+    Answer,
+    HiddenEffect,
+    make_exercise,
+    record,
+    score,
+)
+from fbse_drake.discrepancy.exercises.strangers import STRANGERS
 from fbse_drake.effects.effect import library
 from fbse_drake.report.html import (
     Details,
@@ -111,7 +118,7 @@ class Case:
 
     name: str
     group: Literal["effect", "decoy", "stranger", "pair", "mismatch", "threshold", "length"]
-    # As in `fbse_drake.discrepancy.hidden.draw`.
+    # As in `fbse_drake.discrepancy.exercises.hidden.draw`.
     what: str
     size: str = "medium"
     count: int = 1

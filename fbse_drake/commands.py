@@ -21,16 +21,20 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from fbse_drake.discrepancy.add import add, read_findings
-from fbse_drake.discrepancy.compare import compare, comparison_json
-from fbse_drake.discrepancy.diagnose import Finding, diagnose, diagnosis_json
-from fbse_drake.discrepancy.hidden import hide, reveal
-from fbse_drake.discrepancy.hygiene import Hygiene, hygiene_json, inspect
-from fbse_drake.discrepancy.identify import identifiability_text, identification_json, identify
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.sanity import check_sensors
-from fbse_drake.discrepancy.study import study, study_json, train_and_rest
-from fbse_drake.discrepancy.validation import validated
+from fbse_drake.discrepancy.diagnosis.add import add, read_findings
+from fbse_drake.discrepancy.diagnosis.compare import compare, comparison_json
+from fbse_drake.discrepancy.diagnosis.diagnose import Finding, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.identify import (
+    identifiability_text,
+    identification_json,
+    identify,
+)
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import study, study_json, train_and_rest
+from fbse_drake.discrepancy.diagnosis.validation import validated
+from fbse_drake.discrepancy.exercises.hidden import hide, reveal
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_atomically, write_text

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.multibody.tree import MultibodyForces
 
 from fbse_drake import Log, Scenario
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig

@@ -11,12 +11,12 @@ import yaml
 from fbse_drake import InputError, Log, Scenario, simulate
 from fbse_drake.control.compensation import FeedforwardCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.bandwidth import bandwidth
-from fbse_drake.discrepancy.compare import compare
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.servo import with_command
-from fbse_drake.discrepancy.study import model_error, train_and_rest
+from fbse_drake.discrepancy.diagnosis.bandwidth import bandwidth
+from fbse_drake.discrepancy.diagnosis.compare import compare
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import model_error, train_and_rest
+from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset

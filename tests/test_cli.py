@@ -14,8 +14,8 @@ import pytest
 
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.study import study
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.study import study
 from fbse_drake.effects.effect import library
 from fbse_drake.schema import load_tree
 from fbse_drake.simulate import fall_reason

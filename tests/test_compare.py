@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from fbse_drake import load_scenario
-from fbse_drake.discrepancy.compare import Comparison, compare, compare_residual, comparison_json
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import Instants, Residual, residual_rows
+from fbse_drake.discrepancy.diagnosis.compare import (
+    Comparison,
+    compare,
+    compare_residual,
+    comparison_json,
+)
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.residual.residual import Instants, Residual, residual_rows
 from fbse_drake.scenario import build_robot
 
 BLOCKS, PERIOD = 1500, 0.01

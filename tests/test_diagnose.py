@@ -10,20 +10,20 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from fbse_drake.discrepancy.add import add, read_findings
-from fbse_drake.discrepancy.detectability import smallest_detectable
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose, diagnosis_json
-from fbse_drake.discrepancy.dictionary import Dictionary
-from fbse_drake.discrepancy.experiment import planned_log
-from fbse_drake.discrepancy.explanation import Candidate
-from fbse_drake.discrepancy.fits import Fits
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.proposals import Proposals
-from fbse_drake.discrepancy.regression import Signature
-from fbse_drake.discrepancy.rivals import equals
-from fbse_drake.discrepancy.rollout import rollout
-from fbse_drake.discrepancy.selection import best_additions, is_significant
-from fbse_drake.discrepancy.study import study, study_json
+from fbse_drake.discrepancy.diagnosis.add import add, read_findings
+from fbse_drake.discrepancy.diagnosis.detectability import smallest_detectable
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.rivals import equals
+from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_significant
+from fbse_drake.discrepancy.diagnosis.study import study, study_json
+from fbse_drake.discrepancy.identification.regression import Signature
+from fbse_drake.discrepancy.residual.rollout import rollout
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect

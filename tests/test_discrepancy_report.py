@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from fbse_drake import Log, load_scenario
-from fbse_drake.discrepancy.compare import Comparison, compare
-from fbse_drake.discrepancy.diagnose import Diagnosis, EffectStatus, Estimate, Finding
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.rollout import RolloutError
-from fbse_drake.discrepancy.structure import Structure
-from fbse_drake.discrepancy.study import ModelError, Study, StudyStep
+from fbse_drake.discrepancy.diagnosis.compare import Comparison, compare
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import ModelError, Study, StudyStep
+from fbse_drake.discrepancy.identification.structure import Structure
+from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
 

@@ -9,11 +9,11 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.dictionary import Dictionary
-from fbse_drake.discrepancy.explanation import Explanation
-from fbse_drake.discrepancy.fits import Fits
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.explanation import Explanation
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect

@@ -8,8 +8,8 @@ import pytest
 from rig import BENT, robot_copy
 
 from fbse_drake import InputError, load_scenario, simulate
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.geometry import LinkLength
 from fbse_drake.robot.plant import Robot, make_robot

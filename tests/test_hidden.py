@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from fbse_drake import InputError, Log, Scenario, load_scenario
-from fbse_drake.discrepancy.hidden import (
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.exercises.hidden import (
     SIZES,
     Answer,
     HiddenEffect,
@@ -23,9 +24,8 @@ from fbse_drake.discrepancy.hidden import (
     seal,
     unseal,
 )
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.regression import WhitenedResidual
-from fbse_drake.discrepancy.strangers import STRANGERS
+from fbse_drake.discrepancy.exercises.strangers import STRANGERS
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.joint_torque import JointMotion
 from fbse_drake.robot.description import load_description

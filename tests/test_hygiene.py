@@ -9,11 +9,11 @@ from conftest import scenario
 from scipy.signal import butter, lfilter, sosfilt
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.channel_checks import estimated_noise
-from fbse_drake.discrepancy.evidence import HygieneFinding
-from fbse_drake.discrepancy.hygiene import Hygiene, hygiene_json, inspect
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.sanity import check_sensors
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.hygiene.channel_checks import estimated_noise
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.residual.evidence import HygieneFinding
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 

@@ -13,19 +13,19 @@ from pydrake.multibody.tree import MultibodyForces
 from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake import InputError, Log, Scenario, load_scenario
-from fbse_drake.discrepancy.add import add
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.identify import Identification, identification_json, identify
-from fbse_drake.discrepancy.inertial import (
+from fbse_drake.discrepancy.diagnosis.add import add
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.identify import Identification, identification_json, identify
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import model_error, study
+from fbse_drake.discrepancy.identification.inertial import (
     PARAMETERS,
     base_columns,
     body_wrench,
     consistent_parameters,
     inertial_regressor,
 )
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import EquationOfMotion, Instants
-from fbse_drake.discrepancy.study import model_error, study
+from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.inertia import (
     InertialParameters,

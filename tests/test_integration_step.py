@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from fbse_drake.discrepancy.integration import integration_step
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.regression import WhitenedResidual
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.effects.friction import ViscousFriction
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import mujoco_hidden
 from benchmarks.cases import Result
 from fbse_drake import Log, load_scenario
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.robot.plant import Ground, Robot, make_robot

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.evidence import HygieneFinding
-from fbse_drake.discrepancy.hygiene import inspect
-from fbse_drake.discrepancy.noise import noise_power
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.hygiene.hygiene import inspect
+from fbse_drake.discrepancy.residual.evidence import HygieneFinding
+from fbse_drake.discrepancy.residual.noise import noise_power
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.log import Log

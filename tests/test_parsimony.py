@@ -11,10 +11,10 @@ import pytest
 from scipy.optimize import minimize
 
 from fbse_drake import Log, Scenario, load_scenario
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.experiment import planned_log
-from fbse_drake.discrepancy.parsimony import blocks_per_sample
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.parsimony import blocks_per_sample
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.joint_torque import (
     JointMotion,

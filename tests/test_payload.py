@@ -12,12 +12,12 @@ from pydrake.multibody.tree import MultibodyForces
 from rig import robot_copy
 
 from fbse_drake import Log, Scenario, load_scenario, resources
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.experiment import planned_log
-from fbse_drake.discrepancy.identify import identify
-from fbse_drake.discrepancy.inertial import PARAMETERS, untrusted_inertia
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.regression import WhitenedResidual
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.identify import identify
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.inertial import PARAMETERS, untrusted_inertia
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.inertia import (
     BodyCentreOfMass,

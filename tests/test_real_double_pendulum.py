@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fbse_drake import Log, Scenario, load_scenario
-from fbse_drake.discrepancy.identify import Identification, identify
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.study import Study, study, train_and_rest
+from fbse_drake.discrepancy.diagnosis.identify import Identification, identify
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import Study, study, train_and_rest
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.inertia import pseudo_inertia
 from fbse_drake.interop.convert import read_log

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from fbse_drake import Log, Scenario, load_scenario
-from fbse_drake.discrepancy.identify import Identification, identify
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.rollout import rollout
-from fbse_drake.discrepancy.study import Study, model_error, study
+from fbse_drake.discrepancy.diagnosis.identify import Identification, identify
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import Study, model_error, study
+from fbse_drake.discrepancy.residual.rollout import rollout
 from fbse_drake.effects.effect import library
 from fbse_drake.interop.convert import read_log
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.evidence import Evidence
-from fbse_drake.discrepancy.hygiene import Hygiene, inspect
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import rms
-from fbse_drake.discrepancy.sanity import check_sensors
-from fbse_drake.discrepancy.study import model_error, study
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import model_error, study
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.residual.evidence import Evidence
+from fbse_drake.discrepancy.residual.residual import rms
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.sensor import FootForceGain, FootForceLag, FootForceMisalignment
 from fbse_drake.errors import InputError

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fbse_drake import Log, Scenario, load_scenario
-from fbse_drake.discrepancy.add import add
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.rollout import RolloutError, rollout
-from fbse_drake.discrepancy.study import model_error
+from fbse_drake.discrepancy.diagnosis.add import add
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import model_error
+from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
 from fbse_drake.effects.actuation import TorqueRollOff
 from fbse_drake.effects.friction import CoulombFriction, LoadDependentFriction, ViscousFriction
 from fbse_drake.effects.inertia import ReflectedInertia

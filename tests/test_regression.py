@@ -5,11 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fbse_drake.discrepancy import regression
-from fbse_drake.discrepancy.memory import Memory
-from fbse_drake.discrepancy.regression import FOLDS, Regression, Signature, WhitenedResidual
-from fbse_drake.discrepancy.remainder import Remainder
-from fbse_drake.discrepancy.residual import Residual, Row
+from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.identification import regression
+from fbse_drake.discrepancy.identification.regression import (
+    FOLDS,
+    Regression,
+    Signature,
+    WhitenedResidual,
+)
+from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.discrepancy.residual.residual import Residual, Row
 
 ROWS = 3
 

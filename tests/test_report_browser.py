@@ -15,10 +15,10 @@ from test_any_plant import CRANE, crane
 from test_discrepancy_report import FRICTION, INPUTS, NOTHING, made_diagnosis
 
 from fbse_drake import Log, load_scenario, simulate
-from fbse_drake.discrepancy.compare import compare
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.rollout import RolloutError
-from fbse_drake.discrepancy.study import Study, StudyStep, model_error, study
+from fbse_drake.discrepancy.diagnosis.compare import compare
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import Study, StudyStep, model_error, study
+from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.report import discrepancy as reports

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fbse_drake.discrepancy.hygiene import inspect
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.regression import Regression, Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual import RecordedMotion, Residual, Row, block_means, rms
-from fbse_drake.discrepancy.sanity import check_sensors
-from fbse_drake.discrepancy.structure import leftover_structure
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.hygiene.hygiene import inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.identification.regression import Regression, Signature, WhitenedResidual
+from fbse_drake.discrepancy.identification.structure import leftover_structure
+from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, Row, block_means, rms
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
@@ -186,7 +186,7 @@ def test_a_long_log_is_computed_piece_by_piece(
 ) -> None:
     motion = Predictor(*walk).motion
     whole = motion.equation.residual(motion.steps)
-    monkeypatch.setattr("fbse_drake.discrepancy.residual._MOST_INSTANTS", 700)
+    monkeypatch.setattr("fbse_drake.discrepancy.residual.residual._MOST_INSTANTS", 700)
     np.testing.assert_array_equal(motion.equation.residual(motion.steps), whole)
 
 

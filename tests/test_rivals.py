@@ -10,11 +10,11 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from recorded_arm import ARM, Course
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.dictionary import Dictionary
-from fbse_drake.discrepancy.fits import MARGIN, Fits
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.rivals import fitted
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.rivals import fitted
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.sensor import ImuMisalignment, TransmissionElasticity
 

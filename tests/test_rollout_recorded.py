@@ -11,7 +11,7 @@ import yaml
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
 from fbse_drake.control.compensation import FeedforwardCompensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.rollout import RolloutError, rollout
+from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
 from fbse_drake.effects.actuation import DcMotor
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction

@@ -15,9 +15,9 @@ from pydrake.systems.analysis import Simulator
 from rig import rms
 
 from fbse_drake import Log, build_station, estimate, resources, simulate
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import rms as row_rms
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.residual.residual import rms as row_rms
 from fbse_drake.effects.friction import LoadDependentFriction
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.estimator import NoEstimator

@@ -11,8 +11,8 @@ import yaml
 from rig import rms
 
 from fbse_drake import Scenario, load_scenario, simulate
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.errors import InputError
 from fbse_drake.report.metrics import joint_sides
 from fbse_drake.robot.plant import make_robot

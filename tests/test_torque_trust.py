@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from recorded_arm import ARM, PENDULUM, Course, Machine
 
-from fbse_drake.discrepancy.diagnose import diagnose
-from fbse_drake.discrepancy.evidence import HygieneFinding
-from fbse_drake.discrepancy.hygiene import Hygiene, inspect
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.sanity import check_sensors
-from fbse_drake.discrepancy.torque_readings import chance, gain
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.hygiene.torque_readings import chance, gain
+from fbse_drake.discrepancy.residual.evidence import HygieneFinding
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log

@@ -11,12 +11,12 @@ from scipy.signal import lfilter
 
 from fbse_drake import Log, Scenario, load_scenario
 from fbse_drake.cli import DONE, main
-from fbse_drake.discrepancy.diagnose import Estimate, Finding, diagnose
-from fbse_drake.discrepancy.experiment import planned_log
-from fbse_drake.discrepancy.identify import identify
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.study import study, train_and_rest
-from fbse_drake.discrepancy.validation import batch_length, root_of_ratio, validated
+from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding, diagnose
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.identify import identify
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import study, train_and_rest
+from fbse_drake.discrepancy.diagnosis.validation import batch_length, root_of_ratio, validated
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.files import write_text
@@ -193,7 +193,7 @@ def test_a_study_keeps_plain_identification_where_that_leaves_less(
         ),
         held_out_after=0.5,
     )
-    monkeypatch.setattr("fbse_drake.discrepancy.study.diagnose", lambda *_, **__: wrong)
+    monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.study.diagnose", lambda *_, **__: wrong)
     result = study(scenario, log, FEW, rollouts=False)
     first, last = (result.steps[k].errors["train"].relative_by_joint[KNEE] for k in (0, -1))
     assert last < 0.2 * first

@@ -42,9 +42,9 @@ from benchmarks.in_mujoco.robot import make_machine
 from fbse_drake import load_scenario
 from fbse_drake.campaign.steps import Material
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.diagnose import diagnose, diagnosis_json
-from fbse_drake.discrepancy.hidden import Answer, HiddenEffect, Score, score
-from fbse_drake.discrepancy.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.exercises.hidden import Answer, HiddenEffect, Score, score
 from fbse_drake.robot.plant import Ground, Robot
 from fbse_drake.scenario import (
     RecordingConfig,

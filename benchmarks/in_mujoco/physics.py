@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.hidden import HiddenEffect
+from fbse_drake.discrepancy.exercises.hidden import HiddenEffect
 from fbse_drake.robot.plant import Robot
 
 # Torques of the motors in a step of MuJoCo [Nm], from commands [Nm], joint positions [rad] and

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fbse_drake.campaign.columns import Column, run_columns, run_figures
-from fbse_drake.discrepancy.diagnose import diagnosis_json
-from fbse_drake.discrepancy.hidden import Answer, Size, make_exercise, score
-from fbse_drake.discrepancy.study import study
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnosis_json
+from fbse_drake.discrepancy.diagnosis.study import study
+from fbse_drake.discrepancy.exercises.hidden import Answer, Size, make_exercise, score
 from fbse_drake.errors import InputError
 from fbse_drake.estimate import estimate
 from fbse_drake.interop.convert import read_log

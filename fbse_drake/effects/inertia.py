@@ -261,10 +261,12 @@ _INERTIAL = {
 @in_library
 @dataclass(frozen=True)
 class InertialParameters(InertiaEffect):
-    """All ten inertial parameters of a body, as changes from what the model says, in the body's frame B: mass, first moment m p_BoBcm, and
-    rotational inertia about Bo (ixy is the element of the matrix).
+    """All ten inertial parameters of a body, as changes from what the model says, in its frame B.
 
-    A log shows them only in combinations; see `fbse_drake.discrepancy.inertial`, which finds values that some distribution of mass has.
+    They are mass, first moment m p_BoBcm, and rotational inertia about Bo (ixy is the element of
+    the matrix). A log shows them only in combinations; see
+    `fbse_drake.discrepancy.identification.inertial`, which finds values that some distribution of
+    mass has.
     """
 
     description: ClassVar[str] = (

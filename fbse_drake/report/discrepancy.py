@@ -9,14 +9,14 @@ from platform import python_version
 
 import numpy as np
 
-from fbse_drake.discrepancy.compare import Channel, Comparison, words
-from fbse_drake.discrepancy.diagnose import Diagnosis, EffectStatus, Estimate, Finding
-from fbse_drake.discrepancy.hygiene import Hygiene
-from fbse_drake.discrepancy.prediction import Predictor
-from fbse_drake.discrepancy.residual import joint_velocity_noise
-from fbse_drake.discrepancy.structure import Structure
-from fbse_drake.discrepancy.study import Study, StudyStep
-from fbse_drake.discrepancy.validation import Measured, Validation
+from fbse_drake.discrepancy.diagnosis.compare import Channel, Comparison, words
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import Study, StudyStep
+from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene
+from fbse_drake.discrepancy.identification.structure import Structure
+from fbse_drake.discrepancy.residual.residual import joint_velocity_noise
 from fbse_drake.effects.effect import library
 from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures

@@ -17,11 +17,11 @@ from matplotlib.ticker import LogLocator
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 
-from fbse_drake.discrepancy.compare import Bin, Channel, Comparison, words
-from fbse_drake.discrepancy.diagnose import EffectStatus, Estimate, Finding
-from fbse_drake.discrepancy.residual import Residual, Row
-from fbse_drake.discrepancy.rollout import RolloutError
-from fbse_drake.discrepancy.study import StudyStep
+from fbse_drake.discrepancy.diagnosis.compare import Bin, Channel, Comparison, words
+from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.study import StudyStep
+from fbse_drake.discrepancy.residual.residual import Residual, Row
+from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.effects.effect import library
 from fbse_drake.report.figures import (
     ESTIMATE,

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from fbse_drake.discrepancy.identify import Identification, identifiability_text
-from fbse_drake.discrepancy.inertial import PARAMETERS, BaseParameter
+from fbse_drake.discrepancy.diagnosis.identify import Identification, identifiability_text
+from fbse_drake.discrepancy.identification.inertial import PARAMETERS, BaseParameter
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.report.discrepancy import parameters_text
 from fbse_drake.report.discrepancy_figures import spaced, targets_text

@@ -1,0 +1,114 @@
+"""Adds what a diagnosis found to a scenario's model."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding
+from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.inertia import InertialParameters
+from fbse_drake.errors import InputError
+from fbse_drake.scenario import Scenario
+
+
+def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> list[Finding]:
+    """What there is to add according to a diagnosis.json.
+
+    Args:
+        diagnosis: its contents.
+        effect: which effect of the ranking, on the targets where it explains most; by default all that the diagnosis chose.
+
+    Raises:
+        InputError: the ranking has no such effect, or there is nothing to add.
+    """
+    try:
+        ranking = [
+            Finding(
+                entry["effect"],
+                tuple(entry["joints"]),
+                entry["held_out_before"],
+                entry["held_out_after"],
+                {
+                    name: Estimate(float(p["value"]), tuple(p["interval"]), p["unit"])
+                    for name, p in entry["parameters"].items()
+                },
+                tuple(entry["confusable_with"]),
+                entry["chosen"],
+            )
+            for entry in diagnosis["ranking"]
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"not the contents of a diagnosis.json (at {error})") from None
+    named = [finding for finding in ranking if effect in (None, finding.effect)]
+    findings = [finding for finding in named if finding.chosen] or (named[:1] if effect else [])
+    if not findings:
+        names = ", ".join(dict.fromkeys(finding.effect for finding in ranking)) or "none"
+        wanted = f"no effect {effect}" if effect else "no effect to add"
+        raise InputError(f"the diagnosis has {wanted} (effects in its ranking: {names})")
+    return findings
+
+
+def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
+    """The scenario with further effects in its model.
+
+    Raises:
+        InputError: an effect that the library does not have.
+    """
+    by_effect: dict[str, dict[str, dict[str, float]]] = {}
+    # Inertia was fitted beside just these values.
+    as_fitted = any(finding.effect == InertialParameters.__name__ for finding in findings)
+    for finding in findings:
+        values = by_effect.setdefault(finding.effect, {})
+        for name, estimate in finding.parameters.items():
+            value = estimate.value if as_fitted else _settled(finding.effect, name, estimate)
+            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, value))
+    model = scenario.believed
+    effects = dict(model.effects)
+    for name, values in by_effect.items():
+        effect = _make(name, values)
+        if isinstance(effect, InertialParameters):
+            earlier = {
+                key: other
+                for key, other in effects.items()
+                if isinstance(other, InertialParameters)
+            }
+            effect = sum(earlier.values(), effect)
+            effects = {key: other for key, other in effects.items() if key not in earlier}
+        effects[_free_key(name, effects)] = effect
+    return replace(scenario, model=replace(model, effects=effects))
+
+
+def _settled(effect: str, name: str, estimate: Estimate) -> float:
+    """The value that a parameter gets. A velocity of transition of which the data do not say that the default is wrong keeps it: friction
+    must hold a joint at rest also where nobody saw how steep it is.
+    """
+    kind = library().get(effect)
+    if kind is None or name != "transition":
+        return estimate.value
+    default = kind().transition["all"]
+    low, high = estimate.interval
+    return default if low <= default <= high else estimate.value
+
+
+def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:
+    kind = library().get(name)
+    if kind is None:
+        raise InputError(f"the library has no effect {name} (there are: {', '.join(library())})")
+    targets = list(next(iter(values.values())))
+    return kind.from_values(
+        targets,
+        {
+            parameter: [numbers[target] for target in targets]
+            for parameter, numbers in values.items()
+        },
+    )
+
+
+def _free_key(name: str, taken: Mapping[str, Effect]) -> str:
+    """A key for an effect, as `torque_gain`, that is not taken."""
+    key = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+    number = 2
+    while key in taken:
+        key, number = f"{key.rstrip('0123456789_')}_{number}", number + 1
+    return key

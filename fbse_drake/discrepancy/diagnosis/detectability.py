@@ -1,0 +1,138 @@
+"""What a log would have shown: the smallest size of an effect that is found, and how well two effects are told apart."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Explanation
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.proposals import grid_gain
+from fbse_drake.discrepancy.identification.regression import columns_of
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+# A size that is this many times the largest plausible one is none.
+_HOPELESS = 1e3
+
+
+def smallest_detectable(fits: Fits, base: Explanation, effect: type[Effect]) -> dict[str, float]:
+    """Size of an effect's first parameter that would have been found beside an explanation, by target; infinite where none would.
+
+    The size at which the effect's sum of squares reaches what its parameters must bring and cost.
+    """
+    sizes = _sizes_that_reach(fits, base, effect)
+    return {
+        target: size
+        if size < _HOPELESS * fits.dictionary.largest_plausible(effect, target)
+        else np.inf
+        for target, size in sizes.items()
+    }
+
+
+def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> dict[str, float]:
+    beside = fits.remainder(base)
+    result = {}
+    if not issubclass(effect, JointTorqueEffect):
+        for candidate in (c for c in fits.fixed_candidates if c.effect is effect):
+            s = candidate.signature
+            power = sum(
+                beside.moments(s, k)[0][0, 0] / beside.scale[row] for k, row in enumerate(s.rows)
+            )
+            result[candidate.targets[0]] = float(
+                np.sqrt(
+                    (fits.needed(s.values.shape[2]) + fits.systematic(s.rows) + candidate.spurious)
+                    / max(power, 1e-30)
+                )
+            )
+        return result
+    grid = fits.grid(effect)
+    has_linear = any(parameter.linear for parameter in effect.parameters.values())
+    for row, joint in enumerate(fits.dictionary.joints):
+        here = grid.points[..., row]
+        usual = (
+            int(
+                np.abs(np.log(here / fits.dictionary.usual_at(effect, joint)[:, None]))
+                .sum(axis=0)
+                .argmin()
+            )
+            if len(here)
+            else 0
+        )
+        needed = fits.needed(len(effect.parameters)) + fits.systematic(np.array([row]))
+        sets = grid.sets[row]
+        gram, _ = beside.moments_of_sets(sets.signature, 0, sets.gram)
+        power = gram[:, 0, 0] / beside.scale[row]
+        if not np.all(
+            effect.shows_within(
+                fits.dictionary.travel[row], fits.dictionary.usual_at(effect, joint)
+            )
+        ):
+            result[joint] = np.inf
+        elif has_linear:
+            result[joint] = float(np.sqrt(needed / max(power[usual], 1e-30)))
+        else:
+            # Sizes in the order of the grid, from weak to strong.
+            strong = power > needed
+            order = np.argsort(power)
+            enough = np.flatnonzero(strong[order])
+            result[joint] = (
+                _crossing(here[0][order], power[order], needed) if len(enough) else np.inf
+            )
+    return result
+
+
+def separation(
+    fits: Fits,
+    effect: type[Effect],
+    targets: Sequence[str],
+    values: Mapping[str, float],
+    rival: type[Effect],
+) -> float:
+    """How much of what an effect would do here a rival could not mimic: a sum of squares in units of noise.
+
+    Args:
+        values: of the effect's parameters.
+    """
+    signal = np.zeros_like(fits.white.y)
+    names = effect.parameters
+    nonlinear = np.array(
+        [values[name] for name, parameter in names.items() if not parameter.linear]
+    )
+    amounts = np.array(
+        [values[name] for name, parameter in names.items() if parameter.linear] or [1.0]
+    )
+    for target in targets:
+        raw = fits.dictionary.predictor.signature(effect, target, nonlinear)
+        whitened = fits.white.whiten_signature(raw)
+        signal[:, whitened.rows] += whitened.values @ amounts
+    total = float((signal**2).sum())
+    if issubclass(rival, JointTorqueEffect):
+        grid = fits.grid(rival)
+        for row, joint in enumerate(fits.dictionary.joints):
+            if joint in targets and signal[:, row].any():
+                sets = grid.sets[row]
+                right = columns_of(sets.signature)[0].T @ signal[:, row]
+                gain = grid_gain(rival, sets.gram, right.reshape(sets.gram.shape[:2]))
+                total -= float(gain.max())
+        return total
+    gains = []
+    for s in (c.signature for c in fits.fixed_candidates if c.effect is rival):
+        right = np.einsum("brp,br->p", s.values, signal[:, s.rows])
+        gram = fits.regression.products(s, s)[2].sum(axis=0)
+        gains.append(float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0]))
+    return total - max(gains, default=0.0)
+
+
+def _crossing(sizes: np.ndarray, power: np.ndarray, needed: float) -> float:
+    """Size at which increasing power reaches what is needed, interpolated in logarithms."""
+    first = int(np.argmax(power > needed))
+    if first == 0:
+        # Small effects grow in proportion to their size; a limit is the weaker the larger it is.
+        return (
+            float(sizes[0] * np.sqrt(needed / power[0]))
+            if sizes[0] < sizes[-1]
+            else float(sizes[0])
+        )
+    low, high = np.log(np.maximum(power[first - 1 : first + 1], 1e-30))
+    share = (np.log(needed) - low) / (high - low)
+    return float(np.exp((1 - share) * np.log(sizes[first - 1]) + share * np.log(sizes[first])))

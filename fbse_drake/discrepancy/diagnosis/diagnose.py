@@ -1,0 +1,439 @@
+"""Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.bandwidth import Averaging, averaged_to_bandwidth
+from fbse_drake.discrepancy.diagnosis.detectability import smallest_detectable
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import Experiments
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.parsimony import frugal
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, remeasured
+from fbse_drake.discrepancy.diagnosis.rivals import equals, rival_name, rivals, settled
+from fbse_drake.discrepancy.diagnosis.selection import select
+from fbse_drake.discrepancy.diagnosis.significance import Significance
+from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
+from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.identification.structure import Structure, leftover_structure
+from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.inertia import InertialParameters
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.progress import Interrupted, Progress, silent
+
+Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
+EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
+# An effect counts as the explanation of a row if it takes away this share of what exceeds the noise there, and leaves no more than this
+# many times the noise.
+_EXPLAINED = 0.97
+_LARGEST_REST = 5.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value with its 95 % confidence interval."""
+
+    value: float
+    interval: tuple[float, float]
+    unit: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one effect on one or more targets explains."""
+
+    effect: str
+    # Joints, bodies, sides or `robot`; they share the values.
+    targets: tuple[str, ...]
+    # Root mean square of the held-out residual, in multiples of the sensors' noise, without and with the effect.
+    held_out_before: float
+    held_out_after: float
+    parameters: dict[str, Estimate]
+    # Other effects that explain the residual as well.
+    confusable_with: tuple[str, ...]
+    # Is it part of the explanation, or only an alternative, or too small to matter?
+    chosen: bool
+    # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is measured, NaN where it is not known.
+    too_small: bool = False
+    share: float = np.nan
+
+
+@dataclass(frozen=True)
+class EffectStatus:
+    """What this data says about one effect of the library."""
+
+    verdict: EffectVerdict
+    # Parameter that says how large the effect is, its unit, and the smallest value that this data would have shown, by target.
+    parameter: str
+    unit: str
+    smallest_detectable: dict[str, float]
+    # What would show it; a scenario that would, where one is known.
+    experiment: str
+    scenario: str | None = None
+
+    @property
+    def command(self) -> str | None:
+        """The command that makes that experiment, in simulation."""
+        return f"fbse simulate {self.scenario} --out out/{self.scenario}" if self.scenario else None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Which effects are missing, and how sure that is."""
+
+    verdict: Verdict
+    # Chosen effects, those that explain most first, then alternatives, best first.
+    ranking: tuple[Finding, ...]
+    effects: dict[str, EffectStatus]
+    # What no effect of the library explains: by row, as far as it is large enough to matter.
+    unexplained: tuple[Structure, ...]
+    # Explanations in the order in which they were found; the first has no effects.
+    path: tuple[Explanation, ...]
+    # Root mean squares of the whole residual in multiples of the sensors' noise: on held-out data without and with what was chosen, and on
+    # the data that it was fitted to.
+    held_out_before: float
+    held_out_after: float
+    train_after: float
+    # Inertial parameters that were identified along, of bodies whose own are not trusted; see `IdentifyConfig`.
+    inertia: IdentifiedInertia | None = None
+    # Over what the log was averaged.
+    averaging: Averaging | None = None
+    # Why the search ended before it was through; None if it was. What a partial diagnosis does not name was not ruled out.
+    partial: str | None = None
+    # By log that was set aside: is the model with what was chosen better there? See `study` for a
+    # search that goes on.
+    set_aside: Mapping[str, Validation] = field(default_factory=dict)
+
+    @property
+    def chosen(self) -> list[Finding]:
+        return [finding for finding in self.ranking if finding.chosen]
+
+    @property
+    def too_small(self) -> list[Finding]:
+        """What is there, but too small to matter."""
+        return [finding for finding in self.ranking if finding.too_small]
+
+
+def plausible_effects(predictor: Predictor) -> list[type[Effect]]:
+    """The library but for what the scenario rules out, and for what acts in the joints of a log without torques."""
+    torques = "joint/torque_command" in predictor.motion.log
+    known = {
+        name: effect
+        for name, effect in library().items()
+        if name not in predictor.scenario.identify.ruled_out
+    }
+    return [
+        effect for effect in known.values() if torques or not issubclass(effect, JointTorqueEffect)
+    ]
+
+
+def diagnose(
+    predictor: Predictor,
+    effects: Iterable[type[Effect]] | None = None,
+    *,
+    progress: Progress = silent,
+) -> Diagnosis:
+    """Finds the effects that a model lacks.
+
+    Candidates are added one after the other, each the one that leaves the least deviance on held-out data; after every addition each member
+    is tried against all others in its place. An effect counts if it beats what chance would bring once in a thousand logs.
+
+    Args:
+        effects: what is tried; by default `plausible_effects`.
+        progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
+    """
+    predictor, averaging = averaged_to_bandwidth(predictor)
+    tried = plausible_effects(predictor) if effects is None else effects
+    dictionary = Dictionary(predictor, tried, progress)
+    first, partial = Fits(dictionary), None
+    before = first.white.sse
+    path, proposals = [first.explain([])], Proposals(first)
+    try:
+        for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
+            progress("looking for what explains more")
+        path[-1] = frugal(proposals, path[-1])
+    except Interrupted as stop:
+        partial = str(stop)
+    fits = proposals.fits
+    white = fits.white
+    alternatives: dict[int, list[Explanation]] = {}
+    try:
+        if partial is None and dictionary.inertia is None:
+            path[-1], alternatives = settled(proposals, path[-1])
+    except Interrupted as stop:
+        partial = str(stop)
+    final, inertia = consistent(fits, path[-1])
+    path[-1], remaining, left = added(fits, final)
+    final = path[-1]
+    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    unexplained = [
+        structure
+        for structure in leftover_structure(predictor.motion, remaining, left)
+        if not significance.left_share(structure, remaining) < tolerance
+    ]
+    shares = {c: significance.share(final, c) for c in final.candidates}
+    statuses: dict[str, EffectStatus] = {}
+    try:
+        if partial is None:
+            if dictionary.inertia is not None:
+                alternatives = rivals(proposals, final)
+            experiments = Experiments(predictor.scenario)
+            for k, effect in enumerate(dictionary.effects):
+                progress("finding what would have been seen", k / len(dictionary.effects))
+                statuses[effect.__name__] = _status(fits, final, effect, alternatives, experiments)
+    except Interrupted as stop:
+        partial = str(stop)
+    hidden = sum(status.verdict == "not_visible" for status in statuses.values())
+    if unexplained and not _well_explained(white, final, unexplained):
+        verdict: Verdict = "unknown_effect"
+    elif any(not share < tolerance for share in shares.values()) or (
+        inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
+    ):
+        verdict = "effect_found"
+    elif partial is not None or hidden > 0.5 * len(statuses):
+        verdict = "not_visible"
+    else:
+        verdict = "nothing_missing"
+    return Diagnosis(
+        verdict,
+        (
+            *(_sized(f, tolerance) for f in _ranking(fits, path, alternatives, shares)),
+            *inertia_findings(white, before, path[0], inertia),
+        ),
+        statuses,
+        tuple(unexplained),
+        tuple(path),
+        *(root_mean_square(white, sse) for sse in (before, final.held_out_sse, final.sse)),
+        inertia,
+        averaging,
+        partial,
+    )
+
+
+def _sized(finding: Finding, tolerance: float) -> Finding:
+    """A finding that is chosen only if it is large enough to matter."""
+    small = finding.chosen and finding.share < tolerance
+    return replace(finding, chosen=finding.chosen and not small, too_small=small)
+
+
+def root_mean_square(
+    white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)
+) -> float:
+    """Of a whitened residual with these sums of squares, (R,), in some rows together."""
+    return float(np.sqrt(sse[rows].sum() / max(1, white.count[rows].sum())))
+
+
+def _ranking(
+    fits: Fits,
+    path: list[Explanation],
+    alternatives: dict[int, list[Explanation]],
+    shares: Mapping[Candidate, float],
+) -> list[Finding]:
+    final, white = path[-1], fits.white
+    without = [
+        fits.explain([c for c in final.candidates if c is not member])
+        for member in final.candidates
+    ]
+    findings = []
+    for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
+        member, rest = final.candidates[k], without[k]
+        equal = tuple(
+            dict.fromkeys(
+                rival_name(e.candidates[-1], member)
+                for e in alternatives[k]
+                if equals(fits, e, final)
+            )
+        )
+        finding = finding_of(white, rest, final, member, equal, chosen=True)
+        findings.append(replace(finding, share=shares[member]))
+    seen = {(f.effect, f.targets) for f in findings}
+    others = sorted(
+        (e for of_member in alternatives.values() for e in of_member), key=lambda e: e.deviance
+    )
+    for explanation in others:
+        member = explanation.candidates[-1]
+        if (member.name, member.targets) not in seen:
+            seen.add((member.name, member.targets))
+            rest = fits.explain(explanation.candidates[:-1])
+            findings.append(finding_of(white, rest, explanation, member, (), chosen=False))
+    return findings
+
+
+def finding_of(
+    white: WhitenedResidual,
+    before: Explanation,
+    after: Explanation,
+    member: Candidate,
+    equal: tuple[str, ...],
+    *,
+    chosen: bool,
+) -> Finding:
+    """What a member of an explanation brings.
+
+    Args:
+        before, after: explanations without and with it.
+        equal: effects that explain as much.
+    """
+    values, intervals = after.values(member)
+    parameters = {
+        name: Estimate(values[name], intervals[name], member.parameters[name].unit)
+        for name in values
+    }
+    rows = member.signature.rows
+    return Finding(
+        member.name,
+        member.targets,
+        root_mean_square(white, before.held_out_sse, rows),
+        root_mean_square(white, after.held_out_sse, rows),
+        parameters,
+        equal,
+        chosen,
+    )
+
+
+def inertia_findings(
+    white: WhitenedResidual,
+    before: np.ndarray,
+    alone: Explanation,
+    inertia: IdentifiedInertia | None,
+) -> list[Finding]:
+    """Changes of the inertial parameters of each body.
+
+    Args:
+        before: sum of squares of each row of the model as it is.
+        alone: the explanation by inertia alone.
+    """
+    if inertia is None:
+        return []
+    findings = []
+    for body, values, widths in zip(
+        inertia.bodies, inertia.change, inertia.half_width, strict=True
+    ):
+        parameters = {
+            name: Estimate(
+                float(value),
+                (float(value - width), float(value + width)),
+                InertialParameters.parameters[name].unit,
+            )
+            for name, value, width in zip(PARAMETERS, values, widths, strict=True)
+        }
+        errors = (root_mean_square(white, sse) for sse in (before, alone.held_out_sse))
+        findings.append(
+            Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True)
+        )
+    return findings
+
+
+def _well_explained(
+    white: WhitenedResidual, final: Explanation, unexplained: Sequence[Structure]
+) -> bool:
+    """Is what is left small beside what the explanation takes away, in every row?"""
+    if not final.candidates:
+        return False
+    for structure in unexplained:
+        row = structure.index
+        before, after = (
+            white.sse[row] - white.count[row],
+            final.held_out_sse[row] - white.count[row],
+        )
+        if after > (1 - _EXPLAINED) * before or structure.ratio > _LARGEST_REST:
+            return False
+    return True
+
+
+def _status(
+    fits: Fits,
+    final: Explanation,
+    effect: type[Effect],
+    alternatives: dict[int, list[Explanation]],
+    experiments: Experiments,
+) -> EffectStatus:
+    parameter = next(iter(effect.parameters))
+    smallest = smallest_detectable(fits, final, effect)
+    scenario = None
+    mistaken_for = [
+        final.candidates[k]
+        for k, of_member in alternatives.items()
+        if any(e.candidates[-1].effect is effect and equals(fits, e, final) for e in of_member)
+    ]
+    if any(c.effect is effect for c in final.candidates):
+        verdict: EffectVerdict = "present"
+    elif mistaken_for:
+        verdict = "confusable"
+        member = mistaken_for[0]
+        scenario = experiments.that_separates(
+            member.effect, member.targets, final.values(member)[0], effect
+        )
+    elif all(
+        size > fits.dictionary.largest_plausible(effect, target)
+        for target, size in smallest.items()
+    ):
+        verdict = "not_visible"
+        scenario = experiments.that_shows(effect)
+    else:
+        verdict = "absent"
+    units = dict.fromkeys(
+        fits.dictionary.parameters(effect, target)[parameter].unit for target in smallest
+    ) or [effect.parameters[parameter].unit]
+    return EffectStatus(
+        verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
+    )
+
+
+def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Contents of diagnosis.json."""
+    return {
+        "verdict": diagnosis.verdict,
+        "partial": diagnosis.partial is not None,
+        "interrupted_because": diagnosis.partial,
+        "held_out_before": diagnosis.held_out_before,
+        "held_out_after": diagnosis.held_out_after,
+        "train_after": diagnosis.train_after,
+        "set_aside": {name: validation_json(one) for name, one in diagnosis.set_aside.items()},
+        "noise_floor": 1.0,
+        "block": None if diagnosis.averaging is None else diagnosis.averaging.block,
+        "ranking": [
+            {
+                "effect": f.effect,
+                "joints": list(f.targets),
+                "held_out_before": f.held_out_before,
+                "held_out_after": f.held_out_after,
+                "parameters": {
+                    n: {"value": e.value, "interval": list(e.interval), "unit": e.unit}
+                    for n, e in f.parameters.items()
+                },
+                "confusable_with": list(f.confusable_with),
+                "chosen": f.chosen,
+                "too_small": f.too_small,
+                "share": f.share,
+            }
+            for f in diagnosis.ranking
+        ],
+        "effects": {
+            name: {
+                "verdict": s.verdict,
+                "smallest_detectable": max(
+                    (size for size in s.smallest_detectable.values() if np.isfinite(size)),
+                    default=np.inf,
+                ),
+                "parameter": s.parameter,
+                "unit": s.unit,
+                "smallest_detectable_by_target": s.smallest_detectable,
+                "experiment": s.experiment,
+                "scenario": s.scenario,
+                "command": s.command,
+            }
+            for name, s in diagnosis.effects.items()
+        },
+        "unexplained": [
+            {"row": u.row, "ratio": u.ratio, "variable": u.variable, "share": u.share}
+            for u in diagnosis.unexplained
+        ],
+    }

@@ -1,0 +1,276 @@
+"""The dictionary of a log: every effect that could explain its residual, as columns that know nothing of noise."""
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.inertial import (
+    UntrustedInertia,
+    untrusted_bodies,
+    untrusted_inertia,
+)
+from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
+from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.effects.effect import Effect, Parameter
+from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.inertia import InertiaEffect
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
+from fbse_drake.progress import Progress, silent
+
+# So many numbers are kept in columns, at most.
+_MOST_NUMBERS = 20_000_000
+
+
+@dataclass(frozen=True)
+class FixedColumns:
+    """An effect that is no joint torque effect, on one target."""
+
+    effect: type[Effect]
+    target: str
+    # Values of its nonlinear parameters, which are not searched for, (m,).
+    nonlinear: np.ndarray
+    signature: Signature
+    # What the sensors' noise puts into it, for an inertia effect.
+    noise: Signature | None
+
+
+class Dictionary:
+    """The effects that could explain one residual; see the module."""
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        effects: Collection[type[Effect]],
+        progress: Progress = silent,
+    ):
+        """Nothing is predicted before it is asked for.
+
+        Args:
+            effects: what is tried.
+            progress: is told what is being done with the dictionary, too.
+        """
+        self.predictor, self.progress = predictor, progress
+        self.effects = [effect for effect in effects if not effect.composite]
+        # In a log per step it is not known at which velocity within the step a law holds: what such a law leaves is weak evidence.
+        self.per_step = predictor.scenario.recording.rows == "per_step"
+        self.joints = predictor.robot.joint_names
+        self.travel = np.ptp(predictor.motion.signals.joint_position, axis=0)
+        self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
+        untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
+        self._untrusted = set(untrusted)
+        # Inertial parameters that are not trusted are fitted in every explanation, in directions that the log shows.
+        self.inertia = untrusted_inertia(predictor.motion, untrusted) if untrusted else None
+        if self.inertia is not None:
+            # Friction is tried as a whole: as long as half of it is missing, inertia is fitted to that half.
+            self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
+            self._look_at(self.inertia)
+        self._grids: dict[type[JointTorqueEffect], np.ndarray] = {}
+        self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
+
+    def _look_at(self, inertia: UntrustedInertia) -> None:
+        """Finds the directions of inertia that the log shows."""
+        self.inertia = inertia
+        self.directions = inertia.visible_directions(WhitenedResidual(self.predictor.residual))
+        self.inertia_signature = inertia.signature(self.directions)
+
+    def with_inertia(self, inertia: UntrustedInertia) -> "Dictionary":
+        """The same with inertia that is measured otherwise."""
+        changed = copy(self)
+        changed._look_at(inertia)
+        return changed
+
+    def parameters(self, effect: type[Effect], target: str) -> Mapping[str, Parameter]:
+        """An effect's parameters in the units of a target."""
+        return effect.parameters_at(self.unit.get(target, "Nm"))
+
+    def largest_plausible(self, effect: type[Effect], target: str) -> float:
+        """See `Effect.largest_plausible`; in the unit of a target."""
+        return effect.largest_plausible(self.unit.get(target, "Nm"))
+
+    @cached_property
+    def joint_effects(self) -> list[type[JointTorqueEffect]]:
+        return [effect for effect in self.effects if issubclass(effect, JointTorqueEffect)]
+
+    @cached_property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Joints that may share values: each alone, the same joint of every leg, all."""
+        description = self.predictor.robot.description
+        wider = [
+            group
+            for group in (*map(description.counterparts, self.joints), tuple(self.joints))
+            if len(group) > 1
+        ]
+        # Newtons and newton metres have no values in common.
+        wider = [group for group in wider if len({self.unit[joint] for joint in group}) == 1]
+        return [*((joint,) for joint in self.joints), *dict.fromkeys(wider)]
+
+    @cached_property
+    def fixed(self) -> list[FixedColumns]:
+        """All candidates that are no joint torque effects: one for each target that moves the residual."""
+        result = []
+        for k, effect in enumerate(self.effects):
+            self.progress("predicting what each effect would do", k / len(self.effects))
+            if issubclass(effect, JointTorqueEffect):
+                continue
+            # Their nonlinear parameters keep the default.
+            for target in self._targets(effect):
+                usual = self.usual_at(effect, target)
+                raw = self.predictor.signature(effect, target, usual)
+                raw = replace(
+                    raw,
+                    lowest=effect.lowest_values(self.predictor.robot, target),
+                    prior=effect.linear_beliefs() ** -2,
+                )
+                if len(raw.rows):
+                    noise = (
+                        self.predictor.noise_in(effect, target, raw)
+                        if issubclass(effect, InertiaEffect)
+                        else None
+                    )
+                    result.append(FixedColumns(effect, target, usual, raw, noise))
+        return result
+
+    def _targets(self, effect: type[Effect]) -> Sequence[str]:
+        """What an effect is tried on. Of bodies whose inertia is not trusted all is fitted anyhow."""
+        if effect.acts_on == "body":
+            suspected = effect.suspected_bodies(self.predictor.robot)
+            return [body for body in suspected if body not in self._untrusted]
+        return {
+            "joint": self.joints,
+            "foot": self.predictor.robot.description.sides,
+            "robot": ["robot"],
+        }[effect.acts_on]
+
+    def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
+        """First grid of an effect's nonlinear values for each joint, (m, G, n)."""
+        searched = [p for p in effect.parameters.values() if not p.linear]
+        most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
+        axes = [np.geomspace(*p.plausible, min(most, p.grid)) for p in searched]
+        points = (
+            np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1)
+            if searched
+            else np.zeros((0, 1))
+        )
+        factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
+        return points[:, :, None] * factors[:, None]
+
+    def grid(self, effect: type[JointTorqueEffect]) -> np.ndarray:
+        """Columns of an effect's first grid, (B, n, p, G)."""
+        if effect in self._grids:
+            return self._grids[effect]
+        self.progress("predicting what each joint effect would do", self._predicted)
+        columns = self.predictor.joint_columns(
+            effect, self.points(effect), np.arange(len(self.joints))
+        )
+        columns = np.transpose(columns, (2, 3, 0, 1))
+        # Where no law is doubted, nothing is weighed anew, and nobody asks again.
+        if self.per_step:
+            self._grids[effect] = columns
+        return columns
+
+    @property
+    def _predicted(self) -> float:
+        """Share of the joint effects whose grids are there."""
+        return len(self._grids) / max(1, len(self.joint_effects))
+
+    def _factors(self, effect: type[Effect], target: str) -> np.ndarray:
+        """What values of the nonlinear parameters at a revolute joint are multiplied with for a target, shape (m,)."""
+        prismatic = self.unit.get(target) == "N"
+        return np.array(
+            [
+                p.lever_factor if prismatic else 1.0
+                for p in effect.parameters.values()
+                if not p.linear
+            ]
+        )
+
+    def usual_at(self, effect: type[Effect], target: str) -> np.ndarray:
+        """Usual values of the nonlinear parameters in the units of a target, (m,)."""
+        return usual_values(effect) * self._factors(effect, target)
+
+    def columns(
+        self,
+        effect: type[JointTorqueEffect],
+        places: np.ndarray,
+        nonlinear: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> np.ndarray:
+        """Columns for G sets of nonlinear values, (m, G) or (m, G, r), shape (B, r, p, G); see `Predictor.joint_columns`.
+
+        Searches come back to the same values again and again: columns are kept.
+        """
+        sets = (
+            nonlinear
+            if nonlinear.ndim == 3
+            else np.repeat(nonlinear[:, :, None], len(places), axis=2)
+        )
+        found = []
+        for r, place in enumerate(places):
+            keys = [(effect, int(place), values.tobytes(), noisier) for values in sets[..., r].T]
+            known = {key: self._columns[key] for key in keys if key in self._columns}
+            new = [g for g, key in enumerate(keys) if key not in known]
+            if new:
+                columns = self.predictor.joint_columns(
+                    effect, sets[:, new, r : r + 1], places[r : r + 1], noisier=noisier
+                )
+                # From (p, G, B, 1).
+                made = {
+                    keys[g]: np.ascontiguousarray(columns[:, k, :, 0]) for k, g in enumerate(new)
+                }
+                known |= made
+                for key, values in made.items():
+                    self._columns[key] = values
+            found.append([known[key] for key in keys])
+        # From (r, G, p, B).
+        return np.transpose(np.array(found), (3, 0, 2, 1))
+
+    def takes_torque(self, effect: type[Effect]) -> bool:
+        # The load of inertia that is not trusted is taken from the measured torque.
+        return takes_command(effect, load_too=self.inertia is not None)
+
+
+@cache
+def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
+    """Does what a joint effect takes depend on the commanded torque, or on the load?"""
+    if not issubclass(effect, JointTorqueEffect):
+        return False
+    time = np.arange(10.0)[:, None]
+    motion = JointMotion(
+        velocity=np.sin(time),
+        position=np.cos(time),
+        command=np.exp(0.1 * time),
+        time=time,
+        time_step=1e-3,
+    )
+    nonlinear = usual_values(effect)[:, None]
+    motion = motion._replace(load=motion.command)
+    larger = motion._replace(
+        command=100 * motion.command, load=(100 if load_too else 1) * motion.load
+    )
+    columns = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
+    return not np.array_equal(*columns)
+
+
+def usual_values(effect: type[Effect]) -> np.ndarray:
+    """Usual values of an effect's nonlinear parameters, (m,)."""
+    return np.array(
+        [
+            _default(effect, name)
+            for name, parameter in effect.parameters.items()
+            if not parameter.linear
+        ]
+    )
+
+
+def _default(effect: type[Effect], name: str) -> float:
+    """A usual value of a nonlinear parameter: its default, or the middle of its plausible range."""
+    value = getattr(effect(), name)
+    if isinstance(value, dict):
+        value = value.get("all", np.sqrt(np.prod(effect.parameters[name].plausible)))
+    return float(value)

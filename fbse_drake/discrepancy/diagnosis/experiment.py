@@ -1,0 +1,185 @@
+"""Which experiment would decide? What effects would do in the motions of other scenarios, predicted from those motions as planned."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from fbse_drake import resources
+from fbse_drake.discrepancy.diagnosis.detectability import separation, smallest_detectable
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants
+from fbse_drake.effects.effect import Effect
+from fbse_drake.errors import InputError, located
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, build_robot, load_scenario
+from fbse_drake.walking.reference import make_reference
+
+# A planned motion is evaluated at this period and interpolated [s].
+_PERIOD = 0.010
+
+
+def planned_log(scenario: Scenario) -> Log:
+    """What ideal sensors would record if the scenario's model followed its reference exactly: a log without any simulation.
+
+    The trunk stays upright; feet that stand share the load with the least forces.
+
+    Raises:
+        InputError: a motion that the model cannot make.
+    """
+    robot, period = build_robot(scenario.believed), scenario.log.period
+    coarse = np.arange(int(scenario.duration / _PERIOD) + 1) * _PERIOD
+    with located("reference: "):
+        reference = make_reference(scenario.reference, robot, coarse)
+    n = len(robot.joint_names)
+    gravity = -robot.plant.gravity_field().gravity_vector()
+    still = np.zeros((len(coarse), 3))
+    # The IMU sits in an upright trunk.
+    specific_force = (reference.base.acceleration + gravity) @ _imu_axes(robot)
+    equation = EquationOfMotion(robot)
+    pads = len(equation.pads.foot)
+    at = Instants(
+        reference.joint_position,
+        reference.joint_velocity,
+        reference.joint_acceleration,
+        still,
+        still,
+        specific_force,
+        np.zeros((len(coarse), pads, 3)),
+        np.zeros((len(coarse), n)),
+    )
+    if robot.has_floating_base and reference.plan is not None:
+        support = np.stack(
+            [reference.plan.support(side) for side in robot.description.sides], axis=1
+        )
+        at = replace(at, pad_force=_standing_forces(equation, at, support))
+    at = replace(at, torque_command=-equation.residual(at, kinematic=False)[:, :n])
+    fine = np.arange(int(scenario.duration / period) + 1) * period
+
+    def sampled(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        return np.stack([np.interp(fine, coarse, column) for column in flat.T], axis=1).reshape(
+            len(fine), *values.shape[1:]
+        )
+
+    channels = {
+        "time": fine,
+        "joint/position": sampled(at.joint_position),
+        "joint/velocity": sampled(at.joint_velocity),
+        "joint/torque_command": sampled(at.torque_command),
+        "imu/linear_acceleration": sampled(at.specific_force),
+        "imu/angular_velocity": sampled(at.angular_velocity),
+    }
+    force = sampled(at.pad_force)
+    for foot, side in enumerate(robot.description.sides):
+        channels[f"foot/{side}/pad_force"] = force[:, equation.pads.foot == foot]
+    meta = {
+        "joints": robot.joint_names,
+        "sides": robot.description.sides,
+        "period": period,
+        "source": "planned motion",
+    }
+    return Log(channels, meta)
+
+
+def _imu_axes(robot: Robot) -> np.ndarray:
+    """R_BI of the robot's IMU."""
+    X_BI = robot.imu.CalcPose(robot.plant.CreateDefaultContext(), robot.base.body_frame())
+    return X_BI.rotation().matrix()
+
+
+def _standing_forces(equation: EquationOfMotion, at: Instants, support: np.ndarray) -> np.ndarray:
+    """Smallest pad forces on standing feet that satisfy the six unactuated rows, (M, P, 3)."""
+    n, pads = len(equation.robot.joint_names), len(equation.pads.foot)
+    needed = equation.residual(at, kinematic=False)[:, n:]
+    # Column by column: what a unit of each force adds to the rows.
+    columns = np.empty((len(needed), 6, 3 * pads))
+    for k in range(3 * pads):
+        unit = np.zeros((len(needed), pads, 3))
+        unit.reshape(len(needed), -1)[:, k] = 1.0
+        columns[:, :, k] = (
+            equation.residual(replace(at, pad_force=unit), kinematic=False)[:, n:] - needed
+        )
+    columns *= np.repeat(support[:, equation.pads.foot], 3, axis=1)[:, None, :]
+    forces = -np.einsum("mij,mj->mi", np.linalg.pinv(columns), needed)
+    return forces.reshape(len(needed), pads, 3)
+
+
+class Experiments:
+    """Motions that a robot could make, and what each would show."""
+
+    def __init__(self, scenario: Scenario):
+        """Nothing is planned before it is asked for.
+
+        Args:
+            scenario: whose model and sensors make the motions of the shipped scenarios.
+        """
+        self._scenario = scenario
+
+    @cached_property
+    def _predictors(self) -> dict[str, Predictor]:
+        """What each motion would record, by the scenario's name."""
+        found = {}
+        for name, other in _motions(self._scenario).items():
+            model = replace(self._scenario.believed, gantry_height=other.robot.gantry_height)
+            wanted = replace(other, model=model, sensors=self._scenario.sensors)
+            try:
+                found[name] = Predictor(wanted, planned_log(wanted))
+            except InputError:
+                continue  # A motion that this robot cannot make shows nothing.
+        return found
+
+    @cached_property
+    def _whitened(self) -> dict[str, WhitenedResidual]:
+        return {name: WhitenedResidual(p.residual) for name, p in self._predictors.items()}
+
+    def _fits(self, effect: type[Effect]) -> dict[str, Fits]:
+        return {
+            name: Fits(Dictionary(predictor, [effect]), self._whitened[name])
+            for name, predictor in self._predictors.items()
+        }
+
+    def that_shows(self, effect: type[Effect]) -> str | None:
+        """Name of the scenario that would show the smallest size of an effect, if that is a plausible one."""
+        sizes = {}
+        for name, fits in self._fits(effect).items():
+            found = smallest_detectable(fits, fits.noise_alone, effect)
+            sizes[name] = min(found.values(), default=np.inf)
+        best = min(sizes, key=lambda name: sizes[name], default=None)
+        return best if best is not None and sizes[best] < effect.largest_plausible() else None
+
+    def that_separates(
+        self,
+        effect: type[Effect],
+        targets: Sequence[str],
+        values: Mapping[str, float],
+        rival: type[Effect],
+    ) -> str | None:
+        """Name of the scenario in which an effect, with its values, could least be taken for a rival, if it could not."""
+        differences = {
+            name: separation(fits, effect, targets, values, rival)
+            for name, fits in self._fits(rival).items()
+        }
+        best = max(differences, key=lambda name: differences[name], default=None)
+        return best if best is not None and differences[best] > MARGIN else None
+
+
+def _motions(scenario: Scenario) -> dict[str, Scenario]:
+    """Shipped scenarios in which the same robot moves otherwise, by name."""
+    found: dict[str, Scenario] = {}
+    for path in sorted(resources.folder("scenarios").glob("*.yaml")):
+        try:
+            other = load_scenario(path)
+        except InputError:
+            continue
+        same_robot = other.believed.description == scenario.believed.description
+        if same_robot and all(
+            other.reference != known.reference for known in (scenario, *found.values())
+        ):
+            found[path.stem] = other
+    return found

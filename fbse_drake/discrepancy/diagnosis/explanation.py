@@ -1,0 +1,112 @@
+"""Candidates for what is missing, and explanations: candidates that are fitted together."""
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fbse_drake.discrepancy.identification.regression import Fit, Signature
+from fbse_drake.effects.effect import Effect, Parameter
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect on one or more targets that share its values."""
+
+    effect: type[Effect]
+    # Joints, bodies, sides or `robot`.
+    targets: tuple[str, ...]
+    # Of the effect, in the units of the targets.
+    parameters: Mapping[str, Parameter]
+    # Values of its nonlinear parameters, shape (m,).
+    nonlinear: np.ndarray
+    # Whitened; columns are the linear parameters, then the change of the nonlinear ones.
+    signature: Signature
+    # The same as it is, or what makes it: it is seldom asked for.
+    source: Signature | Callable[[], Signature]
+    # Drop of the deviance that it brings because the sensors' noise is in its columns and in the residual alike.
+    spurious: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.effect.__name__
+
+    @cached_property
+    def raw(self) -> Signature:
+        """Its signature, not whitened."""
+        return self.source if isinstance(self.source, Signature) else self.source()
+
+    @property
+    def has_linear(self) -> bool:
+        """Does it have an amount, or nonlinear parameters alone?"""
+        return bool(self.linear_names)
+
+    @property
+    def linear_names(self) -> list[str]:
+        return [name for name, parameter in self.effect.parameters.items() if parameter.linear]
+
+    @property
+    def nonlinear_names(self) -> list[str]:
+        return [name for name, parameter in self.effect.parameters.items() if not parameter.linear]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Effects that are fitted together; their parameters stand one candidate after the other, then those of untrusted inertia."""
+
+    candidates: tuple[Candidate, ...]
+    # None for no effects at all.
+    fit: Fit | None
+    sse: np.ndarray
+    held_out_sse: np.ndarray
+    # Of held-out data, with the charge for every parameter; smaller is better.
+    deviance: float
+
+    def start(self, candidate: Candidate) -> int:
+        """Place of a candidate's first parameter."""
+        return sum(
+            c.signature.values.shape[2]
+            for c in itertools.takewhile(lambda c: c is not candidate, self.candidates)
+        )
+
+    def values(
+        self, candidate: Candidate
+    ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds.
+
+        A nonlinear parameter that was not searched for has its plausible range as interval.
+        """
+        start, names = self.start(candidate), candidate.linear_names
+        fitted = names + (
+            candidate.nonlinear_names if issubclass(candidate.effect, JointTorqueEffect) else []
+        )
+        offsets = np.concatenate([np.zeros(len(names)), candidate.nonlinear])[: len(fitted)]
+        part = slice(start, start + len(fitted))
+        values, intervals = (
+            self.fit.parameters[part] + offsets,
+            self.fit.interval()[part] + offsets[:, None],
+        )
+        found, between = {}, {}
+        for name, value, interval in zip(fitted, values, intervals, strict=True):
+            bounds = candidate.parameters[name].bounds
+            found[name], between[name] = (
+                float(np.clip(value, *bounds)),
+                tuple(np.clip(interval, *bounds).tolist()),
+            )
+        for name, value in zip(candidate.nonlinear_names, candidate.nonlinear, strict=True):
+            if name not in found:
+                found[name], between[name] = float(value), candidate.parameters[name].plausible
+        return found, between
+
+    @property
+    def effects(self) -> list[Effect]:
+        """The candidates' effects with the values that were found."""
+        found = []
+        for candidate in self.candidates:
+            values, _ = self.values(candidate)
+            same = {name: [value] * len(candidate.targets) for name, value in values.items()}
+            found.append(candidate.effect.from_values(candidate.targets, same))
+        return found

@@ -1,0 +1,366 @@
+"""Fits of explanations to one residual: how well effects explain it together, and what they leave."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.stats import chi2
+
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.identification.regression import (
+    Regression,
+    Signature,
+    WhitenedResidual,
+    bounded_least_squares,
+    leftover,
+)
+from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+# Probability of any false alarm on a log that hides nothing.
+FALSE_ALARM = 1e-3
+# Explanations whose deviances differ by less are not told apart (a likelihood ratio of some 150).
+MARGIN = 10.0
+# What a parameter must earn beyond what it costs on held-out data.
+COMPLEXITY = 4.0
+# Share of the doubt about known laws that an effect could mimic.
+_SYSTEMATIC = 0.5
+# Safety on what the noise in an effect's own columns may feign.
+_SPURIOUS = 3.0
+
+
+# Slopes with respect to nonlinear values are taken over this share of them.
+_SLOPE_STEP = 0.02
+# So many explanations are kept, and so many numbers in columns.
+_KEPT = 500
+_MOST_NUMBERS = 30_000_000
+
+
+@dataclass(frozen=True)
+class ColumnSets:
+    """Columns of a joint torque effect in one joint for G sets of its nonlinear values."""
+
+    # Whitened, p columns for each set, one set after the other.
+    signature: Signature
+    # Inner products within each set, (G, p, p).
+    gram: np.ndarray
+
+    @property
+    def columns(self) -> np.ndarray:
+        """By set, (B, G, p)."""
+        return self.signature.values.reshape(-1, *self.gram.shape[:2])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The first sets of nonlinear values that a search tries."""
+
+    # (m, G, n).
+    points: np.ndarray
+    # For each joint.
+    sets: tuple[ColumnSets, ...]
+
+
+class Fits:
+    """Explanations of one residual by one dictionary, weighted by the residual's noise."""
+
+    def __init__(self, dictionary: Dictionary, white: WhitenedResidual | None = None):
+        """Nothing is fitted yet.
+
+        Args:
+            white: the residual with the noise to weigh by; by default the predictor's.
+        """
+        self.dictionary = dictionary
+        self.white = WhitenedResidual(dictionary.predictor.residual) if white is None else white
+        inertia = dictionary.inertia
+        # Whitened columns of inertia that is not trusted.
+        self.always = (
+            [] if inertia is None else [self.white.whiten_signature(dictionary.inertia_signature)]
+        )
+        self.regression = Regression(self.white)
+        self._grids: dict[str, Grid] = {}
+        self._explanations: Memory[Explanation] = Memory(_KEPT)
+        self._sets: Memory[ColumnSets] = Memory(
+            _MOST_NUMBERS, lambda sets: sets.signature.values.size
+        )
+        self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
+
+    def doubting(self, explanation: Explanation) -> tuple["Fits", Explanation]:
+        """Fits that weigh the residual anew, and an explanation in them: friction laws that it takes off make the residual noisier."""
+        predictor = self.dictionary.predictor
+        resolved = [effect.resolve(predictor.robot.description) for effect in explanation.effects]
+        residual = predictor.doubted(predictor.residual, resolved)
+        if np.array_equal(residual.variance, self.white.residual.variance):
+            return self, explanation
+        fits = Fits(self.dictionary, WhitenedResidual(residual))
+        moved = [
+            replace(c, signature=fits.white.whiten_signature(c.raw)) for c in explanation.candidates
+        ]
+        return fits, fits.explain(moved)
+
+    @cached_property
+    def fixed_candidates(self) -> list[Candidate]:
+        """All candidates that are no joint torque effects: one for each target that moves the residual."""
+        result = []
+        for fixed in self.dictionary.fixed:
+            signature = self.white.whiten_signature(fixed.signature)
+            spurious = (
+                0.0
+                if fixed.noise is None
+                else self._spurious(signature, self.white.whiten_signature(fixed.noise))
+            )
+            parameters = self.dictionary.parameters(fixed.effect, fixed.target)
+            result.append(
+                Candidate(
+                    fixed.effect,
+                    (fixed.target,),
+                    parameters,
+                    fixed.nonlinear,
+                    signature,
+                    fixed.signature,
+                    spurious,
+                )
+            )
+        return result
+
+    def _spurious(self, signature: Signature, noise: Signature) -> float:
+        """Drop of the deviance that the noise in a signature may feign."""
+        both = np.einsum("brp,br->p", noise.values, self._noise[:, signature.rows])
+        power = (signature.values**2).sum(axis=(0, 1))
+        return _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        """A realization of the residual's noise, whitened, (B, R)."""
+        realization = self.dictionary.predictor.noise_realization
+        return np.stack(
+            [self.white.whiten(row, values) for row, values in enumerate(realization.T)], axis=1
+        )
+
+    @cached_property
+    def threshold(self) -> np.ndarray:
+        """Drop of the deviance that k parameters must bring before they count, by k."""
+        tests = len(self.fixed_candidates)
+        for effect in self.dictionary.joint_effects:
+            sets = self.dictionary.points(effect).shape[1]
+            tests += len(self.dictionary.groups) * max(1, sets // 4)
+        return np.array([np.inf, *(chi2.isf(FALSE_ALARM / tests, k) for k in range(1, 13))])
+
+    def explain(self, candidates: Sequence[Candidate]) -> Explanation:
+        """Fits candidates together."""
+        key = tuple(candidates)
+        return self._explanations.or_made(key, lambda: self._explain(key))
+
+    def _explain(self, candidates: tuple[Candidate, ...]) -> Explanation:
+        white = self.white
+        if not candidates and not self.always:
+            return Explanation((), None, white.sse, white.sse, white.deviance(white.sse))
+        fit = self.regression.fit([*(c.signature for c in candidates), *self.always])
+        charge = COMPLEXITY * sum(c.signature.values.shape[2] for c in candidates)
+        factor = self.torque_factor(candidates, fit.parameters)
+        sse, held_out_sse = fit.sse * factor, fit.held_out_sse * factor
+        return Explanation(
+            candidates, fit, sse, held_out_sse, white.deviance(held_out_sse) + charge
+        )
+
+    def torque_factor(
+        self, candidates: Sequence[Candidate], parameters: np.ndarray
+    ) -> np.ndarray | float:
+        """What the squares of each row are to be multiplied with where torque is measured and effects take a share of it, (R,).
+
+        With u = share * torque, the rest torque - u - ... is the error of the torque times 1 - share: a share near 1 would explain
+        everything. As the error of the torque itself it is the larger the more is taken.
+        """
+        taking = [c for c in candidates if self.dictionary.takes_torque(c.effect)]
+        if self.dictionary.per_step or not taking:
+            return 1.0
+        torque = self.dictionary.predictor.motion.blocks.torque_command
+        taken, start = {}, 0
+        for c in candidates:
+            stop = start + c.signature.values.shape[2]
+            if c in taking:
+                added = c.raw.values @ parameters[start:stop] + c.raw.offset
+                for row, values in zip(c.raw.rows, added.T, strict=True):
+                    taken[row] = taken.get(row, 0.0) + values
+            start = stop
+        factor = np.ones(self.white.y.shape[1])
+        for row, values in taken.items():
+            known = self.white.residual.known[:, row]
+            own, rest = (
+                float((part[known] ** 2).sum())
+                for part in (torque[:, row], torque[:, row] - values)
+            )
+            if own > 0 and rest > 0:
+                factor[row] = own / rest
+        return factor
+
+    @property
+    def noise_alone(self) -> Explanation:
+        """What an explanation that leaves nothing but noise would be, without any effects."""
+        return Explanation((), None, 1.0 * self.white.count, 1.0 * self.white.count, 0.0)
+
+    def systematic(self, rows: np.ndarray) -> float:
+        """Drop of the deviance that doubtful laws alone may give to an effect in these rows: what is doubted need not be random."""
+        return (
+            _SYSTEMATIC * float(self.white.doubt[rows].sum()) if self.dictionary.per_step else 0.0
+        )
+
+    def grid(self, effect: type[JointTorqueEffect]) -> Grid:
+        """First grid of an effect's nonlinear values, in all joints."""
+        if effect.__name__ not in self._grids:
+            points, columns = self.dictionary.points(effect), self.dictionary.grid(effect)
+            sets = (self._whitened(columns[:, j], j) for j in range(columns.shape[1]))
+            self._grids[effect.__name__] = Grid(points, tuple(sets))
+        return self._grids[effect.__name__]
+
+    def sets(
+        self,
+        effect: type[JointTorqueEffect],
+        place: int,
+        points: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> ColumnSets:
+        """Sets of an effect's nonlinear values, (m, G), in one joint; if they are to be noisier, with the sensors' noise once more."""
+
+        def made() -> ColumnSets:
+            columns = self.dictionary.columns(effect, np.array([place]), points, noisier=noisier)
+            return self._whitened(columns[:, 0], place)
+
+        return self._sets.or_made((effect, place, points.tobytes(), noisier), made)
+
+    def _whitened(self, columns: np.ndarray, place: int) -> ColumnSets:
+        """Of columns (B, p, G)."""
+        values = self.white.whiten(place, np.swapaxes(columns, 1, 2))
+        by_set = np.moveaxis(values, 0, 2)
+        flat = values.reshape(len(values), 1, -1)
+        return ColumnSets(Signature(np.array([place]), flat), by_set @ np.swapaxes(by_set, 1, 2))
+
+    def candidate(
+        self,
+        effect: type[JointTorqueEffect],
+        group: tuple[str, ...],
+        nonlinear: np.ndarray,
+        beside: Remainder,
+    ) -> Candidate:
+        """A joint torque effect with nonlinear values, linearised about them.
+
+        Args:
+            beside: what the explanation leaves that it is to be added to.
+        """
+        places = np.array([self.dictionary.joints.index(joint) for joint in group])
+        parameters = self.dictionary.parameters(effect, group[0])
+        names = [name for name, parameter in parameters.items() if not parameter.linear]
+        smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
+        steps = _SLOPE_STEP * nonlinear
+        # The values themselves, then for each of them a bit less and a bit more.
+        stencil = np.repeat(nonlinear[:, None], 1 + 2 * len(nonlinear), axis=1)
+        for k, step in enumerate(steps):
+            stencil[k, 1 + 2 * k : 3 + 2 * k] += [-step, step]
+        sets = [self.sets(effect, place, stencil) for place in places]
+        amounts = np.ones(1)
+        if len(smallest):
+            moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in sets]
+            gram, right = (sum(part[0] for part in parts) for parts in zip(*moments, strict=True))
+            # A slope for an amount that cannot be would mimic just that.
+            amounts = bounded_least_squares(gram, right, smallest)
+
+        def linearised(columns: np.ndarray) -> np.ndarray:
+            """Columns (r, B, G, p) of the stencil: those of the amounts, then slopes for amounts that fit best; (B, r, P)."""
+            slopes = [
+                (columns[:, :, 2 + 2 * k] - columns[:, :, 1 + 2 * k]) @ amounts / (2 * step)
+                for k, step in enumerate(steps)
+            ]
+            together = [columns[:, :, 0], *(slope[..., None] for slope in slopes)]
+            return np.moveaxis(np.concatenate(together, axis=2), 0, 1)
+
+        # A weak belief in the plausible range keeps values that the data say nothing about from running away.
+        ranges = [np.log(parameters[name].plausible) for name in names]
+        belief = [
+            1.0 / (0.25 * (high - low) * value) ** 2
+            for (low, high), value in zip(ranges, nonlinear, strict=True)
+        ]
+        # Nonlinear parameters do not fall far below their plausible range.
+        lows = 0.5 * np.array([parameters[name].plausible[0] for name in names])
+        lowest = smallest.tolist()
+        lowest += np.maximum(-0.6 * nonlinear, np.minimum(lows - nonlinear, 0.0)).tolist()
+        prior = np.array([0.0] * len(smallest) + belief)
+
+        def signature(columns: np.ndarray) -> Signature:
+            values = linearised(columns)
+            if len(smallest):
+                return Signature(places, values, prior=prior, lowest=np.array(lowest))
+            offset = values[:, :, 0]
+            return Signature(places, values[:, :, 1:], offset, prior=prior, lowest=np.array(lowest))
+
+        def raw() -> Signature:
+            # From (B, r, p, G).
+            columns = self.dictionary.columns(effect, places, stencil)
+            return signature(np.transpose(columns, (1, 0, 3, 2)))
+
+        whitened = np.stack([s.columns for s in sets])
+        here = nonlinear[:, None]
+        noisier = [self.sets(effect, place, here, noisier=True).columns[:, 0] for place in places]
+        both = sum(
+            (noisy - clean[:, 0]).T @ self._noise[:, place]
+            for noisy, clean, place in zip(noisier, whitened, places, strict=True)
+        )
+        power = sum(np.diag(s.gram[0]) for s in sets)
+        spurious = _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+        return Candidate(effect, group, parameters, nonlinear, signature(whitened), raw, spurious)
+
+    def about(self, candidate: Candidate, values: np.ndarray) -> Candidate:
+        """A candidate that is no joint torque effect, made linear about values of its linear parameters.
+
+        Raises:
+            InputError: no body has these values.
+        """
+        raw = self.dictionary.predictor.signature_near(
+            candidate.effect,
+            candidate.targets[0],
+            values,
+            candidate.nonlinear,
+            candidate.raw,
+        )
+        return replace(candidate, source=raw, signature=self.white.whiten_signature(raw))
+
+    def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
+        """Whitened, in the order of the explanation's parameters."""
+        return (
+            *(c.signature for c in explanation.candidates),
+            *(self.always if explanation.fit is not None else []),
+        )
+
+    def leftover(self, explanation: Explanation) -> np.ndarray:
+        """Whitened residual after an explanation, (B, R)."""
+        if explanation.fit is None:
+            return self.white.y
+        return leftover(self.white, self.signatures(explanation), explanation.fit.parameters)
+
+    def remainder(self, explanation: Explanation) -> Remainder:
+        """What further effects could take of what an explanation leaves."""
+        if explanation not in self._remainders:
+            parameters = np.zeros(0) if explanation.fit is None else explanation.fit.parameters
+            self._remainders[explanation] = Remainder(
+                self.regression,
+                self.signatures(explanation),
+                parameters,
+                self.white.scale(explanation.sse),
+                tied=bool(self.always),
+            )
+        return self._remainders[explanation]
+
+    def required(self, candidate: Candidate) -> float:
+        """Drop of the deviance that a candidate must bring before it counts."""
+        rows, parameters = candidate.signature.rows, candidate.signature.values.shape[2]
+        return float(
+            self.threshold[min(12, parameters)] + self.systematic(rows) + candidate.spurious
+        )
+
+    def needed(self, parameters: int) -> float:
+        """Sum of squares that an effect with so many parameters must have to be found."""
+        return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)

@@ -1,0 +1,288 @@
+"""Parsimony: the smallest explanation that held-out data does not speak against.
+
+A search adds what improves an explanation; what it added first may have become needless later, and
+chance and errors of the model make some of it look useful. So every member has to pay once more,
+beside all others; laws give way to simpler ones that they contain; and joints that agree share values.
+
+Held-out data are no independent samples where what is left is correlated in time: improvements are
+divided by the number of blocks that count as one, see `blocks_per_sample`.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import polished
+from fbse_drake.discrepancy.diagnosis.selection import is_significant
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+# Level of the region of confidence that must not contain "no effect".
+_CONFIDENCE = 0.95
+# Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what is
+# required speaks for itself.
+_PLAIN = 3.0
+# Share of the upper end of a range from which on a value counts as at its end.
+_AT_THE_END = 0.98
+# A finding takes off a row at least this share of what then is left there beyond the noise: what
+# explains a large rest would also change what is small beside it.
+_LEAST_OF_REST = 0.1
+
+
+def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
+    """The smallest explanation that is as good as this one, as far as held-out data can tell.
+
+    Members that do not pay go, the least useful first; then laws are reduced, then joints pooled;
+    until nothing changes.
+    """
+    judge = _Judge(proposals.fits, explanation)
+    while True:
+        proposals.fits.dictionary.progress("looking for a smaller explanation")
+        smaller = next(_smaller(proposals, judge, explanation), None)
+        if smaller is None:
+            return explanation
+        explanation = polished(proposals.fits, smaller)
+
+
+def blocks_per_sample(scores: np.ndarray) -> np.ndarray:
+    """How many blocks of a row count as one independent sample, not less than 1, shape (R,).
+
+    The integrated autocorrelation time, over lags as long as sums of adjacent pairs are positive
+    (Geyer 1992, initial positive sequence).
+
+    Args:
+        scores: columns times what is left, 0 where nothing is known, (B, R). Of slow columns they
+            are correlated as what is left is; columns that change sign meanwhile are surer.
+    """
+    size = len(scores)
+    power = np.abs(np.fft.rfft(scores, 2 * size, axis=0)) ** 2
+    products = np.fft.irfft(power, axis=0)[: size - size % 2]
+    correlation = np.divide(
+        products, products[0], out=np.zeros_like(products), where=products[0] > 0
+    )
+    # Lags 0 and 1, 2 and 3, ...
+    pairs = correlation.reshape(len(correlation) // 2, 2, -1).sum(axis=1)
+    positive = np.logical_and.accumulate(pairs > 0, axis=0)
+    return np.maximum(2 * np.where(positive, pairs, 0.0).sum(axis=0) - 1.0, 1.0)
+
+
+def _smaller(
+    proposals: Proposals, judge: "_Judge", explanation: Explanation
+) -> Iterator[Explanation]:
+    """Smaller explanations that are as good, the first to be taken first."""
+    fits = proposals.fits
+    without = {
+        member: fits.explain([c for c in explanation.candidates if c is not member])
+        for member in explanation.candidates
+    }
+    for member in sorted(without, key=lambda c: judge.gain(without[c], explanation)):
+        if not judge.pays(without[member], explanation, member):
+            yield without[member]
+    yield from _on_fewer_targets(proposals, judge, explanation)
+    yield from _reduced(proposals, judge, explanation)
+    yield from _pooled(proposals, judge, explanation)
+
+
+class _Judge:
+    """What members of an explanation bring, in effectively independent samples."""
+
+    def __init__(self, fits: Fits, explanation: Explanation):
+        """Measures what the largest explanation leaves: what a smaller one leaves is no noise."""
+        self._fits, self._left = fits, fits.leftover(explanation)
+
+    def gain_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
+        """Drop of the held-out deviance in each row, (R,)."""
+        fits, white = self._fits, self._fits.white
+
+        def deviance(sse: np.ndarray) -> np.ndarray:
+            scale = white.scale(sse)
+            return white.count * np.log(scale) + sse / scale
+
+        drop = deviance(base.held_out_sse) - deviance(wider.held_out_sse)
+        explained = fits.leftover(base) - fits.leftover(wider)
+        return drop / blocks_per_sample(explained * self._left)
+
+    def gain(self, base: Explanation, wider: Explanation) -> float:
+        """The same in all rows, without what the parameters cost."""
+        more = _size(wider) - _size(base)
+        return float(self.gain_by_row(base, wider).sum()) - COMPLEXITY * more
+
+    def pays(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
+        """Is a member worth its parameters, is it more than nothing, and does it worsen no row?"""
+        fits, rows = self._fits, member.signature.rows
+        again = fits.explain([*rest.candidates, member])
+        if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
+            # Every joint has it: what identification begins with needs no proof against chance.
+            return is_significant(fits, rest, again, member)
+        gain, repeated = self.gain(rest, whole), _is_repeated(rest, member)
+        required = fits.threshold[min(12, member.signature.values.shape[2])]
+        return (
+            gain >= required
+            and self.gain_by_row(rest, whole)[rows].min() > -MARGIN
+            and self._stands_out(rest, whole, rows)
+            and (
+                (gain >= _PLAIN * required and not repeated) or is_more_than_nothing(whole, member)
+            )
+            and not _is_beyond_its_range(member)
+            and is_significant(fits, rest, again, member)
+        )
+
+    def _stands_out(self, rest: Explanation, whole: Explanation, rows: np.ndarray) -> bool:
+        """Is what a member takes off any of its rows large beside what nobody explains there?"""
+        taken = (rest.held_out_sse - whole.held_out_sse)[rows]
+        left = (whole.held_out_sse - self._fits.white.count)[rows]
+        return bool(np.any((taken > 0) & (taken >= _LEAST_OF_REST * left)))
+
+    def is_as_good(self, smaller: Explanation, explanation: Explanation) -> bool:
+        """May chance have brought what an explanation has more than one with fewer parameters?
+
+        One comparison, and not the best of many: its threshold is that of a single test.
+        """
+        more = _size(explanation) - _size(smaller)
+        least = float(chi2.isf(FALSE_ALARM, more)) if more > 0 else MARGIN
+        rows = self.gain_by_row(smaller, explanation) - COMPLEXITY * more
+        return self.gain(smaller, explanation) < least and rows.max() < least
+
+
+def _size(explanation: Explanation) -> int:
+    return sum(c.signature.values.shape[2] for c in explanation.candidates)
+
+
+def is_more_than_nothing(explanation: Explanation, member: Candidate) -> bool:
+    """Does the interval of one of a member's amounts not hold zero, or their joint region (Hotelling's T squared)?
+
+    Of an effect that has one parameter and no amount, the interval of that, if zero is neutral. (With
+    several, that they are not all neutral is not said by intervals of a law made linear.)
+    """
+    start, names = explanation.start(member), member.linear_names
+    if names:
+        part = slice(start, start + len(names))
+        values = explanation.fit.parameters[part]
+    else:
+        if [member.parameters[name].neutral for name in member.nonlinear_names] != [0.0]:
+            return True
+        part = slice(start, start + 1)
+        values = explanation.fit.parameters[part] + member.nonlinear
+    spread = explanation.fit.spread
+    deviation, freedom = spread.deviation[part], np.minimum(spread.freedom[part], 1e6)
+    if np.any(np.abs(values) > student.ppf((1 + _CONFIDENCE) / 2, freedom) * deviation):
+        return True
+    if not np.all(deviation > 0):
+        return False
+    # Units must not decide what counts as singular.
+    covariance = spread.covariance[part, part] / np.outer(deviation, deviation)
+    scaled = values / deviation
+    square = scaled @ np.linalg.pinv(covariance, hermitian=True) @ scaled
+    return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
+
+
+def _is_repeated(rest: Explanation, member: Candidate) -> bool:
+    """Is there a law for the same joint that contains a member's, or that it contains?"""
+
+    def contains(effect: type[Effect], other: type[Effect]) -> bool:
+        return issubclass(effect, JointTorqueEffect) and any(
+            other in reduction.effects for reduction in effect.reductions
+        )
+
+    return any(
+        set(c.targets) & set(member.targets)
+        and (contains(c.effect, member.effect) or contains(member.effect, c.effect))
+        for c in rest.candidates
+    )
+
+
+def _is_beyond_its_range(member: Candidate) -> bool:
+    """Is a parameter at the upper end of a range that it cannot leave? Then something else is there."""
+    values = dict(zip(member.nonlinear_names, member.nonlinear, strict=True))
+    return any(
+        parameter.closed and values[name] > _AT_THE_END * parameter.plausible[1]
+        for name, parameter in member.parameters.items()
+        if name in values
+    )
+
+
+def _on_fewer_targets(
+    proposals: Proposals, judge: _Judge, explanation: Explanation
+) -> Iterator[Explanation]:
+    """Without targets of a member whose held-out error the shared values raise."""
+    for member in explanation.candidates:
+        if len(member.targets) == 1 or not issubclass(member.effect, JointTorqueEffect):
+            continue
+        others = [c for c in explanation.candidates if c is not member]
+        rest = proposals.fits.explain(others)
+        gain = judge.gain_by_row(rest, explanation)
+        joints = proposals.fits.dictionary.joints
+        kept = tuple(t for t in member.targets if gain[joints.index(t)] > -MARGIN)
+        if kept and len(kept) < len(member.targets):
+            yield proposals.beside(rest, member.effect, kept)
+
+
+def _reduced(
+    proposals: Proposals, judge: _Judge, explanation: Explanation
+) -> Iterator[Explanation]:
+    """With simpler laws in the place of one that contains them, wherever it is: it is one law for
+    all joints unless none of them needs it."""
+    tried = set(proposals.fits.dictionary.effects)
+    for effect in dict.fromkeys(c.effect for c in explanation.candidates):
+        if not issubclass(effect, JointTorqueEffect):
+            continue
+        members = [c for c in explanation.candidates if c.effect is effect]
+        simpler = [r.effects for r in effect.reductions if tried.issuperset(r.effects)]
+        smaller: Explanation | None = explanation if simpler else None
+        for targets in (member.targets for member in members):
+            if smaller is None:
+                break
+            larger = smaller
+            # Others may have been moved to where they fit.
+            member = next(
+                c for c in larger.candidates if (c.effect, c.targets) == (effect, targets)
+            )
+            options = (_with_laws(proposals, larger, member, laws) for laws in simpler)
+            good = (e for e in options if e is not None and judge.is_as_good(e, larger))
+            smaller = next(good, None)
+        if smaller is not None:
+            yield smaller
+
+
+def _with_laws(
+    proposals: Proposals,
+    explanation: Explanation,
+    member: Candidate,
+    laws: Sequence[type[JointTorqueEffect]],
+) -> Explanation | None:
+    """With laws in the place of a member that are not there yet; None if some are there for some of its targets alone."""
+    others = [c for c in explanation.candidates if c is not member]
+    result = proposals.fits.explain(others)
+    for law in laws:
+        there = {t for c in others if c.effect is law for t in c.targets} & set(member.targets)
+        if not there:
+            result = polished(proposals.fits, proposals.beside(result, law, member.targets))
+        elif len(there) < len(member.targets):
+            return None
+    return result
+
+
+def _pooled(proposals: Proposals, judge: _Judge, explanation: Explanation) -> Iterator[Explanation]:
+    """With one member for the same joint of all legs, in the place of one for each."""
+    fits = proposals.fits
+    alone = {
+        (c.effect, c.targets[0]): c
+        for c in explanation.candidates
+        if len(c.targets) == 1 and issubclass(c.effect, JointTorqueEffect)
+    }
+    for group in fits.dictionary.groups:
+        for effect in dict.fromkeys(effect for effect, _ in alone):
+            members = [alone.get((effect, joint)) for joint in group]
+            if len(group) == 1 or None in members:
+                continue
+            rest = fits.explain([c for c in explanation.candidates if c not in members])
+            shared = polished(fits, proposals.beside(rest, effect, group))
+            if judge.is_as_good(shared, explanation):
+                yield shared

@@ -1,0 +1,704 @@
+"""What effects add to the residual of a log: signatures for the regression to fit, and predictions of effects whose values are known."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import cache, cached_property, partial
+
+import numpy as np
+from scipy.ndimage import shift
+from scipy.signal import savgol_filter, welch
+
+from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
+from fbse_drake.discrepancy.identification.regression import Signature
+from fbse_drake.discrepancy.residual.noise import Noise, measured_noise, measured_sensors
+from fbse_drake.discrepancy.residual.residual import (
+    EquationOfMotion,
+    Instants,
+    RecordedMotion,
+    Residual,
+    averaged,
+    block_means,
+    joint_velocity_noise,
+    residual_rows,
+    rms,
+    within_steps,
+)
+from fbse_drake.discrepancy.residual.servo import with_command
+from fbse_drake.effects.contact import (
+    ContactEffect,
+    FootCreep,
+    GroundCompliance,
+    PadContact,
+    pad_contact,
+    spring_force,
+)
+from fbse_drake.effects.effect import Effect, ResolvedEffect
+from fbse_drake.effects.geometry import GeometryEffect
+from fbse_drake.effects.inertia import InertiaEffect
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    ResolvedJointTorque,
+    basis_over_time,
+)
+from fbse_drake.effects.sensor import SensorEffect, SensorSignals
+from fbse_drake.errors import InputError, located
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario, build_robot
+from fbse_drake.sensors.foot_force import force_noise
+
+# Joint velocities are smoothed over this many samples, without delay, where friction laws take them.
+_SMOOTHING = 9
+# What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
+_LAW_DOUBT = 8.0
+# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times it.
+_SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
+# A column that is smaller than this share of the others is rounding.
+_ROUNDING = 1e-9
+# A law without memory is evaluated at least so often in a block, if the log has that many samples.
+_EVALUATIONS = 8
+# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of those that we did.
+_EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
+# Most numbers that one array of columns may have before it is averaged over blocks.
+_CHUNK = 5_000_000
+
+
+class Predictor:
+    """A scenario's model over one log: its residual, and what further effects would add to it."""
+
+    def __init__(self, scenario: Scenario, log: Log, noise: Noise | None = None):
+        """Reads the log.
+
+        Args:
+            noise: of the rows, beyond what is believed; by default it is measured.
+
+        Raises:
+            InputError: a log that does not fit the model.
+        """
+        self.scenario, self.log = scenario, log
+        with located("model: "):
+            self.robot = build_robot(scenario.believed)
+        names = self.robot.description
+        self._known = [
+            effect.resolve(names, key=f"model.effects.{key}")
+            for key, effect in scenario.believed.effects.items()
+        ]
+        log = with_command(scenario, log, names)
+        sensors, self._noisier_channels = measured_sensors(
+            scenario.sensors, scenario.recording, log
+        )
+        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log)
+        for known in self._known:
+            if issubclass(known.effect, SensorEffect):
+                self.motion.signals = self._undone(known, self._remembered(known))
+        self._given_noise = noise
+        self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
+        self._regressors: dict[tuple[str, bool], np.ndarray] = {}
+
+    @property
+    def rows(self) -> int:
+        """Number of the residual's rows."""
+        return len(residual_rows(self.robot))
+
+    @cached_property
+    def residual(self) -> Residual:
+        """What the model, with its effects, leaves over; with the noise that the log shows where
+        that is more than is believed."""
+        residual = self._believed_residual
+        return replace(residual, variance=residual.variance + self.noise.white / self.motion.length)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Of the rows, beyond what is believed."""
+        if self._given_noise is not None:
+            return self._given_noise
+        return measured_noise(self.motion, self._believed_residual, self._noisier_channels)
+
+    @cached_property
+    def _believed_residual(self) -> Residual:
+        residual = self.motion.residual
+        for known in self._known:
+            residual = residual.minus(self.predict(known))
+        if self.robot.has_floating_base:
+            residual = residual.minus(self.ground_gives_way())
+            residual = replace(
+                residual,
+                variance=residual.variance + self.sinking_variance / self._contact.stiffness**2,
+            )
+        return self.doubted(residual, self._known)
+
+    def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
+        """A residual that is less certain because effects were taken off it.
+
+        Friction laws are doubtful, see `law_variance`, and the sinking of soles is predicted from forces that are measured with noise.
+        """
+        effects = list(effects)
+        doubt = np.zeros_like(residual.variance)
+        doubt[:, : len(self.robot.joint_names)] = self.law_variance(
+            e for e in effects if isinstance(e, ResolvedJointTorque)
+        )
+        softer = sum(
+            float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance
+        )
+        if softer:
+            nominal = 1.0 / self._contact.stiffness
+            doubt += ((nominal + softer) ** 2 - nominal**2) * self.sinking_variance
+        return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
+
+    @cached_property
+    def sinking_variance(self) -> np.ndarray:
+        """What the noise of the force sensors puts into the predicted sinking of the soles, per unit of compliance squared, (R,).
+
+        Of a noise that is added to the measured forces once more.
+        """
+        force = self.motion.signals.pad_force
+        noise = force_noise(
+            self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0)
+        )
+        motions = [
+            [
+                GroundCompliance.sole_motion(f, pads, self._sample_time)
+                for f, pads in self._split_feet(forces)
+            ]
+            for forces in (force, force + noise)
+        ]
+        clean, noisy = (
+            self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both])
+            for both in motions
+        )
+        return np.nan_to_num(rms(noisy - clean, self.motion.known) ** 2)
+
+    def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
+        """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
+
+        A law of the velocity does not say at which velocity within a step it holds: its torque is uncertain by its slope times what the
+        velocity changes in the step. This counts where a sticking joint trembles. Of rows that are sampled at an instant
+        nothing is doubted.
+        """
+        motion, joint_motion = self.motion, self.joint_motion
+        if motion.recording.rows == "instantaneous":
+            return np.zeros(motion.blocks.joint_position.shape)
+        slope = np.zeros(joint_motion.velocity.shape)
+        for law in laws:
+            if not law.effect.has_memory:
+                slope += law.torque_and_slope(joint_motion)[1]
+        noise = joint_velocity_noise(motion.sensors)
+        change = np.diff(motion.signals.joint_velocity, axis=0) ** 2
+        real = np.maximum(block_means(change, motion.length) - 2 * noise**2, 0.0)
+        return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
+
+    def predict(self, effect: ResolvedEffect) -> np.ndarray:
+        """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are in the residual already."""
+        result = np.zeros((len(self.motion.time), self.rows))
+        if issubclass(effect.effect, JointTorqueEffect):
+            columns = self.joint_columns(
+                effect.effect, effect.nonlinear, np.arange(len(effect.targets))
+            )
+            amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
+            result[:, : len(effect.targets)] = np.einsum("pbn,pn->bn", columns, amounts)
+        elif issubclass(effect.effect, ContactEffect):
+            signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
+            result[:, signature.rows] = signature.values @ effect.linear[:, 0]
+        return result
+
+    @cached_property
+    def joint_motion(self) -> JointMotion:
+        """What joint torque effects depend on, step by step: (N - 1, n) each."""
+        return self._joint_motion_of(self.motion.signals)
+
+    @cached_property
+    def _joint_motions(self) -> Callable[[int], JointMotion]:
+        """The same averaged over so many steps."""
+        return cache(partial(_joined, self.joint_motion))
+
+    @cached_property
+    def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
+        """The same if the sensors' noise were in it once more."""
+        return cache(partial(_joined, self._joint_motion_of(self._noisier_signals)))
+
+    def _joint_motion_of(self, signals: SensorSignals) -> JointMotion:
+        motion = self.motion
+        velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
+        time = motion.start + np.arange(len(velocity) - 1) * motion.period
+        torque = self._without_noise(signals.torque_command)
+        at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
+        return JointMotion(
+            velocity=within_steps(velocity, motion.law_share),
+            position=at.joint_position,
+            command=at.torque_command,
+            time=time[:, None],
+            time_step=motion.period,
+            # A model whose inertia is not trusted does not know the load.
+            load=at.torque_command - (0.0 if self.scenario.identify.inertia else self._loss),
+        )
+
+    def _without_noise(self, torque: np.ndarray) -> np.ndarray:
+        """Torques (N, n) without frequencies in which the log has little but white noise: in a
+        regressor it would take off the noise of the residual, which is the same (errors in
+        variables). A command of exactly zero stays, for it may be a drive that is off."""
+        result = np.empty_like(torque)
+        for joint, corner in enumerate(self._torque_corners):
+            result[:, joint] = self.motion.low_passed(torque[:, joint], corner)
+        return np.where(torque == 0, 0.0, result)
+
+    @cached_property
+    def _torque_corners(self) -> list[float]:
+        """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
+        motion = self.motion
+        torque = motion.signals.torque_command
+        # What is missing in the model has next to no part in the noise of the rows.
+        noise = measured_noise(motion, motion.residual, ()).white[: torque.shape[1]]
+        variance = motion.torque_variance(torque).mean(axis=0) + noise
+        return noise_corners(torque, variance, motion.period)
+
+    @cached_property
+    def _loss(self) -> np.ndarray:
+        """What the links do not get of the command by the rigid model, smoothed over three blocks, step by step, (N - 1, n)."""
+        motion, n = self.motion, len(self.robot.joint_names)
+        loss = _smooth(motion.residual.value[:, :n])
+        time = (
+            motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
+        )
+        return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
+
+    def joint_columns(
+        self,
+        effect: type[JointTorqueEffect],
+        nonlinear: np.ndarray,
+        joints: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> np.ndarray:
+        """Torque of a joint effect per unit of each linear parameter, averaged over blocks.
+
+        Args:
+            nonlinear: (m, T), or (m, G, T) for G sets of values, for the joints.
+            joints: places of the joints, shape (T,).
+            noisier: with the sensors' noise once more.
+
+        Returns:
+            Shape (p, B, T), or (p, G, B, T).
+        """
+        # What remembers must see every step.
+        step = 1 if effect.has_memory else self._joined_steps
+        whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
+        motion = whole._replace(
+            **{
+                name: getattr(whole, name)[:, joints]
+                for name in ("velocity", "position", "command", "load")
+            }
+        )
+        if nonlinear.ndim == 2:
+            return self._averages(basis_over_time(effect, motion, nonlinear), step)
+        sets = max(1, _CHUNK // motion.velocity.size)
+        parts = [
+            self._averages(
+                basis_over_time(effect, motion, nonlinear[:, start : start + sets]), step
+            )
+            for start in range(0, nonlinear.shape[1], sets)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def _averages(self, columns: np.ndarray, step: int) -> np.ndarray:
+        """Averages over blocks of columns (..., M, T) that were evaluated once for so many steps, all at once."""
+        first = np.moveaxis(columns, -2, 0)
+        if step > 1:
+            return np.moveaxis(block_means(first, self.motion.length // step), 0, -2)
+        return np.moveaxis(self.motion.averages(first), 0, -2)
+
+    @property
+    def _joined_steps(self) -> int:
+        """How many steps may be averaged before a law is evaluated: in long blocks a law is evaluated often enough all the same."""
+        motion = self.motion
+        if motion.recording.recorded_cutoff > 0:
+            return 1
+        return max(
+            step
+            for step in range(1, max(1, motion.length // _EVALUATIONS) + 1)
+            if motion.length % step == 0
+        )
+
+    def signature(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> Signature:
+        """What an effect on one target adds to the residual per unit of each linear parameter.
+
+        Args:
+            nonlinear: values of the nonlinear parameters, shape (m,).
+        """
+        if issubclass(effect, JointTorqueEffect):
+            joint = self.robot.joint_names.index(target)
+            columns = self.joint_columns(effect, nonlinear[:, None], np.array([joint]))
+            return Signature(np.array([joint]), np.moveaxis(columns, 0, 2))
+        if issubclass(effect, ContactEffect):
+            values = self._contact_columns(effect)
+        else:
+            point = self._expansion_point(effect, target)
+            if point is not None:
+                values, offset = self._slopes(effect, target, point, nonlinear)
+                rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
+                return Signature(rows, values[:, rows], offset[:, rows])
+            names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+            units = np.diag([_probe(effect, name) for name in names])
+            columns = [
+                self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units
+            ]
+            values = _without_rounding(np.stack(columns, axis=2))
+        rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
+        return Signature(rows, values[:, rows])
+
+    @cached_property
+    def _smooth_blocks(self) -> Instants:
+        """Averages at which derivatives are taken."""
+        return self._smoothed(self.motion.blocks)
+
+    def _smoothed(self, blocks: Instants) -> Instants:
+        """Averages with accelerations that are smoothed further, for their noise is in the residual too. Not those of a recording that is
+        low-passed: little noise is left in them, and smoothing would take motion."""
+        if self.motion.recording.cutoff > 0:
+            return blocks
+        smooth = {
+            name: _smooth(getattr(blocks, name))
+            for name in ("joint_acceleration", "angular_acceleration")
+        }
+        return replace(blocks, **smooth)
+
+    @cached_property
+    def _residual_at_blocks(self) -> np.ndarray:
+        return self.motion.equation.residual(self._smooth_blocks)
+
+    @cached_property
+    def _noisier_signals(self) -> SensorSignals:
+        """The signals if the sensors' noise were in them once more."""
+        motion, sensors, random = self.motion, self.motion.sensors, np.random.default_rng(0)
+        noise = {
+            "joint_velocity": joint_velocity_noise(sensors),
+            "specific_force": sensors.imu.acceleration_noise,
+            "angular_velocity": sensors.imu.angular_velocity_noise,
+        }
+        more = {name: getattr(motion.signals, name) for name in noise}
+        added = {
+            name: values + noise[name] * random.standard_normal(values.shape)
+            for name, values in more.items()
+        }
+        noisy_force = motion.signals.pad_force + force_noise(
+            sensors.foot_force, self.robot, len(motion.signals.pad_force), random
+        )
+        torque = motion.signals.torque_command
+        deviation = np.sqrt(motion.torque_variance(torque) + self.noise.white[: torque.shape[1]])
+        noisy_torque = torque + deviation * random.standard_normal(torque.shape)
+        return replace(motion.signals, pad_force=noisy_force, torque_command=noisy_torque, **added)
+
+    @cached_property
+    def _noisier_blocks(self) -> Instants:
+        return averaged(self.motion.steps_of(self._noisier_signals), self.motion.length)
+
+    @cached_property
+    def noise_realization(self) -> np.ndarray:
+        """What that noise adds to the residual, (B, R)."""
+        return self.motion.equation.residual(self._noisier_blocks) - self.motion.equation.residual(
+            self.motion.blocks
+        )
+
+    def _expansion_point(self, effect: type[Effect], target: str) -> np.ndarray | None:
+        """Values about which the signature of an effect is taken first, (p,); None for zeros."""
+        if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
+            return None
+        return effect.expansion_point(self.robot.body(target))
+
+    def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
+        """What that noise adds to the signature of an inertia effect: regressors are measured too."""
+        point = self._expansion_point(effect, target)
+        if point is not None:
+            values, _ = self._slopes(effect, target, point, np.zeros(0), noisier=True)
+            return replace(clean, values=values[:, clean.rows] - clean.values, offset=0.0)
+        columns = np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
+        for k, name in enumerate(effect.parameters):
+            unit = _probe(effect, name)
+            columns[:, :, k] = (
+                self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True)
+                / unit
+            )
+        return replace(clean, values=columns[:, clean.rows] - clean.values)
+
+    def is_possible(self, effect: type[Effect], target: str, linear: np.ndarray) -> bool:
+        """Can a robot have an effect with these values? Not every inertia is that of a body."""
+        if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
+            return True
+        values = dict(zip(effect.parameters, ([value] for value in linear), strict=True))
+        return self.can_have([effect.from_values([target], values)])
+
+    def can_have(self, effects: Iterable[Effect]) -> bool:
+        """Can a robot have these effects beside those of the model?"""
+        try:
+            self._with(*effects)
+        except InputError:
+            return False
+        return True
+
+    def _with(self, *changes: Effect) -> EquationOfMotion:
+        """Of a model that has some effects as well.
+
+        Raises:
+            InputError: no robot has them.
+        """
+        believed = self.scenario.believed
+        more = {f"_change_{k}": change for k, change in enumerate(changes)}
+        return EquationOfMotion(build_robot(replace(believed, effects=believed.effects | more)))
+
+    def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
+        """What an inertia effect adds to the residual, (B, R)."""
+        blocks = self._smoothed(self._noisier_blocks) if noisier else self._smooth_blocks
+
+        def regressor(body: str) -> np.ndarray:
+            key = (body, noisier)
+            if key not in self._regressors:
+                self._regressors[key] = inertial_regressor(self.motion.equation, blocks, body)
+            return self._regressors[key]
+
+        added = inertia_addition(self.motion.equation, blocks, effect, regressor)
+        return np.pad(added, ((0, 0), (0, self.rows - added.shape[1])))
+
+    def signature_near(
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        elsewhere: Signature,
+    ) -> Signature:
+        """The signature of an inertia, geometry or sensor effect about values of its parameters, for what it adds is not quite linear.
+
+        Args:
+            linear, nonlinear: values of the parameters, shapes (p,) and (m,).
+            elsewhere: the signature about zero; it stays that of a contact effect.
+        """
+        if not issubclass(effect, InertiaEffect | GeometryEffect | SensorEffect):
+            return elsewhere
+        values, offset = self._slopes(effect, target, linear, nonlinear)
+        rows = elsewhere.rows
+        return replace(elsewhere, values=values[:, rows], offset=offset[:, rows])
+
+    def _slopes(
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What an inertia, geometry or sensor effect adds per unit of each parameter about some
+        values, (B, R, p), and what it adds with these values beyond that, (B, R)."""
+        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+        here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
+        slopes = []
+        for k, name in enumerate(names):
+            moved = linear.copy()
+            moved[k] += _probe(effect, name)
+            there = self._addition(effect, target, moved, nonlinear, noisier=noisier)
+            slopes.append((there - here) / _probe(effect, name))
+        values = _without_rounding(np.stack(slopes, axis=2))
+        return values, here - values @ linear
+
+    def _addition(
+        self,
+        effect: type[Effect],
+        target: str,
+        linear: np.ndarray,
+        nonlinear: np.ndarray,
+        *,
+        noisier: bool = False,
+    ) -> np.ndarray:
+        """What an inertia, geometry or sensor effect with these values adds to the residual, (B, R); an inertia effect also if the
+        sensors' noise were in its regressors once more."""
+        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+        fixed = [name for name in effect.parameters if name not in names]
+        values = {
+            name: [value]
+            for name, value in (
+                *zip(names, linear, strict=True),
+                *zip(fixed, nonlinear, strict=True),
+            )
+        }
+        changed = effect.from_values([target], values)
+        if issubclass(effect, InertiaEffect):
+            return self._inertia_addition(changed, noisier=noisier)
+        if issubclass(effect, GeometryEffect):
+            return self._residual_at_blocks - self._with(changed).residual(self._smooth_blocks)
+        # By taking the effect off the signals.
+        motion, resolved = self.motion, changed.resolve(self.robot.description)
+        signals = self._undone(resolved, self._memory(effect, resolved))
+        blocks = averaged(motion.steps_of(signals), motion.length)
+        return self._residual_at_blocks - motion.equation.residual(self._smoothed(blocks))
+
+    def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
+        """Signals that the effect turns into those of the log."""
+        return effect.effect.undone(
+            self.motion.signals, memory, effect, self.robot, self.motion.period
+        )
+
+    def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
+        """What an effect remembers over the log. It depends on the nonlinear parameters alone, where `undone` needs it."""
+        key = (effect, resolved.nonlinear.tobytes())
+        if key not in self._memories:
+            self._memories[key] = self._remembered(resolved)
+        return self._memories[key]
+
+    def _remembered(self, effect: ResolvedEffect) -> np.ndarray:
+        """What an effect remembers over the log, of torques without their white noise: it would become an acceleration.
+
+        A simulation of ours begins with no memory; any other log begins as if it had always been as it is then.
+        """
+        motion, signals = self.motion, self.motion.signals
+        torque = signals.torque_command
+        corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
+        smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]
+        signals = replace(signals, torque_command=np.stack(smooth, axis=1))
+        ours = self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
+        earlier = 0 if ours else round(_EARLIER / motion.period)
+        longer = {
+            name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
+            for name, values in vars(signals).items()
+        }
+        memory = effect.effect.memory_over_time(
+            SensorSignals(**longer), effect, self.robot, motion.period
+        )
+        return memory[:, earlier:]
+
+    def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
+        """By the motion of the standing soles that the effect predicts, (B, R, p)."""
+        if not self.robot.has_floating_base:
+            return np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
+        motions = [
+            effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces
+        ]
+        return np.moveaxis(
+            np.array(
+                [
+                    self._sole_rows([(r[k], d[k]) for r, d in motions])
+                    for k in range(len(motions[0][0]))
+                ]
+            ),
+            0,
+            2,
+        )
+
+    @cached_property
+    def _sample_time(self) -> np.ndarray:
+        return (
+            self.motion.start
+            + np.arange(len(self.motion.signals.joint_position)) * self.motion.period
+        )
+
+    @cached_property
+    def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return self._split_feet(self.motion.signals.pad_force)
+
+    def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pad forces (N, P, 3) with their springs' share as normal component, and places (P, 3) of each foot."""
+        pads, force = self.motion.equation.pads, pad_force.copy()
+        force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
+        return list(zip(pads.split(force), pads.split(pads.position), strict=True))
+
+    def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Kinematic rows for soles that move like this.
+
+        Args:
+            motions: rotation vector and displacement of each sole against level, still ground, in its frame, (N, 3) each.
+        """
+        motion, length, period = self.motion, self.motion.length, self.motion.period
+        result = np.zeros((len(motion.time), self.rows))
+        # A force that is the mean over the step that ends tells of a sole in that step, a sampled
+        # one of that instant; where that is in a step of the residual, and the motion's rate there.
+        share = motion.motion_share
+        posture, rate = (
+            (2 * share, 3 * share - 1) if motion.recording.rows == "per_step" else (0.5, 0.0)
+        )
+        place = result.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+        velocities = []
+        for rotation, displacement in motions:
+            turning, moving = (
+                np.diff(values, axis=0, append=values[-1:]) / period
+                for values in (rotation, displacement)
+            )
+            g = self.motion.equation.gravity
+            # R_WF^T g z for a sole turned by the rotation vector, less g z.
+            tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)
+            change = _later(moving, posture) - _later(moving, posture - 1)
+            result[:, place : place + 3] = block_means(_later(turning, rate)[:-1], length)
+            result[:, place + 3 : place + 6] = block_means(
+                (_later(tilt, posture) + change / period)[:-1], length
+            )
+            velocities.append(block_means(_later(moving, rate)[:-1], length))
+            place += 6
+        if len(motions) == 2:
+            left, right = (
+                np.einsum("bij,bj->bi", R_BF, v)
+                for R_BF, v in zip(self._sole_rotations, velocities, strict=True)
+            )
+            result[:, place:] = left - right
+        return result
+
+    @cached_property
+    def _sole_rotations(self) -> list[np.ndarray]:
+        """R_BF of each sole in every block, (B, 3, 3)."""
+        return self.motion.equation.sole_rotations(self.motion.blocks)
+
+    @cached_property
+    def _contact(self) -> PadContact:
+        return pad_contact(
+            self.scenario.believed.description, self.scenario.ground, self.scenario.plant
+        )
+
+    def ground_gives_way(self) -> np.ndarray:
+        """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""
+        sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
+        return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
+
+
+def noise_corners(torque: np.ndarray, variance: np.ndarray, period: float) -> list[float]:
+    """Frequency above which each joint's torque (N, n) is little but white noise [Hz]; 0 for none.
+
+    Args:
+        variance: of the noise of a sample, (n,).
+    """
+    window = min(len(torque), round(_SPECTRUM / period))
+    frequency, power = welch(torque, 1.0 / period, nperseg=window, axis=0)
+    corners = []
+    for density, white in zip(power.T, 2 * variance * period, strict=True):
+        above = np.flatnonzero(density > _ABOVE_NOISE * white)
+        last = above[-1] + 1 if len(above) else 1
+        corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
+    return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
+
+
+def _joined(motion: JointMotion, steps: int) -> JointMotion:
+    """Averages over so many steps."""
+    if steps == 1:
+        return motion
+    joined = {
+        name: block_means(getattr(motion, name), steps)
+        for name in ("velocity", "position", "command", "time", "load")
+    }
+    return motion._replace(**joined, time_step=steps * motion.time_step)
+
+
+def _later(values: np.ndarray, samples: float) -> np.ndarray:
+    """Samples (N, 3) so much later, interpolated; the ends are held."""
+    return shift(values, (-samples, 0), order=1, mode="nearest")
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Binomial smoothing over three blocks."""
+    padded = np.concatenate([values[:1], values, values[-1:]])
+    return 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
+
+
+def _without_rounding(values: np.ndarray) -> np.ndarray:
+    """Columns (..., p) in which nothing but the rounding of the others is left, made zero: they would ask for boundless parameters."""
+    largest = np.abs(values).max(axis=tuple(range(values.ndim - 1)))
+    return np.where(largest > _ROUNDING * largest.max(), values, 0.0)
+
+
+def _probe(effect: type[Effect], name: str) -> float:
+    """A small value of a parameter, to take derivatives with."""
+    return 0.01 * max(abs(bound) for bound in effect.parameters[name].plausible)

@@ -1,0 +1,222 @@
+"""Proposals: which candidates, alone, would take off enough of what an explanation leaves over."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.effects.actuation import TorqueBias
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+
+# How often a grid of nonlinear values is narrowed down around its best point, and to how many points.
+_NARROWINGS = 2
+_POINTS = 9
+# How often a candidate that is linear only nearby is made linear about the values that fit best.
+_EXPANSIONS = 3
+# So many numbers are kept in columns of candidates.
+_MOST_NUMBERS = 15_000_000
+# How often friction of all joints is fitted in turn.
+_SWEEPS = 3
+
+
+# What is said meanwhile.
+LOOKING = "looking for what explains more"
+
+
+class Proposals:
+    """Candidates that are worth a fit; see the module."""
+
+    def __init__(self, fits: Fits):
+        self.fits = fits
+        self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
+        self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
+
+    def promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
+        """Candidates that, alone, would take off enough of what an explanation leaves over.
+
+        Args:
+            rows: only those that change one of these; None for all.
+        """
+        fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
+        if rows is None:
+            rows = np.arange(len(beside.scale))
+        enough = 0.5 * fits.threshold[1]
+        known = {(c.effect, c.targets) for c in base.candidates}
+        result = [
+            self._settled(candidate, base)
+            for candidate in fits.fixed_candidates
+            if (candidate.effect, candidate.targets) not in known
+            and np.intersect1d(candidate.signature.rows, rows).size
+            and fixed_gain(beside, candidate) > 0.5 * fits.required(candidate)
+        ]
+        coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
+            group: [] for group in dictionary.groups
+        }
+        for k, effect in enumerate(dictionary.joint_effects):
+            dictionary.progress(LOOKING, 0.3 * k / len(dictionary.joint_effects))
+            taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
+            for group in dictionary.groups:
+                places = [dictionary.joints.index(joint) for joint in group]
+                if taken & set(group) or not np.intersect1d(places, rows).size:
+                    continue
+                gain = self._gain(effect, places, beside)
+                coarse[group].append((float(gain.max()), effect, int(gain.argmax())))
+        for group, found in coarse.items():
+            # What the grid shows far behind the best does not catch up between its points.
+            # (A share of measured torque seems to explain more than it does.)
+            honest = (
+                gain
+                for gain, effect, _ in found
+                if dictionary.per_step or not dictionary.takes_torque(effect)
+            )
+            least = max(enough, 0.4 * max(honest, default=0.0))
+            for gain, effect, best in found:
+                if gain > least:
+                    dictionary.progress(LOOKING, 0.3)
+                    result.append(self._best_on(effect, group, best, beside))
+        return result
+
+    def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
+        """A candidate made linear about the values that fit best beside an explanation, if it is linear only nearby."""
+        if not candidate.effect.linear_nearby:
+            return candidate
+
+        def made() -> Candidate:
+            settled = candidate
+            for _ in range(_EXPANSIONS):
+                wider = self.fits.explain([*base.candidates, settled])
+                start = wider.start(settled)
+                values = wider.fit.parameters[start : start + len(settled.linear_names)]
+                settled = self.fits.about(settled, values)
+            return settled
+
+        return self._found.or_made((candidate, base), made)
+
+    def plain_friction(self) -> Explanation:
+        """Coulomb and viscous friction and a bias in every joint, fitted together; what identification of inertia begins with."""
+        explanation = self.fits.explain([])
+        for k in range(_SWEEPS):
+            for effect in (CoulombViscousFriction, TorqueBias):
+                self.fits.dictionary.progress("fitting plain friction", k / _SWEEPS)
+                for joint in self.fits.dictionary.joints:
+                    others = [
+                        c
+                        for c in explanation.candidates
+                        if (c.effect, c.targets) != (effect, (joint,))
+                    ]
+                    explanation = self.beside(self.fits.explain(others), effect, (joint,))
+        return explanation
+
+    def beside(
+        self, base: Explanation, effect: type[JointTorqueEffect], targets: tuple[str, ...]
+    ) -> Explanation:
+        """An explanation with one more joint torque effect, with the nonlinear values that fit best beside it."""
+        remainder = self.fits.remainder(base)
+        places = [self.fits.dictionary.joints.index(joint) for joint in targets]
+        gain = self._gain(effect, places, remainder)
+        best = self._best_on(effect, targets, int(gain.argmax()), remainder)
+        return self.fits.explain([*base.candidates, best])
+
+    def _gain(
+        self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
+    ) -> np.ndarray:
+        """Drop of the sum of squares for each set of an effect's first grid, in joints at these places together, (G,)."""
+        grid, moments = self.fits.grid(effect), []
+        for place in places:
+            # Found once for what an explanation has in a row.
+            key = (effect, place, *beside.beside(place).key)
+            if key not in self._moments:
+                sets = grid.sets[place]
+                self._moments[key] = beside.moments_of_sets(sets.signature, 0, sets.gram)
+            moments.append(self._moments[key])
+        return grid_gain(effect, *_weighted(moments, beside.scale[places]))
+
+    def _best_on(
+        self,
+        effect: type[JointTorqueEffect],
+        group: tuple[str, ...],
+        best: int,
+        beside: Remainder,
+    ) -> Candidate:
+        """A joint torque effect with the nonlinear values that fit best; found once for what is left in the group's rows."""
+        places = [self.fits.dictionary.joints.index(joint) for joint in group]
+        key = (effect, group, *(part for j in places for part in beside.beside(j).key))
+
+        def made() -> Candidate:
+            nonlinear = self._narrowed(effect, places, best, beside)
+            return self.fits.candidate(effect, group, nonlinear, beside)
+
+        return self._found.or_made(key, made)
+
+    def _narrowed(
+        self,
+        effect: type[JointTorqueEffect],
+        places: Sequence[int],
+        best: int,
+        beside: Remainder,
+    ) -> np.ndarray:
+        """Nonlinear values between the grid's points that fit best, shape (m,)."""
+        dictionary = self.fits.dictionary
+        points = self.fits.grid(effect).points[..., places[0]]
+        chosen = points[:, best].copy()
+        parameters = dictionary.parameters(effect, dictionary.joints[places[0]])
+        ranges = [p.plausible for p in parameters.values() if not p.linear]
+        steps = []
+        for axis in points:
+            values = np.unique(axis)
+            steps.append(np.log(values[1] / values[0]) if len(values) > 1 else 0.0)
+        for _ in range(_NARROWINGS):
+            for k in range(len(chosen)):
+                if steps[k] == 0:
+                    continue
+                trial = np.repeat(chosen[:, None], _POINTS, axis=1)
+                trial[k] = np.clip(
+                    chosen[k] * np.exp(np.linspace(-steps[k], steps[k], _POINTS)), *ranges[k]
+                )
+                found = [self.fits.sets(effect, place, trial) for place in places]
+                moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in found]
+                gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
+                chosen[k] = trial[k, int(gain.argmax())]
+                steps[k] *= 2.0 / (_POINTS - 1)
+        return chosen
+
+
+def _weighted(
+    moments: Sequence[tuple[np.ndarray, np.ndarray]], scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over rows of inner products, weighted by the inverse of the rows' scales."""
+    grams, rights = zip(*moments, strict=True)
+    return (
+        sum(part / s for part, s in zip(grams, scale, strict=True)),
+        sum(part / s for part, s in zip(rights, scale, strict=True)),
+    )
+
+
+def fixed_gain(beside: Remainder, candidate: Candidate) -> float:
+    """Drop of the sum of squares by a candidate that is no joint torque effect, roughly."""
+    s = candidate.signature
+    moments = [beside.moments(s, k) for k in range(len(s.rows))]
+    gram, right = _weighted(moments, beside.scale[s.rows])
+    return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+
+
+def grid_gain(effect: type[Effect], gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Drop of the sum of squares for each set of nonlinear values, shape (G,)."""
+    if not any(parameter.linear for parameter in effect.parameters.values()):
+        return 2 * right[:, 0] - gram[:, 0, 0]
+    if right.shape[1] == 1:
+        parameter = next(p for p in effect.parameters.values() if p.linear)
+        theta = np.divide(
+            right[:, 0], gram[:, 0, 0], out=np.zeros(len(right)), where=gram[:, 0, 0] > 1e-12
+        )
+        theta = np.clip(theta, *parameter.bounds)
+        return 2 * theta * right[:, 0] - theta**2 * gram[:, 0, 0]
+    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(
+        gram.shape[1]
+    ) + 1e-12 * np.eye(gram.shape[1])
+    return np.einsum("gp,gp->g", right, np.linalg.solve(gram + ridge, right[:, :, None])[:, :, 0])

@@ -1,0 +1,165 @@
+"""What becomes of an explanation that is taken at its word: linear about its own values, with possible bodies, added to the model."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Explanation
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.identification.inertial import (
+    IdentifiedInertia,
+    consistent_parameters,
+    identified_inertia,
+)
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.effects.geometry import GeometryEffect
+from fbse_drake.effects.inertia import InertiaEffect
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.errors import InputError
+
+# How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
+_POLISHINGS = 3
+# How often untrusted bodies are measured anew, at most.
+_REMEASUREMENTS = 3
+
+
+def polished(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation made linear about the values that its fit found."""
+    moved, start = [], 0
+    for candidate in explanation.candidates:
+        size, m = candidate.signature.values.shape[2], len(candidate.nonlinear)
+        shift = explanation.fit.parameters[start + size - m : start + size]
+        start += size
+        if not issubclass(candidate.effect, JointTorqueEffect):
+            values = explanation.fit.parameters[start - size : start]
+            try:
+                moved.append(fits.about(candidate, values))
+            except InputError:
+                # No body has these values.
+                return explanation
+            continue
+        if m == 0:
+            moved.append(candidate)
+            continue
+        rest = fits.explain([c for c in explanation.candidates if c is not candidate])
+        ranges = np.array(
+            [candidate.parameters[name].plausible for name in candidate.nonlinear_names]
+        )
+        # The slopes hold nearby.
+        near = np.clip(
+            candidate.nonlinear + shift, 0.6 * candidate.nonlinear, 1.6 * candidate.nonlinear
+        )
+        nonlinear = np.clip(near, 0.5 * ranges[:, 0], 2.0 * ranges[:, 1])
+        moved.append(
+            fits.candidate(candidate.effect, candidate.targets, nonlinear, fits.remainder(rest))
+        )
+    result = fits.explain(moved)
+    return result if result.deviance <= explanation.deviance + COMPLEXITY else explanation
+
+
+def consistent(
+    fits: Fits, explanation: Explanation
+) -> tuple[Explanation, IdentifiedInertia | None]:
+    """An explanation whose bodies some distribution of mass has, and what it says of their inertia.
+
+    Nonlinear parameters are moved to where they fit, and held there.
+    """
+    if fits.dictionary.inertia is None:
+        return explanation, None
+    for _ in range(_POLISHINGS):
+        explanation = polished(fits, explanation)
+    signatures = [
+        *(c.signature for c in explanation.candidates),
+        fits.white.whiten_signature(fits.dictionary.inertia.signature()),
+    ]
+    sizes = [s.values.shape[2] for s in signatures]
+    weight = 1.0 / np.sqrt(fits.white.scale(explanation.sse))
+    X, y = np.zeros((*fits.white.y.shape, sum(sizes))), fits.white.y.copy()
+    prior, lowest, free = (
+        np.zeros(sum(sizes)),
+        np.full(sum(sizes), -np.inf),
+        np.ones(sum(sizes), dtype=bool),
+    )
+    stops = np.cumsum(sizes)
+    for s, start, stop in zip(signatures, stops - sizes, stops, strict=True):
+        X[:, s.rows, start:stop], prior[start:stop], lowest[start:stop] = (
+            s.values,
+            s.prior,
+            s.lowest,
+        )
+        y[:, s.rows] -= s.offset
+    for candidate, stop in zip(explanation.candidates, stops, strict=False):
+        if issubclass(candidate.effect, JointTorqueEffect):
+            free[stop - len(candidate.nonlinear) : stop] = False
+    bodies = len(fits.dictionary.inertia.model)
+    of_free = (X * weight[:, None]).reshape(-1, sum(sizes))[:, free]
+    others, z = consistent_parameters(
+        of_free,
+        (y * weight).ravel(),
+        prior[free],
+        lowest[free][:-bodies],
+        fits.dictionary.inertia.own,
+    )
+    parameters = np.zeros(sum(sizes))
+    parameters[free] = np.concatenate([others, z])
+    sse = ((y - X @ parameters) ** 2).sum(axis=0) * fits.torque_factor(
+        explanation.candidates, parameters
+    )
+    fit = replace(
+        explanation.fit,
+        parameters=np.concatenate([parameters[:-bodies], fits.dictionary.directions.T @ z]),
+        sse=sse,
+    )
+    identified = identified_inertia(
+        fits.dictionary.inertia, fits.white, explanation.fit, z, fits.dictionary.directions
+    )
+    return replace(explanation, fit=fit, sse=sse), identified
+
+
+def remeasured(fits: Fits) -> Fits:
+    """Fits in which what the log says clearly of untrusted bodies is not held back by the belief in the model.
+
+    Plain friction is fitted along; see `inertial` for bodies that are in conflict with the model.
+    """
+    for _ in range(_REMEASUREMENTS):
+        if fits.dictionary.inertia is None:
+            break
+        _, found = consistent(fits, Proposals(fits).plain_friction())
+        inertia = fits.dictionary.inertia.measured_by(found.change)
+        if inertia is fits.dictionary.inertia:
+            break
+        fits = Fits(fits.dictionary.with_inertia(inertia), fits.white)
+    return fits
+
+
+def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedResidual, np.ndarray]:
+    """An explanation when its inertia, geometry and sensor effects are in the model, where it has any; the residual that is
+    measured by; and what is left of it, whitened, (B, R).
+
+    An impact shows a heavy foot's mass only if accelerations are not smoothed, noise grows with the masses, and which soles stand is
+    seen when the forces are set right.
+    """
+    if fits.dictionary.inertia is not None or not any(
+        issubclass(c.effect, InertiaEffect | GeometryEffect | SensorEffect)
+        for c in explanation.candidates
+    ):
+        return explanation, fits.white, fits.leftover(explanation)
+    scenario = fits.dictionary.predictor.scenario
+    found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
+    believed = replace(scenario.believed, effects=scenario.believed.effects | found)
+    white = WhitenedResidual(
+        Predictor(replace(scenario, model=believed), fits.dictionary.predictor.log).residual
+    )
+    # As many squares as before; what is held out exceeds them by as much as it did.
+    share = fits.white.count / np.maximum(white.count, 1)
+    sse = white.sse * share * fits.torque_factor(explanation.candidates, explanation.fit.parameters)
+    return (
+        replace(
+            explanation, sse=sse, held_out_sse=sse + explanation.held_out_sse - explanation.sse
+        ),
+        white,
+        white.y,
+    )

@@ -1,0 +1,189 @@
+"""What an explanation leaves of a residual, and what further columns could take of it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fbse_drake.discrepancy.identification.regression import Regression, Signature
+
+# Directions with less than this share of the largest inner product are there by rounding alone.
+_SINGULAR = 1e-12
+# Of a column of which no more than this share is left beside others nothing is left.
+_ROUNDING = 1e-10
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """The columns that an explanation has in one row."""
+
+    # Those with columns there, and the place of the row in each.
+    signatures: tuple[Signature, ...]
+    # Of each column, 1 for an offset, (Q,); and which have a parameter.
+    amounts: np.ndarray
+    fitted: np.ndarray
+    # Of the fitted columns X: a root of what stands for (X^T X)^-1, (P, k), and what a fit to what is left would change in the parameters.
+    root: np.ndarray
+    shift: np.ndarray
+
+    @cached_property
+    def key(self) -> tuple[object, ...]:
+        """Equal for explanations that are equal in this row."""
+        return (*self.signatures, self.amounts.tobytes(), self.shift.tobytes(), self.root.tobytes())
+
+
+class Remainder:
+    """What an explanation leaves.
+
+    Of new columns x in one row its columns X there leave x - X (X^T X)^-1 X^T x. Columns of inertia however tie all
+    rows together: with all columns X, rows one below the other and weighted, new columns in row r keep
+    x^T x - x^T X_r (X^T X)^-1 X_r^T x of their sum of squares.
+    """
+
+    def __init__(
+        self,
+        regression: Regression,
+        signatures: tuple[Signature, ...],
+        parameters: np.ndarray,
+        scale: np.ndarray,
+        *,
+        tied: bool,
+    ):
+        """What is left.
+
+        Args:
+            signatures: of the explanation, whitened, and their parameters.
+            scale: what the noise of each row is to be multiplied with, (R,).
+            tied: are all rows tied together?
+        """
+        self._regression, self._signatures, self.scale = regression, signatures, scale
+        stops = np.cumsum([s.values.shape[2] for s in signatures], dtype=int)
+        self._slices = [
+            slice(stop - s.values.shape[2], stop) for s, stop in zip(signatures, stops, strict=True)
+        ]
+        self._parameters, self._tied = parameters, tied and bool(signatures)
+        self._rows: dict[int, _Beside] = {}
+
+    def beside(self, row: int) -> _Beside:
+        """What the explanation has in a row."""
+        if row not in self._rows:
+            self._rows[row] = self._beside(row)
+        return self._rows[row]
+
+    def moments(self, signature: Signature, place: int) -> tuple[np.ndarray, np.ndarray]:
+        """Inner products of a signature's columns in one of its rows, with each other (p, p) and with what is left (p,), of the parts that
+        the explanation leaves."""
+        within = self._regression.products(signature, signature)[2][place]
+        gram, right = self.moments_of_sets(signature, place, within[None])
+        return gram[0], right[0]
+
+    def moments_of_sets(
+        self, signature: Signature, place: int, gram: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same for G sets of p columns each, one set after the other.
+
+        Args:
+            gram: inner products within each set, (G, p, p).
+
+        Returns:
+            Shapes (G, p, p) and (G, p).
+        """
+        beside = self.beside(int(signature.rows[place]))
+        right = self._regression.right(signature)[place]
+        sets = gram.shape[:2]
+        if beside.signatures:
+            cross = np.concatenate(
+                [self._cross(signature, place, other) for other in beside.signatures],
+                axis=1,
+            )
+            of_fitted = cross[:, beside.fitted]
+            right = right - cross @ beside.amounts - of_fitted @ beside.shift
+            taken = (of_fitted @ beside.root).reshape(*sets, -1)
+            left = gram - taken @ np.swapaxes(taken, 1, 2)
+            gone = np.einsum("gpp->gp", left) < _ROUNDING * np.einsum("gpp->gp", gram)
+            right = np.where(gone, 0.0, right.reshape(sets))
+            gram = np.where(gone[:, :, None] | gone[:, None, :], 0.0, left)
+        return gram, right.reshape(sets)
+
+    def _cross(self, signature: Signature, place: int, other: Signature) -> np.ndarray:
+        of_new, _, products = self._regression.products(signature, other)
+        return products[np.flatnonzero(of_new == place)[0]]
+
+    def _beside(self, row: int) -> _Beside:
+        there = [k for k, s in enumerate(self._signatures) if row in s.rows]
+        signatures = tuple(self._signatures[k] for k in there)
+        if not signatures:
+            return _Beside((), np.zeros(0), np.zeros(0, bool), np.zeros((0, 0)), np.zeros(0))
+        gram, right, fitted = self._row_moments(row, signatures)
+        amounts = np.ones(len(right))
+        amounts[fitted] = np.concatenate([self._parameters[self._slices[k]] for k in there])
+        if self._tied:
+            at = np.concatenate([np.arange(len(self._parameters))[self._slices[k]] for k in there])
+            inverse, correction = self._of_all
+            root = _root(inverse[np.ix_(at, at)] / self.scale[row])
+            return _Beside(signatures, amounts, fitted, root, correction[at])
+        root = _inverse_root(gram[np.ix_(fitted, fitted)])
+        left = right[fitted] - gram[fitted] @ amounts
+        return _Beside(signatures, amounts, fitted, root, root @ (root.T @ left))
+
+    def _row_moments(
+        self, row: int, signatures: tuple[Signature, ...]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Inner products of an explanation's columns in a row with each other and with the residual; which have a parameter."""
+        places = [int(np.flatnonzero(s.rows == row)[0]) for s in signatures]
+        rights = [
+            self._regression.target(s)[:, place].sum(axis=0)
+            for s, place in zip(signatures, places, strict=True)
+        ]
+        fitted = np.concatenate(
+            [
+                np.arange(len(right)) < s.values.shape[2]
+                for s, right in zip(signatures, rights, strict=True)
+            ]
+        )
+        stops = np.cumsum([len(right) for right in rights])
+        gram = np.zeros((stops[-1], stops[-1]))
+        for i, a in enumerate(signatures):
+            for j, b in enumerate(signatures[: i + 1]):
+                of_a, _, products = self._regression.gram(a, b)
+                block = products[:, np.flatnonzero(of_a == places[i])[0]].sum(axis=0)
+                rows = slice(stops[i] - len(rights[i]), stops[i])
+                columns = slice(stops[j] - len(rights[j]), stops[j])
+                gram[rows, columns], gram[columns, rows] = block, block.T
+        return gram, np.concatenate(rights), fitted
+
+    @cached_property
+    def _of_all(self) -> tuple[np.ndarray, np.ndarray]:
+        """(X^T X)^-1 of all columns in all rows, weighted, and what a fit without any prior would change in the parameters."""
+        size = len(self._parameters)
+        gram, left = np.zeros((size, size)), np.zeros(size)
+        for row in range(len(self.scale)):
+            there = [k for k, s in enumerate(self._signatures) if row in s.rows]
+            if not there:
+                continue
+            moments, right, fitted = self._row_moments(
+                row, tuple(self._signatures[k] for k in there)
+            )
+            at = np.concatenate([np.arange(size)[self._slices[k]] for k in there])
+            amounts = np.ones(len(right))
+            amounts[fitted] = self._parameters[at]
+            gram[np.ix_(at, at)] += moments[np.ix_(fitted, fitted)] / self.scale[row]
+            left[at] += (right[fitted] - moments[fitted] @ amounts) / self.scale[row]
+        root = _inverse_root(gram)
+        return root @ root.T, root @ (root.T @ left)
+
+
+def _inverse_root(gram: np.ndarray) -> np.ndarray:
+    """L with L L^T = gram^-1, (P, k), without directions that are there by rounding."""
+    norm = np.sqrt(np.diag(gram))
+    norm[norm == 0] = 1.0
+    power, directions = np.linalg.eigh(gram / np.outer(norm, norm))
+    seen = power > _SINGULAR * max(power.max(), 0.0)
+    return directions[:, seen] / np.sqrt(power[seen]) / norm[:, None]
+
+
+def _root(inverse: np.ndarray) -> np.ndarray:
+    """L with L L^T equal to a positive semidefinite matrix, (P, k)."""
+    power, directions = np.linalg.eigh(inverse)
+    seen = power > 0
+    return directions[:, seen] * np.sqrt(power[seen])

@@ -1,0 +1,132 @@
+"""Rivals: other effects in the place of a member of an explanation, each at the values that fit it best.
+
+Far from zero an effect is not what its slope at zero says: a crooked IMU that is linearised there looks worse than the bias that it
+resembles. So a rival is fitted by itself, nonlinear parameters and all, before it is compared.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import polished
+from fbse_drake.discrepancy.diagnosis.selection import best_additions
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.errors import InputError
+
+# So many rivals of each member are fitted by themselves, and so often at most.
+_FITTED, _ROUNDS = 4, 3
+# Values of a nonlinear parameter that are tried over its plausible range, and how often the best is sought between its neighbours.
+_POINTS, _NARROWINGS = 5, 2
+
+
+def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
+    """For each member: explanations with another effect in its place, or the same on another body, which comes last; best first. One
+    for each effect and targets; the best of them fitted by themselves."""
+    fits, result = proposals.fits, {}
+    for k, member in enumerate(final.candidates):
+        fits.dictionary.progress("fitting what looks alike", k / len(final.candidates))
+        rest = fits.explain([c for c in final.candidates if c is not member])
+        additions = [
+            e
+            for e in best_additions(proposals, rest, member.signature.rows)
+            if len(e.candidates) == len(final.candidates) and rival_name(e.candidates[-1], member)
+        ]
+        found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]
+        result[k] = sorted(found, key=lambda e: e.deviance)
+    return result
+
+
+def rival_name(rival: Candidate, member: Candidate) -> str:
+    """What a rival of a member is called: another effect, or the same on another body; empty if it is neither."""
+    if rival.effect is not member.effect:
+        return rival.name
+    on_bodies = rival.effect.acts_on == "body" and rival.targets != member.targets
+    return f"{rival.name} on {rival.targets[0]}" if on_bodies else ""
+
+
+def equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
+    """Does a rival explain as much as the final explanation?
+
+    One with fewer parameters does also if chance may have brought what the final explanation has more.
+    """
+    more = len(final.fit.parameters) - len(rival.fit.parameters)
+    least = fits.threshold[min(12, more)] if more > 0 else MARGIN
+    return rival.deviance < final.deviance + least
+
+
+def settled(
+    proposals: Proposals, final: Explanation
+) -> tuple[Explanation, dict[int, list[Explanation]]]:
+    """An explanation whose members no rival beats, and their rivals."""
+    fits, found = proposals.fits, rivals(proposals, final)
+    for _ in range(_ROUNDS):
+        better = [
+            e
+            for k, of_member in found.items()
+            for e in of_member
+            if e.deviance < final.deviance - MARGIN
+            and not _contains(e.candidates[-1].effect, final.candidates[k].effect)
+            and fits.dictionary.predictor.can_have(e.effects)
+        ]
+        if not better:
+            break
+        final = min(better, key=lambda e: e.deviance)
+        found = rivals(proposals, final)
+    return final, found
+
+
+def _contains(law: type[Effect], other: type[Effect]) -> bool:
+    """Is a law a larger one? Whether it pays was asked before."""
+    return issubclass(law, JointTorqueEffect) and any(other in r.effects for r in law.reductions)
+
+
+def fitted(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation at the values that fit it best, found by Gauss-Newton steps, and for its last member by a search over what is
+    nonlinear in it."""
+    best = _searched(fits, explanation)
+    for _ in range(_ROUNDS):
+        moved = polished(fits, best)
+        if not moved.deviance < best.deviance - 1.0:
+            break
+        best = moved
+    return best
+
+
+def _searched(fits: Fits, explanation: Explanation) -> Explanation:
+    """With the nonlinear parameters of the last member, one after the other, where they fit best. Those of joint torque effects were
+    searched for already."""
+    best, member = explanation, explanation.candidates[-1]
+    if issubclass(member.effect, JointTorqueEffect):
+        return explanation
+    for k, name in enumerate(member.nonlinear_names):
+        low, high = member.parameters[name].plausible
+        values = np.geomspace(low, high, _POINTS)
+        for _ in range(1 + _NARROWINGS):
+            found = [_with_nonlinear(fits, best, k, value) for value in values]
+            best = min([best, *found], key=lambda e: e.deviance)
+            here, width = best.candidates[-1].nonlinear[k], values[1] / values[0]
+            values = here * np.array([width**-0.5, width**0.5])
+    return best
+
+
+def _with_nonlinear(fits: Fits, explanation: Explanation, k: int, value: float) -> Explanation:
+    """With another value of a nonlinear parameter of the last member."""
+    *others, member = explanation.candidates
+    nonlinear = member.nonlinear.copy()
+    nonlinear[k] = value
+    start = explanation.start(member)
+    linear = explanation.fit.parameters[start : start + len(member.linear_names)]
+    try:
+        raw = fits.dictionary.predictor.signature_near(
+            member.effect, member.targets[0], linear, nonlinear, member.raw
+        )
+    except InputError:
+        return explanation
+    signature = fits.white.whiten_signature(raw)
+    return fits.explain(
+        [*others, replace(member, nonlinear=nonlinear, source=raw, signature=signature)]
+    )

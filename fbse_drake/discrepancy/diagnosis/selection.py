@@ -1,0 +1,239 @@
+"""Selection of effects: which additions to an explanation are significant, and forward selection among them."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import polished
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import BodyMass
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import FootForceGain
+
+# No explanation has more parts than this.
+_MOST_EFFECTS = 16
+# What an effect takes off a row may be wrong by this share; so small a rest is no evidence of another effect.
+_MISFIT = 0.02
+# A value may lie beyond the plausible range by this factor.
+_IMPLAUSIBLE = 3.0
+
+
+def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
+    """Explanations by forward selection, from none to the last that improves significantly.
+
+    The residual is weighed anew with every addition.
+
+    Yields:
+        After every addition, before and after what was there already is checked beside it: all explanations so far, and the
+        proposals for the last.
+    """
+    proposals = Proposals(fits)
+    path = [fits.explain([])]
+    yield [*path], proposals
+    if fits.dictionary.inertia is not None:
+        fits, explanation = fits.doubting(_pruned(fits, proposals.plain_friction()))
+        proposals = Proposals(fits)
+        path.append(explanation)
+        yield [*path], proposals
+    while len(path[-1].candidates) < _MOST_EFFECTS:
+        base = path[-1]
+        additions = best_additions(proposals, base)
+        if not additions:
+            break
+        chosen = _spread(fits, additions)
+        yield [*path, chosen], proposals
+        chosen = _revise(proposals, chosen)
+        if chosen.deviance > base.deviance - MARGIN:
+            yield [*path], proposals
+            break
+        weighed, explanation = fits.doubting(chosen)
+        if weighed is not fits:
+            fits, proposals = weighed, Proposals(weighed)
+        path.append(polished(fits, explanation))
+        yield [*path], proposals
+
+
+def best_additions(
+    proposals: Proposals, base: Explanation, rows: np.ndarray | None = None
+) -> list[Explanation]:
+    """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
+
+    Joints of both legs may be wrong together, and one alone look like something else: `_pairs` are tried too.
+
+    Args:
+        rows: only candidates that change one of these; by default all.
+    """
+    fits = proposals.fits
+    promising, found = proposals.promising(base, rows), []
+    tried = [*([candidate] for candidate in promising), *_pairs(fits, promising)]
+    for k, added in enumerate(tried):
+        fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
+        everything = [*base.candidates, *added]
+        if _loses_scale(fits, everything):
+            continue
+        wider = fits.explain(everything)
+        without = (
+            base if len(added) == 1 else fits.explain([c for c in everything if c is not member])
+            for member in added
+        )
+        if all(
+            is_significant(fits, rest, wider, member)
+            for rest, member in zip(without, added, strict=True)
+        ):
+            found.append(wider)
+    return sorted(found, key=lambda e: e.deviance)
+
+
+def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Candidates in joints that are no joint torque effects, each with its like on the other legs; with values of their own."""
+    alike = dict.fromkeys(
+        map(fits.dictionary.predictor.robot.description.counterparts, fits.dictionary.joints)
+    )
+    found = {
+        (c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)
+    }
+    result = []
+    for effect in dict.fromkeys(c.effect for c in candidates):
+        for targets in alike:
+            members = [found.get((effect, (target,))) for target in targets]
+            if len(members) > 1 and None not in members:
+                result.append(members)
+    return result
+
+
+def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
+    """Could everything be nothing? Without torques only the masses and the gains of the feet say how large forces are: if all of them
+    are free, the smallest robot with the deafest feet explains every log."""
+    names = fits.dictionary.predictor.robot.description
+    gained = {side for c in candidates if c.effect is FootForceGain for side in c.targets}
+    torques = any(fits.white.count[: len(names.joint_names)])
+    return (
+        bool(names.sides)
+        and not torques
+        and gained == set(names.sides)
+        and any(c.effect is BodyMass for c in candidates)
+    )
+
+
+def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
+    """Does a candidate bring more than chance to an explanation without it, with values that can be?"""
+    rows = added.signature.rows
+    if issubclass(added.effect, JointTorqueEffect) and not np.any(
+        added.effect.shows_within(fits.dictionary.travel[rows], added.nonlinear)
+    ):
+        return False
+    if base.deviance - wider.deviance < fits.required(added):
+        return False
+    taken, gained = (
+        float(np.maximum(a[rows] - b[rows], 0.0).sum())
+        for a, b in ((fits.white.sse, base.sse), (base.sse, wider.sse))
+    )
+    if fits.dictionary.per_step and gained < _MISFIT * taken:
+        return False
+    start = wider.start(added)
+    names = added.linear_names if added.has_linear else added.nonlinear_names
+    offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
+    part = slice(start, start + len(names))
+    values = wider.fit.parameters[part] + offsets
+    for k, (name, value) in enumerate(zip(names, values, strict=True)):
+        low, high = added.parameters[name].bounds
+        plausible = added.parameters[name].plausible
+        widest = max(abs(bound) for bound in plausible)
+        if low <= value <= high and abs(value) <= widest:
+            continue
+        deviation, (least, most) = wider.fit.deviation[part][k], wider.fit.interval()[part][k]
+        allowed = 3 * deviation
+        if not issubclass(added.effect, JointTorqueEffect):
+            # Masses, places and offsets have sizes that a bad fit does not widen.
+            allowed = min(allowed, _IMPLAUSIBLE * widest)
+        if (
+            value < low
+            or value > high + 3 * deviation
+            or abs(value) > _IMPLAUSIBLE * widest + allowed
+        ):
+            return False
+        # What is not told from nothing may not be implausible as well.
+        if abs(value) > widest and least <= 0 <= most:
+            return False
+    return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
+
+
+def _pruned(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation without the members that bring no more than chance."""
+    for member in explanation.candidates:
+        rest = fits.explain([c for c in explanation.candidates if c is not member])
+        if not is_significant(fits, rest, fits.explain([*rest.candidates, member]), member):
+            explanation = rest
+    return explanation
+
+
+def _spread(fits: Fits, additions: list[Explanation]) -> Explanation:
+    """The best addition, with the same effect on all further joints where nothing else explains more.
+
+    Joints that share values get values of their own if that explains more; then a simpler effect may do as well.
+    """
+    best = _simplest(additions)
+    added, others = best.candidates[-1], best.candidates[:-1]
+    if not issubclass(added.effect, JointTorqueEffect):
+        return best
+    by_joint: dict[str, list[Explanation]] = {}
+    for explanation in additions:
+        candidate = explanation.candidates[-1]
+        if len(candidate.targets) == 1 and issubclass(candidate.effect, JointTorqueEffect):
+            by_joint.setdefault(candidate.targets[0], []).append(explanation)
+
+    def alone(effect: type[Effect], joint: str) -> list[Explanation]:
+        return [e for e in by_joint.get(joint, []) if e.candidates[-1].effect is effect]
+
+    if len(added.targets) > 1:
+        simple = [
+            _simplest(by_joint[joint]).candidates[-1].effect
+            for joint in added.targets
+            if joint in by_joint
+        ]
+        options = [best]
+        for effect in dict.fromkeys([added.effect, *simple]):
+            own = [e.candidates[-1] for joint in added.targets for e in alone(effect, joint)]
+            options += [fits.explain([*others, *own])] if own else []
+        best = _simplest(sorted(options, key=lambda e: e.deviance))
+    effect = best.candidates[-1].effect
+    chosen, taken = (
+        [*best.candidates],
+        {target for c in best.candidates if c.effect is effect for target in c.targets},
+    )
+    for joint, there in by_joint.items():
+        same = alone(effect, joint)
+        if joint not in taken and same and same[0].deviance < there[0].deviance + MARGIN:
+            chosen.append(same[0].candidates[-1])
+    return fits.explain(chosen) if len(chosen) > len(best.candidates) else best
+
+
+def _simplest(additions: list[Explanation]) -> Explanation:
+    """The best addition; among those that are told apart by nobody, the one with the fewest parameters."""
+    equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
+    return min(equal, key=lambda e: len(e.fit.parameters))
+
+
+def _revise(proposals: Proposals, explanation: Explanation) -> Explanation:
+    """Tries every member that shares a row with another one against all others in its place, until nothing improves."""
+    improved = True
+    while improved:
+        improved = False
+        for k, member in enumerate(explanation.candidates):
+            proposals.fits.dictionary.progress(
+                "checking what was found", k / len(explanation.candidates)
+            )
+            others = [c for c in explanation.candidates if c is not member]
+            rows = member.signature.rows
+            if not any(np.intersect1d(rows, c.signature.rows).size for c in others):
+                continue
+            rest = proposals.fits.explain(others)
+            additions = best_additions(proposals, rest, rows)
+            best = _simplest(additions) if additions else rest
+            if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
+                explanation, improved = best, True
+                break
+    return explanation

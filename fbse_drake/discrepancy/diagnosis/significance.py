@@ -1,0 +1,62 @@
+"""Which findings matter: their size beside the torques, forces and motions of the rows that they are in.
+
+What is significant statistically may be too small for anybody to care: long logs with little noise show a millionth of a radian.
+"""
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.identification.structure import Structure
+from fbse_drake.discrepancy.residual.residual import rms
+
+
+class Significance:
+    """Sizes of effects over one log as shares of what the log's rows are made of."""
+
+    def __init__(self, predictor: Predictor):
+        """Measures the log.
+
+        Joint rows are measured by their torque, base rows by what the feet give, those of soles by how fast single joints turn and
+        move them, and by gravity.
+        """
+        motion, equation = predictor.motion, predictor.motion.equation
+        blocks, rows = motion.blocks, motion.residual.rows
+        self._known = motion.known
+        self._sizes = np.full(len(rows), np.nan)
+        n = len(predictor.robot.joint_names)
+        self._sizes[:n] = rms(blocks.torque_command, motion.known[:, :n])
+        if predictor.robot.has_floating_base:
+            wrench = equation.feet_wrench(blocks)
+            # A sole that stays level is turned to and fro by joints that cancel each other.
+            legs = np.sqrt((equation.joint_shares(blocks) ** 2).sum(axis=3)).reshape(-1, 6)
+            for kind, size in (
+                ("base/moment", _length(wrench[:, :3])),
+                ("base/force", _length(wrench[:, 3:])),
+                ("sole/angular_velocity", _length(legs[:, :3])),
+                ("sole/specific_force", equation.gravity),
+                ("soles/relative_velocity", _length(legs[:, 3:])),
+            ):
+                self._sizes[[kind in row.name for row in rows]] = size
+
+    def share(self, explanation: Explanation, candidate: Candidate) -> float:
+        """Largest root mean square of what a member of an explanation adds to a row, as a share of its size; NaN if no row has one."""
+        start, raw = explanation.start(candidate), candidate.raw
+        parameters = explanation.fit.parameters[start : start + raw.values.shape[2]]
+        added = rms(raw.values @ parameters + raw.offset, self._known[:, raw.rows])
+        sizes = self._sizes[raw.rows]
+        measured = np.isfinite(sizes) & np.isfinite(added) & (sizes > 0)
+        return float((added[measured] / sizes[measured]).max()) if measured.any() else np.nan
+
+    def left_share(self, structure: Structure, white: WhitenedResidual) -> float:
+        """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it has none."""
+        noise = white.residual.noise_floor[structure.index]
+        return float(
+            np.sqrt(max(structure.ratio**2 - 1.0, 0.0)) * noise / self._sizes[structure.index]
+        )
+
+
+def _length(vectors: np.ndarray) -> float:
+    """Root mean square of the lengths of vectors (M, 3)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))

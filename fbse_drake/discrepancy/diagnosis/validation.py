@@ -1,0 +1,145 @@
+"""Errors of models: is a completed one better on data that was set aside before anything was looked at?
+
+Both models are put against the same blocks, weighted by the same noise, so that what both do not
+know cancels in the change of the error. Its intervals are those of a ratio of sums by batch means:
+consecutive blocks are taken together until their sums are hardly correlated (with B blocks, a
+multiple of sqrt(B) at a time; Flegal and Jones 2010).
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.stats import t as student
+
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.regression import STRETCH
+from fbse_drake.discrepancy.residual.residual import rms
+
+# Of the intervals.
+LEVEL = 0.95
+# Fewer batches say nothing of how much an error scatters.
+_FEWEST_BATCHES = 4
+
+Course = Literal["falls", "rises", "unclear"]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number that a log gives, with its 95 % interval."""
+
+    value: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Errors of a model as given and completed on one log that nothing was fitted to."""
+
+    # Root mean square of all rows in multiples of the sensors' noise, and the second over the first.
+    before: Measured
+    after: Measured
+    change: Measured
+    # |residual| / |torque|, 2-norms over all joints, and the second over the first; NaN without torques.
+    relative_before: Measured
+    relative_after: Measured
+    relative_change: Measured
+
+    @property
+    def course(self) -> Course:
+        """`falls` or `rises` if the interval of the change says so; one that rises counts more."""
+        changes = [c for c in (self.change, self.relative_change) if np.isfinite(c.value)]
+        if any(c.interval[0] > 1.0 for c in changes):
+            return "rises"
+        return "falls" if self.change.interval[1] < 1.0 else "unclear"
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """What a model leaves over on one log, averaged over blocks (`recording.block`)."""
+
+    # |residual| / |torque|, 2-norms over all joints, and of each joint; NaN without torques.
+    relative: float
+    relative_by_joint: dict[str, float]
+    # Root mean square of every row, in its unit.
+    rms: dict[str, float]
+
+
+def model_error(predictor: Predictor) -> ModelError:
+    """What the model of a predictor leaves over on its log."""
+    residual, n = predictor.residual, len(predictor.robot.joint_names)
+    known = residual.known[:, :n]
+    left, torque = (
+        rms(values[:, :n], known) * np.sqrt(known.sum(axis=0))
+        for values in (residual.value, residual.signals.torque_command)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_joint = dict(zip(predictor.robot.joint_names, (left / torque).tolist(), strict=True))
+        relative = float(np.sqrt(np.nansum(left**2)) / np.sqrt(np.nansum(torque**2)))
+    of_rows = rms(residual.value, residual.known).tolist()
+    return ModelError(
+        relative, by_joint, dict(zip((row.name for row in residual.rows), of_rows, strict=True))
+    )
+
+
+def validated(given: Predictor, completed: Predictor) -> Validation:
+    """Compares two models on the log that both predict."""
+    first, last, n = given.residual, completed.residual, len(given.robot.joint_names)
+    known = first.known & last.known
+    # A row without any noise, as from ideal sensors, is still told apart from rounding.
+    noise = np.maximum(first.variance, 1e-18)
+    before, after = (
+        np.where(known, residual.value**2 / noise, 0.0).sum(axis=1) for residual in (first, last)
+    )
+    of_joints = known[:, :n]
+    left, left_after, torque = (
+        np.where(of_joints, values[:, :n] ** 2, 0.0).sum(axis=1)
+        for values in (first.value, last.value, first.signals.torque_command)
+    )
+    batch = batch_length(len(first.time), first.time[1] - first.time[0])
+    return Validation(
+        root_of_ratio(before, known.sum(axis=1), batch),
+        root_of_ratio(after, known.sum(axis=1), batch),
+        root_of_ratio(after, before, batch),
+        root_of_ratio(left, torque, batch),
+        root_of_ratio(left_after, torque, batch),
+        root_of_ratio(left_after, left, batch),
+    )
+
+
+def batch_length(blocks: int, block: float) -> int:
+    """How many blocks are taken together, of so many that are so long [s]."""
+    return max(round(STRETCH / block), int(2 * np.sqrt(blocks)), 1)
+
+
+def root_of_ratio(above: np.ndarray, below: np.ndarray, batch: int) -> Measured:
+    """Root of the ratio of two sums over B blocks, with its interval by batch means.
+
+    Args:
+        above, below: not negative, (B,).
+        batch: so many blocks are taken together; a rest at the end goes to the last batch.
+    """
+    edges = np.arange(max(1, len(above) // batch)) * batch
+    over, under = (np.add.reduceat(values, edges) for values in (above, below))
+    over, under = over[under > 0], under[under > 0]
+    if not len(under):
+        return Measured(np.nan, (np.nan, np.nan))
+    ratio, count = float(over.sum() / under.sum()), len(under)
+    spread = np.inf
+    if count >= _FEWEST_BATCHES and ratio > 0:
+        scatter = float(((over - ratio * under) ** 2).sum()) * count / (count - 1)
+        spread = np.sqrt(scatter) / float(over.sum())
+    # Of the logarithm, which is nearly normal where a ratio of sums of squares is not; half of it,
+    # for the root.
+    half = 0.5 * float(student.ppf((1 + LEVEL) / 2, count - 1)) * spread if count > 1 else np.inf
+    root = float(np.sqrt(ratio))
+    return Measured(root, (root * float(np.exp(-half)), root * float(np.exp(half))))
+
+
+def validation_json(validation: Validation) -> dict[str, Any]:
+    """As it stands in diagnosis.json and study.json, under `set_aside` and the name of a log."""
+    numbers = {
+        name: {"value": number.value, "interval": list(number.interval)}
+        for name, number in vars(validation).items()
+    }
+    return {"course": validation.course, "level": LEVEL, **numbers}

@@ -1,0 +1,143 @@
+"""What no effect of the library explains: is anything left in a residual, where, and which variable does it live in?"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.residual.residual import RecordedMotion
+
+# Pieces of a piecewise linear function of one variable.
+_PIECES = 8
+# A row whose held-out residual exceeds the sensors' noise by more than this factor has something left.
+EXCESS = 1.2
+# Drop of the held-out deviance at which a smooth function of several variables counts as found, beside what is doubted about known laws.
+_DROP = 25.0
+# How many times as large as it was taken the doubt about known laws may be.
+_DOUBT = 3.0
+# Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
+_KINEMATIC_EXCESS = 3.0
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is left in one row."""
+
+    row: str
+    # Place of the row.
+    index: int
+    # Root mean square of what is left, in multiples of the sensors' noise.
+    ratio: float
+    # Variable that explains most of it: position, velocity, load, acceleration, time or phase; and the share that it explains.
+    variable: str
+    share: float
+
+
+def leftover_structure(
+    motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray
+) -> list[Structure]:
+    """Rows in which more than noise is left.
+
+    Args:
+        white: the residual by which it is measured.
+        left: what is left of it, (B, R).
+    """
+    result = []
+    for k, row in enumerate(white.residual.rows):
+        if white.count[k] < 50:
+            continue
+        ratio = float(np.sqrt((left[:, k] ** 2).sum() / white.count[k]))
+        variables = _variables(motion, white, k)
+        if row.kind == "kinematic":
+            if ratio < _KINEMATIC_EXCESS:
+                continue
+        else:
+            everything = np.concatenate(list(variables.values()), axis=1)
+            tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
+            if (
+                ratio < tolerated
+                and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]
+            ):
+                continue
+        excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
+        shares = {
+            name: _explained(white, left, k, basis) / excess for name, basis in variables.items()
+        }
+        best = max(shares, key=lambda name: shares[name])
+        result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
+    return result
+
+
+def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
+    """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces) each."""
+    blocks, n = motion.blocks, len(motion.robot.joint_names)
+    result = {"time": hat_functions(motion.time)}
+
+    def without_own_noise(values: np.ndarray) -> np.ndarray:
+        # The noise of a block is in its residual too: its neighbours beyond the next ones tell what was measured without it.
+        padded = np.concatenate([values[:1]] * 3 + [values] + [values[-1:]] * 3)
+        n = len(values)
+        return 0.25 * (padded[:n] + padded[1 : n + 1] + padded[5 : n + 5] + padded[6 : n + 6])
+
+    if row < n:
+        velocity = without_own_noise(blocks.joint_velocity[:, row])
+        result["position"] = hat_functions(blocks.joint_position[:, row])
+        # Fine near standstill, coarse elsewhere.
+        result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
+        result["load"] = hat_functions(without_own_noise(blocks.torque_command[:, row]))
+        result["acceleration"] = hat_functions(
+            np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row]))
+        )
+        others = [j for j in range(n) if j != row]
+        result["other joints' torque"] = blocks.torque_command[:, others]
+    else:
+        result["angular velocity"] = without_own_noise(blocks.angular_velocity)
+        result["specific force"] = without_own_noise(blocks.specific_force)
+    result["phase"] = white.residual.standing.astype(float)
+    return result
+
+
+def hat_functions(x: np.ndarray) -> np.ndarray:
+    """Piecewise linear functions with knots at the quantiles of x, (B, pieces); they sum to one."""
+    knots = np.unique(np.quantile(x, np.linspace(0, 1, _PIECES + 1)))
+    if len(knots) < 2:
+        return np.ones((len(x), 1))
+    return np.stack([np.interp(x, knots, np.eye(len(knots))[k]) for k in range(len(knots))], axis=1)
+
+
+def _fit(
+    white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray
+) -> tuple[float, float]:
+    """Sums of squares of a row on held-out data, without and with a smooth function."""
+    X = white.whiten(row, basis)
+    X = X[:, np.abs(X).max(axis=0) > 0]
+    y = left[:, row]
+    parts = [(X[white.fold == fold], y[white.fold == fold]) for fold in range(white.fold.max() + 1)]
+    grams, rights = [A.T @ A for A, _ in parts], [A.T @ b for A, b in parts]
+    gram, right = sum(grams), sum(rights)
+    ridge = 1e-3 * np.diag(np.diag(gram))
+    left_over = [
+        b - A @ np.linalg.solve(gram - G + ridge, right - r)
+        for (A, b), G, r in zip(parts, grams, rights, strict=True)
+    ]
+    held_out = np.concatenate(left_over)
+    return float((y**2).sum()), float((held_out**2).sum())
+
+
+def _drop(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    count = white.count[row]
+    before, after = (max(sse / count, 1e-9) for sse in _fit(white, left, row, basis))
+    return float(
+        count
+        * (
+            np.log(max(before, 1))
+            + before / max(before, 1)
+            - np.log(max(after, 1))
+            - after / max(after, 1)
+        )
+    )
+
+
+def _explained(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:
+    before, after = _fit(white, left, row, basis)
+    return before - after

@@ -1,0 +1,219 @@
+"""How noisy the rows of a residual are: white noise shows in differences of neighbours, of which what
+is missing in a model has next to nothing."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import toeplitz
+from scipy.special import comb
+from scipy.stats import chi2
+
+from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
+from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, residual_rows, rms
+from fbse_drake.log import Log
+from fbse_drake.scenario import RecordingConfig, SensorsConfig
+
+# Order of the differences of neighbours, and their number in a window.
+_ORDER, _WINDOW = 4, 20
+# Impacts and trembling joints are no noise: this quantile of windows, and of a channel's components,
+# counts. It is as good as the mean of that share of the windows.
+_QUIET, _EFFICIENCY = 0.25, 0.54
+# Orders at which a channel's noise is measured; of what is not white, the lower shows this factor more.
+_ORDERS, _WHITE = (3, 6), 1.1
+# Smallest factor of a row's noise that is worth a word, and probability of saying so of any by chance.
+_LEAST, _FALSE_ALARM = 1.15, 1e-3
+# The same of a channel, in which motion that is as fast as noise may be most of the excess.
+_LEAST_OF_CHANNEL = 1.3
+# Variance below which a row without any noise is rounding.
+_ROUNDING = 1e-18
+# Share of the torque below which noise that nobody believes in is not worth a word.
+_NEGLIGIBLE = 1e-3
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What a log shows of its white noise beyond what is believed."""
+
+    # Channels of sensors that are noisier.
+    channels: tuple[NoiseLevel, ...]
+    # Variance of a step's white noise to be added in each of R rows to that of the sensors, (R,).
+    white: np.ndarray
+    # What averages over blocks differ from their neighbours, over what is believed; 1 where that may
+    # be right, (R,).
+    factor: np.ndarray
+
+
+@dataclass(frozen=True)
+class Power:
+    """Variance of white noise over what is believed, and its degrees of freedom, (R,) each; NaN
+    where nobody knows."""
+
+    ratio: np.ndarray
+    freedom: np.ndarray
+
+
+def noise_power(
+    values: np.ndarray,
+    known: np.ndarray,
+    believed: np.ndarray,
+    order: int = _ORDER,
+) -> Power:
+    """Compares differences of neighbours with what is believed of them, in windows.
+
+    Args:
+        values, known: (N, R) each.
+        believed: mean square of a difference, normalised for white noise, (N, R).
+        order: of the differences.
+    """
+    differences = np.diff(values, order, axis=0) / np.sqrt(comb(2 * order, order))
+    gaps = np.cumsum(np.vstack([np.zeros((1, known.shape[1])), ~known]), axis=0)
+    whole = gaps[order + 1 :] == gaps[: -order - 1]
+    lags = np.arange(_WINDOW)
+    correlation = np.where(
+        lags <= order, comb(2 * order, order + lags) / comb(2 * order, order), 0.0
+    )
+    # Of the mean of so many squares that are correlated like this.
+    freedom = _WINDOW**2 / (toeplitz(correlation) ** 2).sum()
+    typical = chi2.ppf(_QUIET, freedom) / freedom
+    ratio, windows = np.full((2, known.shape[1]), np.nan)
+    for row in range(known.shape[1]):
+        index = np.flatnonzero(whole[:, row])
+        count = len(index) // _WINDOW
+        if count < 2:
+            continue
+        index = index[: count * _WINDOW].reshape(count, _WINDOW)
+        expected = believed[index + order // 2, row].mean(axis=1)
+        power = (differences[index, row] ** 2).mean(axis=1)
+        ratio[row] = np.quantile(power / np.maximum(expected, _ROUNDING), _QUIET) / typical
+        windows[row] = count
+    return Power(ratio, _EFFICIENCY * freedom * windows)
+
+
+def measured_sensors(
+    sensors: SensorsConfig, recording: RecordingConfig, log: Log
+) -> tuple[SensorsConfig, tuple[NoiseLevel, ...]]:
+    """Sensors with the noise that their channels have where it is more than is believed, and these
+    channels. Torques are left out: they answer the noise of sensors, and are none for that."""
+    encoders, imu, feet = sensors.encoders, sensors.imu, sensors.foot_force
+    usual = ("joint/velocity", "imu/linear_acceleration", "imu/angular_velocity")
+    believed = dict(
+        zip(
+            usual,
+            (encoders.velocity_noise, imu.acceleration_noise, imu.angular_velocity_noise),
+            strict=True,
+        )
+    )
+    for name in log.channels:
+        if name.startswith("foot/") and name.endswith(("/pad_force", "/wrench")):
+            believed[name] = feet.noise
+    if encoders.velocity != "exact" or recording.velocity != "measured":
+        del believed["joint/velocity"]
+    noisier = []
+    for name, expected in believed.items():
+        level = channel_noise(log, name) if name in log else np.nan
+        if level > _LEAST_OF_CHANNEL * expected:
+            noisier.append(NoiseLevel(name, level, log.unit(name), expected))
+    level_of = believed | {noise.channel: noise.level for noise in noisier}
+    feet_level = max((v for name, v in level_of.items() if name.startswith("foot/")), default=0.0)
+    velocity = level_of.get("joint/velocity", encoders.velocity_noise)
+    measured = replace(
+        sensors,
+        encoders=replace(encoders, velocity_noise=velocity),
+        imu=replace(
+            imu,
+            acceleration_noise=level_of["imu/linear_acceleration"],
+            angular_velocity_noise=level_of["imu/angular_velocity"],
+        ),
+        foot_force=replace(feet, noise=max(feet_level, feet.noise)),
+    )
+    return measured, tuple(noisier)
+
+
+def channel_noise(log: Log, name: str) -> float:
+    """Standard deviation of the white noise of a channel's quieter components; NaN if not white."""
+    values = log[name].reshape(len(log.time), -1)
+    values = values[:, 3:] if name.endswith("/wrench") else values
+    known = np.ones(len(log.time), dtype=bool)
+    known[1:] = np.diff(log.time) < 1.5 * float(log.meta["period"])
+    known = np.repeat(known[:, None], values.shape[1], axis=1)
+    low, high = (
+        np.sqrt(noise_power(values, known, np.ones(values.shape), order).ratio) for order in _ORDERS
+    )
+    white = low < _WHITE * high
+    return float(np.quantile(high[white], _QUIET)) if white.any() else np.nan
+
+
+def measured_noise(
+    motion: RecordedMotion, residual: Residual, channels: tuple[NoiseLevel, ...]
+) -> Noise:
+    """Noise of rows whose averages over blocks differ more from their neighbours than is believed.
+
+    What the torques of some joints have more than is believed, those of others are taken to have,
+    too, if it would not show in them.
+
+    Args:
+        residual: of the log, less the effects that are known.
+        channels: that are noisier than the scenario believes; the residual's noise is theirs.
+    """
+    length, rows = motion.length, residual.value.shape[1]
+    believed = np.maximum(
+        residual.variance - 2 * _ORDER / (_ORDER + 1) * residual.covariance, _ROUNDING
+    )
+    power = noise_power(residual.value, residual.known, believed)
+    least = chi2.isf(_FALSE_ALARM / rows, power.freedom) / power.freedom
+    noisy = power.ratio > np.maximum(least, _LEAST**2)
+    typical = np.nan_to_num(rms(np.sqrt(believed), residual.known)) ** 2
+    ratio = np.where(noisy, power.ratio, 1.0)
+    white = (ratio - 1) * typical * length
+
+    torque = motion.torque_variance(motion.blocks.torque_command)
+    n = torque.shape[1]
+    torque = np.nan_to_num(rms(np.sqrt(torque), residual.known[:, :n])) ** 2
+    telling = noisy[:n] & (torque > 0)
+    if telling.any():
+        share = float(np.median(white[:n][telling] / torque[telling]))
+        for row in np.flatnonzero(~noisy[:n]):
+            more = 1 + share * torque[row] / length / typical[row]
+            if np.log(more / power.ratio[row]) < 2 * np.sqrt(2 / power.freedom[row]):
+                white[row], ratio[row] = share * torque[row], more
+    return Noise(channels, white, np.sqrt(ratio))
+
+
+def noise_finding(motion: RecordedMotion, noise: Noise) -> HygieneFinding | None:
+    """Says what is noisier than is believed; None if nothing is.
+
+    Where no noise is believed, what is next to nothing beside the torque is not worth a word.
+    """
+    parts = [
+        f"{c.channel} has white noise of {c.level:.2g} {c.unit} a sample, "
+        f"{c.level / c.believed:.3g} times what the scenario believes"
+        for c in noise.channels
+        if c.believed > 0
+    ]
+    rows, n = residual_rows(motion.robot), len(motion.robot.joint_names)
+    torque = motion.blocks.torque_command
+    torque_noise = np.sqrt(motion.torque_variance(torque).mean(axis=0) + noise.white[:n])
+    worth = motion.step_noise[0].mean(axis=0) + motion.step_noise[1].mean(axis=0) > _ROUNDING
+    worth[:n] |= torque_noise > _NEGLIGIBLE * rms(torque, motion.known[:, :n])
+    said = [int(k) for k in np.argsort(-noise.factor) if noise.factor[k] > 1 and worth[k]]
+    names = [rows[k].name for k in said]
+    if said:
+        text = f"{names[0]} and {len(said) - 1} more rows are" if said[1:] else f"{names[0]} is"
+        text += f" {noise.factor[said[0]]:.3g} times as noisy from block to block as is believed"
+        if said[0] < n:
+            text += f", as if its torque had noise of {torque_noise[said[0]]:.2g} "
+            text += f"{rows[said[0]].unit} a sample (recording.torque_noise)"
+        parts.append(text)
+    if not parts:
+        return None
+    factors = [c.level / c.believed for c in noise.channels if c.believed > 0]
+    factors += [float(noise.factor[k]) for k in said]
+    return remark(
+        "noise_level",
+        "warning",
+        "noise",
+        max(factors),
+        "1",
+        "; ".join([*parts, "what was measured is used"]),
+        [*(c.channel for c in noise.channels if c.believed > 0), *names],
+    )

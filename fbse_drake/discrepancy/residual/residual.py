@@ -1,0 +1,769 @@
+"""What the equation of motion leaves over on a log: joint, base and kinematic residuals, with the noise that the sensors put into them.
+
+Per plant step, with the base's origin at rest and the measured specific force in the place of gravity (see `estimators.floating_base`):
+
+    joint and base rows   S tau - (H v_dot + C v - J_m^T f_m)     torque that the motors gave and the links did not get [Nm];
+                                                                  six unactuated rows [Nm, N], which no joint effect can touch
+    kinematic rows        of every standing sole, in its frame: angular velocity, and specific force less that of a level resting sole;
+                          while both feet stand also the velocity of one sole relative to the other
+
+All are averaged over blocks of time. Averages of one and the same window have one group delay, telescope what is differentiated, and leave
+noise whose covariance is known: white noise (accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
+average of order one, so that each row's covariance is tridiagonal.
+"""
+
+import fnmatch
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import pairwise
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from scipy.ndimage import binary_erosion
+from scipy.signal import butter, sosfiltfilt
+
+from fbse_drake.discrepancy.residual.integration import integration_step
+from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.effects.sensor import SensorSignals
+from fbse_drake.errors import InputError
+from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import RecordingConfig, SensorsConfig
+from fbse_drake.sensors.foot_force import wrench_deviations
+from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
+
+# Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
+_ORDER, _PADDING = 4, 100
+# A sole stands still while it carries more than this share of the weight, and each of its pads this one.
+_STANDING = 0.15
+_STANDING_PAD = 0.01
+# Soles settle for this long at the start of a log [s]. A foot that has just touched down, or is about to lift, may still roll over an edge:
+# its sole is not at rest in this time [s].
+_SETTLING, _ROLLING = 0.1, 0.03
+_AXES = ("x", "y", "z")
+# Results that the equation of motion keeps of each of its functions, and instants that are computed at once: Jacobians take room.
+_REMEMBERED = 3
+_MOST_INSTANTS = 20_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One residual channel."""
+
+    # As `left_knee_pitch`, `base/force_z`, `left_sole/angular_velocity_x`.
+    name: str
+    # `joint`, `base` or `kinematic`.
+    kind: str
+    unit: str
+
+
+def residual_rows(robot: Robot) -> list[Row]:
+    """The residual's rows for a robot, in order."""
+    rows = [
+        Row(name, "joint", unit)
+        for name, unit in zip(robot.joint_names, robot.torque_units, strict=True)
+    ]
+    if not robot.has_floating_base:
+        return rows
+    rows += [
+        Row(f"base/{kind}_{axis}", "base", unit)
+        for kind, unit in (("moment", "Nm"), ("force", "N"))
+        for axis in _AXES
+    ]
+    for side in robot.description.sides:
+        kinds = (("angular_velocity", "rad/s"), ("specific_force", "m/s^2"))
+        rows += [
+            Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit)
+            for kind, unit in kinds
+            for axis in _AXES
+        ]
+    if len(robot.description.sides) == 2:
+        rows += [Row(f"soles/relative_velocity_{axis}", "kinematic", "m/s") for axis in _AXES]
+    return rows
+
+
+def read_signals(
+    robot: Robot, log: Log, recording: RecordingConfig
+) -> tuple[SensorSignals, np.ndarray]:
+    """Sensor channels of a log on an even grid of its nominal period.
+
+    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced; without
+    `joint/torque_command` torques are 0.
+
+    Returns:
+        The signals, N samples, and which of them are measured (not interpolated over a gap), shape (N,).
+
+    Raises:
+        InputError: other joints than the model's, missing IMU or foot channels of a floating robot.
+    """
+    if log.joints != robot.joint_names:
+        raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
+    period, time = float(log.meta["period"]), log.time
+    grid = time[0] + np.arange(round((time[-1] - time[0]) / period) + 1) * period
+    even = len(grid) == len(time) and np.allclose(grid, time, rtol=0, atol=1e-6 * period)
+    after = (
+        np.clip(np.searchsorted(time, grid - 1e-9 * period), 1, len(time) - 1)
+        if len(time) > 1
+        else np.zeros(1, dtype=int)
+    )
+    known = np.ones(len(grid), dtype=bool)
+    if not even:
+        known = (time[after] - time[after - 1] < 1.5 * period) | (
+            time[after] - grid < 1e-3 * period
+        )
+    # What is smoothed or differenced is not so across the switching of a drive, where torques jump.
+    latest = np.clip(np.searchsorted(time, grid + 1e-9 * period) - 1, 0, None)
+    stretches = _stretches(known, log["joint/enabled"][latest] if "joint/enabled" in log else None)
+
+    def low_passed(values: np.ndarray) -> np.ndarray:
+        return _low_passed(values, recording.cutoff, period, stretches)
+
+    def on_grid(values: np.ndarray) -> np.ndarray:
+        if even:
+            return low_passed(values)
+        share = ((grid - time[after - 1]) / (time[after] - time[after - 1])).clip(0.0, 1.0)
+        share = share.reshape(-1, *[1] * (values.ndim - 1))
+        return low_passed((1 - share) * values[after - 1] + share * values[after])
+
+    def held(values: np.ndarray) -> np.ndarray:
+        return low_passed(values if even else values[latest])
+
+    def rate(values: np.ndarray) -> np.ndarray:
+        result = np.zeros_like(values)
+        for stretch in stretches:
+            if len(values[stretch]) > 1:
+                result[stretch] = np.gradient(values[stretch], period, axis=0)
+        return result
+
+    zeros = np.zeros((len(grid), 3))
+    specific_force = angular_velocity = zeros
+    pad_force = np.zeros((len(grid), len(FootPads(robot).foot), 3))
+    if robot.has_floating_base:
+        for name in ("imu/linear_acceleration", "imu/angular_velocity"):
+            if name not in log:
+                raise InputError(
+                    f"the log has no channel {name}, which the residual of a floating robot needs"
+                )
+        specific_force, angular_velocity = (
+            on_grid(log["imu/linear_acceleration"]),
+            on_grid(log["imu/angular_velocity"]),
+        )
+        pad_force = on_grid(measured_pad_forces(robot, log))
+    q = on_grid(log["joint/position"])
+    measured = "joint/velocity" in log and recording.velocity == "measured"
+    torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
+    signals = SensorSignals(
+        joint_position=q,
+        joint_velocity=on_grid(log["joint/velocity"]) if measured else rate(q),
+        specific_force=specific_force,
+        angular_velocity=angular_velocity,
+        pad_force=pad_force,
+        torque_command=on_grid(torque) if recording.rows == "instantaneous" else held(torque),
+    )
+    return signals, known
+
+
+def _low_passed(
+    values: np.ndarray, cutoff: float, period: float, stretches: list[slice]
+) -> np.ndarray:
+    """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a corner of 0."""
+    if cutoff == 0:
+        return values
+    result = values.copy()
+    filter_ = _butterworth(cutoff, period)
+    for stretch in stretches:
+        result[stretch] = sosfiltfilt(
+            filter_, values[stretch], axis=0, padlen=min(len(values[stretch]) - 1, _PADDING)
+        )
+    return result
+
+
+@cache
+def _butterworth(cutoff: float, period: float) -> np.ndarray:
+    return butter(_ORDER, cutoff, fs=1 / period, output="sos")
+
+
+def _stretches(known: np.ndarray, enabled: np.ndarray | None = None) -> list[slice]:
+    """Runs of samples between gaps, in which no drive is switched on or off.
+
+    Args:
+        enabled: which drives are on, (N, n).
+    """
+    switched = np.zeros(len(known), dtype=bool)
+    if enabled is not None:
+        switched[1:] = np.any(np.diff(enabled, axis=0) != 0, axis=1)
+    run = np.where(known, 1 + np.cumsum(switched), 0)
+    edges = np.flatnonzero(np.diff(run, prepend=0, append=0))
+    return [slice(start, stop) for start, stop in pairwise(edges) if known[start]]
+
+
+@dataclass(frozen=True)
+class Instants:
+    """What the equation of motion needs at M instants; IMU quantities in the IMU frame."""
+
+    joint_position: np.ndarray
+    joint_velocity: np.ndarray
+    joint_acceleration: np.ndarray
+    angular_velocity: np.ndarray
+    angular_acceleration: np.ndarray
+    specific_force: np.ndarray
+    # (M, P, 3) [N].
+    pad_force: np.ndarray
+    torque_command: np.ndarray
+
+
+def steps(
+    signals: SensorSignals, period: float, rows: str = "per_step", integration_step: float = 0.0
+) -> Instants:
+    """Every step between two samples, M = N - 1, see `RecordingConfig.rows`.
+
+    Of samples per step the command counts that was held over the step, accelerations and forces are
+    those over it, and posture and velocities those amid it; a simulation has its forces from where
+    its own, semi-implicit steps began, which is half of such a step earlier. Of instantaneous
+    samples all is taken amid the step.
+
+    Args:
+        integration_step: see the function `integration_step`.
+    """
+    if rows == "instantaneous":
+        middle = {name: 0.5 * (values[1:] + values[:-1]) for name, values in vars(signals).items()}
+        return Instants(
+            joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
+            angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
+            **middle,
+        )
+    share = 0.5 - 0.5 * integration_step / period
+    return Instants(
+        joint_position=within_steps(signals.joint_position, share),
+        joint_velocity=within_steps(signals.joint_velocity, share),
+        joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
+        angular_velocity=within_steps(signals.angular_velocity, share),
+        angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
+        specific_force=signals.specific_force[1:],
+        pad_force=signals.pad_force[1:],
+        torque_command=signals.torque_command[:-1],
+    )
+
+
+def within_steps(values: np.ndarray, share: float) -> np.ndarray:
+    """Samples (N, ...) interpolated in every step, (N - 1, ...): at its start for a share of 0, at
+    its end for 1."""
+    return (1.0 - share) * values[:-1] + share * values[1:]
+
+
+def block_means(values: np.ndarray, length: int) -> np.ndarray:
+    """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at the end is dropped."""
+    blocks = len(values) // length
+    return values[: blocks * length].reshape(blocks, length, *values.shape[1:]).mean(axis=1)
+
+
+def averaged(instants: Instants, length: int) -> Instants:
+    """The instants averaged over blocks."""
+    return Instants(
+        **{name: block_means(values, length) for name, values in vars(instants).items()}
+    )
+
+
+class _Remembered:
+    """A function of arrays that remembers its last results."""
+
+    def __init__(self, function: Callable[..., np.ndarray]):
+        self._function = function
+        self._results: Memory[np.ndarray] = Memory(_REMEMBERED)
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        key = tuple(array.tobytes() for array in arrays)
+        return self._results.or_made(key, lambda: self._function(*arrays))
+
+
+class EquationOfMotion:
+    """The residual's rows for one model; see the module."""
+
+    def __init__(self, robot: Robot):
+        self.robot, plant = robot, robot.plant
+        self._context = plant.CreateDefaultContext()
+        self.pads = FootPads(robot)
+        self.weight = plant.CalcTotalMass(self._context) * float(
+            np.linalg.norm(plant.gravity_field().gravity_vector())
+        )
+        self.gravity = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+        n = len(robot.joint_names)
+        if robot.has_floating_base:
+            mount = ImuMount(robot)
+            self.R_BI, self.p_BI = mount.R_BI, mount.p_BI
+            start = robot.base.floating_velocities_start_in_v()
+            # Place of ours, [base angular, base linear, joints], in the plant's velocities.
+            self._order = np.concatenate([np.arange(start, start + 6), robot.velocity_index])
+        else:
+            self._order = robot.velocity_index
+        self._upright = robot.base_pose_positions(RigidTransform())
+        self._joints = slice(len(self._order) - n, None)
+        self._soles = (
+            [robot.sole(side) for side in robot.description.sides]
+            if robot.has_floating_base
+            else []
+        )
+        # An effect that is tried changes some signals; what depends on the others is not computed again.
+        self._inverse_dynamics = _Remembered(self._calc_inverse_dynamics)
+        self._jacobians = _Remembered(self._calc_jacobians)
+        self._bias_accelerations = _Remembered(self._calc_bias_accelerations)
+
+    def sole_rotations(self, at: Instants) -> list[np.ndarray]:
+        """R_BF of each sole, (M, 3, 3) each."""
+        plant, context, soles = (
+            self.robot.plant,
+            self._context,
+            [self.robot.sole(side) for side in self.robot.description.sides],
+        )
+        result = np.empty((len(soles), len(at.joint_position), 3, 3))
+        positions = self._upright.copy()
+        for k, q in enumerate(at.joint_position):
+            positions[self.robot.position_index] = q
+            plant.SetPositions(context, positions)
+            for foot, sole in enumerate(soles):
+                result[foot, k] = sole.CalcPoseInWorld(context).rotation().matrix()
+        return list(result)
+
+    def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
+        """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
+        parts = self.pads.split(pad_force)
+        return [
+            part.reshape(len(part), -1) @ G.T
+            for part, G in zip(parts, self.robot.grasp_maps, strict=True)
+        ]
+
+    def feet_wrench(self, at: Instants) -> np.ndarray:
+        """What the feet give, [moment, force] on the base in its axes, (M, 6)."""
+        unloaded = replace(at, pad_force=np.zeros_like(at.pad_force))
+        n = len(self.robot.joint_names)
+        with_feet, without = (self.residual(one, kinematic=False)[:, n:] for one in (at, unloaded))
+        return with_feet - without
+
+    def standing(self, pad_force: np.ndarray) -> np.ndarray:
+        """Which soles stand on all their pads, (M, feet), bool."""
+        result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)
+        for foot, force in enumerate(self.pads.split(pad_force)):
+            normal = force[:, :, 2]
+            result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (
+                normal.min(axis=1) > _STANDING_PAD * self.weight
+            )
+        return result
+
+    def residual(self, at: Instants, *, kinematic: bool = True) -> np.ndarray:
+        """All rows, shape (M, rows); kinematic ones have their value whether or not a sole stands.
+
+        Args:
+            kinematic: are the kinematic rows wanted? Else they are left out.
+        """
+        if len(at.joint_position) > _MOST_INSTANTS:
+            parts = [
+                slice(start, start + _MOST_INSTANTS)
+                for start in range(0, len(at.joint_position), _MOST_INSTANTS)
+            ]
+            pieces = [
+                Instants(**{name: values[part] for name, values in vars(at).items()})
+                for part in parts
+            ]
+            return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
+        states, accelerations = self.plant_motion(at)
+        generalized = self._inverse_dynamics(states, accelerations)
+        rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
+        if self.robot.has_floating_base:
+            J = self._jacobians(states[:, : self.robot.plant.num_positions()])
+            for foot, wrench in enumerate(self.wrenches(at.pad_force)):
+                generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
+            if kinematic:
+                velocity = np.einsum("fmij,mj->fmi", J, rates)
+                specific_force = np.einsum(
+                    "fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]
+                ) + self._bias_accelerations(states)
+                specific_force[:, :, 2] -= self.gravity
+                kinematic_rows = [
+                    rows[foot]
+                    for foot in range(len(J))
+                    for rows in (velocity[..., :3], specific_force)
+                ]
+                if len(J) == 2:
+                    # The base's columns of J hold R_FB.
+                    left, right = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
+                    kinematic_rows.append(left - right)
+        # Joints first.
+        joints = at.torque_command - generalized[:, self._joints]
+        return np.concatenate(
+            [joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1
+        )
+
+    def joint_shares(self, at: Instants) -> np.ndarray:
+        """Spatial velocity [angular, linear] that each joint gives each sole, in its frame.
+
+        Returns:
+            (feet, M, 6, joints) [rad/s, m/s].
+        """
+        states, _ = self.plant_motion(at)
+        positions = self.robot.plant.num_positions()
+        rates = states[:, positions + self._order[self._joints]]
+        return self._jacobians(states[:, :positions])[..., self._joints] * rates[:, None]
+
+    def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
+        """Generalized forces without those of the feet, (M, v), in our order."""
+        plant, context, forces = self.robot.plant, self._context, MultibodyForces(self.robot.plant)
+        result = np.empty((len(states), len(self._order)))
+        for k, (state, acceleration) in enumerate(zip(states, accelerations, strict=True)):
+            plant.SetPositionsAndVelocities(context, state)
+            if not self.robot.has_floating_base:
+                plant.CalcForceElementsContribution(context, forces)
+            result[k] = plant.CalcInverseDynamics(context, acceleration, forces)[self._order]
+        return result
+
+    def _calc_jacobians(self, positions: np.ndarray) -> np.ndarray:
+        """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
+        plant, context, soles = self.robot.plant, self._context, self._soles
+        result = np.empty((len(soles), len(positions), 6, len(self._order)))
+        for k, position in enumerate(positions):
+            plant.SetPositions(context, position)
+            for foot, sole in enumerate(soles):
+                J = plant.CalcJacobianSpatialVelocity(
+                    context, JacobianWrtVariable.kV, sole, np.zeros(3), plant.world_frame(), sole
+                )
+                result[foot, k] = J[:, self._order]
+        return result
+
+    def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
+        """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
+        plant, context, soles, world = (
+            self.robot.plant,
+            self._context,
+            self._soles,
+            self.robot.plant.world_frame(),
+        )
+        result = np.empty((len(soles), len(states), 3))
+        for k, state in enumerate(states):
+            plant.SetPositionsAndVelocities(context, state)
+            for foot, sole in enumerate(soles):
+                bias = plant.CalcBiasSpatialAcceleration(
+                    context, JacobianWrtVariable.kV, sole, np.zeros(3), world, sole
+                )
+                result[foot, k] = bias.translational()
+        return result
+
+    @property
+    def row_velocities(self) -> np.ndarray:
+        """Place in the plant's velocities of each joint and base row."""
+        return np.concatenate([self._order[self._joints], self._order[: self._joints.start]])
+
+    def plant_motion(self, at: Instants) -> tuple[np.ndarray, np.ndarray]:
+        """States (M, positions + velocities) and accelerations (M, velocities) of the plant, with a floating base's origin at rest and its
+        specific force in the place of its acceleration."""
+        robot, plant, order = self.robot, self.robot.plant, self._order
+        states = np.zeros((len(at.joint_position), plant.num_multibody_states()))
+        positions, rates = states[:, : plant.num_positions()], states[:, plant.num_positions() :]
+        accelerations = np.zeros_like(rates)
+        positions[:] = self._upright
+        positions[:, robot.position_index] = at.joint_position
+        rates[:, robot.velocity_index] = at.joint_velocity
+        accelerations[:, robot.velocity_index] = at.joint_acceleration
+        if robot.has_floating_base:
+            R_BI, p_BI = self.R_BI, self.p_BI
+            w, w_dot = at.angular_velocity @ R_BI.T, at.angular_acceleration @ R_BI.T
+            # Specific force of the base's origin: less the lever arm's turning.
+            f = at.specific_force @ R_BI.T - np.cross(w_dot, p_BI) - np.cross(w, np.cross(w, p_BI))
+            rates[:, order[:3]] = w
+            accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
+        return states, accelerations
+
+    def noise(self, at: Instants, sensors: SensorsConfig) -> tuple[np.ndarray, np.ndarray]:
+        """Variance that sensor noise puts into each row of one step, to first order.
+
+        Returns:
+            Of what is white, and of the integral over time of what is differenced white noise, each (M, rows), in the rows' units squared
+            (the second times s^2).
+        """
+        robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
+        M, n, v = len(at.joint_position), len(robot.joint_names), len(order)
+        rows = len(residual_rows(robot))
+        white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
+        velocity_noise = joint_velocity_noise(sensors)
+        gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
+        floating = robot.has_floating_base
+        state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
+        soles = [robot.sole(side) for side in robot.description.sides] if floating else []
+        world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
+        wrench_variance = (
+            [deviation**2 for deviation in wrench_deviations(sensors.foot_force, robot)]
+            if floating
+            else []
+        )
+        scale = np.concatenate(
+            [np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)]
+        )
+        joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
+        lever = _skew(self.p_BI) if floating else None
+        for k in range(M):
+            state[robot.position_index] = at.joint_position[k]
+            plant.SetPositionsAndVelocities(context, state)
+            H = plant.CalcMassMatrix(context)[np.ix_(order, order)][joints_first]
+            if floating:
+                white[k, :v] = accelerometer**2 * (H[:, 3:6] ** 2).sum(axis=1)
+                H[:, :3] += H[:, 3:6] @ lever
+            differenced[k, :v] = ((H * scale) ** 2).sum(axis=1)
+            place, relative = v, []
+            for sole, variance in zip(soles, wrench_variance, strict=True):
+                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[
+                    :, order
+                ]
+                white[k, :v] += (J**2).T[joints_first] @ variance
+                white[k, place : place + 3] = ((J[:3] * scale) ** 2).sum(axis=1)
+                white[k, place + 3 : place + 6] = accelerometer**2
+                differenced[k, place + 3 : place + 6] = ((J[3:] * scale) ** 2).sum(axis=1)
+                relative.append(J[3:, 3:6].T @ J[3:])
+                place += 6
+            if len(soles) == 2:
+                white[k, place:] = (((relative[0] - relative[1]) * scale) ** 2).sum(axis=1)
+        return white, differenced
+
+
+def joint_velocity_noise(sensors: SensorsConfig) -> float:
+    """Standard deviation of a measured joint velocity [rad/s]."""
+    encoders = sensors.encoders
+    if encoders.velocity == "exact":
+        return encoders.velocity_noise
+    return float(
+        np.sqrt(2) * np.hypot(encoders.noise, encoders.resolution / np.sqrt(12)) / encoders.period
+    )
+
+
+def _skew(p: np.ndarray) -> np.ndarray:
+    return np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Block averages of the residual of a model over a log; B blocks, R rows."""
+
+    rows: list[Row]
+    # Centre of each block [s], shape (B,).
+    time: np.ndarray
+    # (B, R); and which are known: no gap in the log and no force at the end of its sensor's range, for joint rows a torque, for kinematic
+    # rows a sole that stands; no unused row.
+    value: np.ndarray
+    known: np.ndarray
+    # Noise of the sensors: variance of each average, and its covariance with the next block's, each (B, R).
+    variance: np.ndarray
+    covariance: np.ndarray
+    # Which soles stand, (B, feet).
+    standing: np.ndarray
+    # Averages of the signals, for tables and plots.
+    signals: Instants
+    # What of the variance is no noise of sensors but doubt about laws that were taken off, (B, R) or 0.
+    doubt: np.ndarray | float = 0.0
+
+    @cached_property
+    def row_index(self) -> dict[str, int]:
+        return {row.name: k for k, row in enumerate(self.rows)}
+
+    @cached_property
+    def noise_floor(self) -> np.ndarray:
+        """Root mean square of the sensors' noise in each row, shape (R,); NaN for a row that is never known."""
+        return rms(np.sqrt(self.variance), self.known)
+
+    def minus(self, predicted: np.ndarray) -> "Residual":
+        """What is left when a prediction (B, R) is taken off."""
+        return replace(self, value=self.value - predicted)
+
+
+def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Root mean square over the first axis where known; NaN where nothing is."""
+    counts = known.sum(axis=0)
+    total = (np.where(known, values, 0.0) ** 2).sum(axis=0)
+    return np.sqrt(np.divide(total, counts, out=np.full(total.shape, np.nan), where=counts > 0))
+
+
+class RecordedMotion:
+    """A log seen by a model: makes residuals, and finds how they change with the signals or the model."""
+
+    def __init__(self, robot: Robot, sensors: SensorsConfig, recording: RecordingConfig, log: Log):
+        """Reads the log.
+
+        Args:
+            robot: the model.
+            sensors: whose noise is believed.
+            recording: how the log is read.
+
+        Raises:
+            InputError: a log that does not fit the model, or one that is too short.
+        """
+        self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
+        self.period = float(log.meta["period"])
+        self.signals, self.measured = read_signals(robot, log, recording)
+        self.length = max(1, round(recording.block / self.period))
+        if len(self.signals.joint_position) < 20 * self.length:
+            raise InputError(
+                f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed"
+            )
+        names = [row.name for row in residual_rows(robot)]
+        for pattern in recording.unused_rows:
+            if not fnmatch.filter(names, pattern):
+                raise InputError(
+                    f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})"
+                )
+        self.start = float(log.time[0])
+        self.equation = EquationOfMotion(robot)
+        # Steps in which the motion was integrated [s]: 0 for continuous motion.
+        self.integration_step = 0.0
+        if recording.rows == "per_step":
+            self.integration_step = integration_step(
+                self.signals.joint_position, self.signals.joint_velocity, self.period, self.measured
+            )
+
+    @property
+    def motion_share(self) -> float:
+        """Where in a step its forces have their posture and velocities, as a share of it."""
+        return 0.5 - 0.5 * self.integration_step / self.period
+
+    @property
+    def law_share(self) -> float:
+        """Where in a step the velocity is that friction has: a simulated law holds at the end of
+        its integration step."""
+        return 0.5 + 0.5 * self.integration_step / self.period
+
+    @cached_property
+    def steps(self) -> Instants:
+        return self.steps_of(self.signals)
+
+    def steps_of(self, signals: SensorSignals) -> Instants:
+        """Steps of other signals on the same grid."""
+        return steps(signals, self.period, self.recording.rows, self.integration_step)
+
+    def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
+        """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0 Hz."""
+        return _low_passed(values, corner, self.period, _stretches(self.measured))
+
+    def averages(self, predicted: np.ndarray) -> np.ndarray:
+        """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
+        return block_means(
+            _low_passed(
+                predicted, self.recording.recorded_cutoff, self.period, self._measured_steps
+            ),
+            self.length,
+        )
+
+    @cached_property
+    def _measured_steps(self) -> list[slice]:
+        """Runs of steps without a gap."""
+        return _stretches(self.measured[:-1] & self.measured[1:])
+
+    @cached_property
+    def blocks(self) -> Instants:
+        """Averages of the steps."""
+        return averaged(self.steps, self.length)
+
+    @cached_property
+    def time(self) -> np.ndarray:
+        """Centre of each block [s]."""
+        return (
+            self.start
+            + (np.arange(len(self.blocks.joint_position)) + 0.5) * self.length * self.period
+        )
+
+    @cached_property
+    def standing(self) -> np.ndarray:
+        """Which soles stand throughout each block, (B, feet)."""
+        return (
+            block_means(self.equation.standing(self.steps.pad_force).astype(float), self.length)
+            == 1.0
+        )
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """Which averages of which rows are known, (B, R)."""
+        rows = residual_rows(self.robot)
+        # A force at the end of the sensor's range is any force beyond it.
+        measured = self.measured & (
+            np.abs(self.signals.pad_force) < self.sensors.foot_force.range
+        ).all(axis=(1, 2))
+        in_gap = block_means(1.0 - (measured[:-1] & measured[1:]), self.length) > 0
+        known = np.repeat(~in_gap[:, None], len(rows), axis=1)
+        if "joint/torque_command" not in self.log:
+            known[:, [row.kind == "joint" for row in rows]] = False
+        known[
+            :,
+            [
+                any(fnmatch.fnmatch(row.name, pattern) for pattern in self.recording.unused_rows)
+                for row in rows
+            ],
+        ] = False
+        least = self.robot.description.per_joint(
+            self.recording.least_speed, key="recording.least_speed", default=0.0
+        )
+        known[:, : len(least)] &= (
+            block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
+        )
+        kinematic = np.array([row.kind == "kinematic" for row in rows])
+        known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
+        around = 2 * round(_ROLLING / (self.length * self.period)) + 1
+        at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
+        for foot, side in enumerate(self.robot.description.sides):
+            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= at_rest[
+                :, foot, None
+            ]
+        known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
+        return known
+
+    def torque_variance(self, torque: np.ndarray) -> np.ndarray:
+        """Variance of the white noise of a sample of torques (M, n), as the recording says it, (M, n)."""
+        names, recording = self.robot.description, self.recording
+        noise, share = (
+            names.per_joint(getattr(recording, key), key=f"recording.{key}", default=0.0)
+            for key in ("torque_noise", "torque_noise_share")
+        )
+        return noise**2 + (share * torque) ** 2
+
+    @cached_property
+    def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Believed variance of a step's white noise and of the integral over time of what is
+        differenced white noise, (B, R) each."""
+        white, differenced = self.equation.noise(self.blocks, self.sensors)
+        torque = self.torque_variance(self.blocks.torque_command)
+        white[:, : torque.shape[1]] += torque
+        return white, differenced
+
+    @cached_property
+    def residual(self) -> Residual:
+        """The residual of the model's rigid bodies; what its effects explain is not taken off.
+
+        Raises:
+            InputError: no row of it is known at any time.
+        """
+        if not self.known.any():
+            lacking = (
+                "" if "joint/torque_command" in self.log else ", joint/torque_command is missing"
+            )
+            raise InputError(
+                f"the log has nothing to compare a model with{lacking} (needed: torques, or feet and an IMU, without gaps for "
+                f"{self.recording.block:g} s, in rows that recording.unused_rows and recording.least_speed leave)"
+            )
+        value = self.equation.residual(self.steps)
+        if self.recording.recorded_cutoff > 0:
+            measured = np.zeros_like(value)
+            measured[:, : len(self.robot.joint_names)] = self.steps.torque_command
+            value = block_means(measured, self.length) + self.averages(value - measured)
+        else:
+            value = block_means(value, self.length)
+        white, differenced = self.step_noise
+        duration = self.length * self.period
+        variance = white / self.length + 2 * differenced / duration**2
+        covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
+        covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
+        return Residual(
+            residual_rows(self.robot),
+            self.time,
+            value,
+            self.known,
+            variance,
+            covariance,
+            self.standing,
+            self.blocks,
+        )

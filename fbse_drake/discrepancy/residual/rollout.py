@@ -1,0 +1,316 @@
+"""The model simulated against a log: the error that a user of the model would see."""
+
+import multiprocessing
+import signal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from fbse_drake.discrepancy.residual.servo import scaled_gains, stretches
+from fbse_drake.effects.effect import ResolvedEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorSignals
+from fbse_drake.errors import InputError, located
+from fbse_drake.estimators.estimator import NoEstimator
+from fbse_drake.log import Log
+from fbse_drake.progress import Interrupted, Progress, silent
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import RobotConfig, Scenario
+from fbse_drake.signals import channels_of
+from fbse_drake.simulate import INTERRUPTED, add_record, simulate
+from fbse_drake.station import build_station
+from fbse_drake.walking.reference import Recorded, RecordedReference
+from fbse_drake.wiring import release
+
+# Where velocities were not measured, that at the start of a stretch is the slope of a parabola through so many samples.
+_STARTING_SAMPLES = 10
+# A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and then noise alone lets a foot land or a
+# joint slip otherwise, and the rest of the walk is another.
+_DRAWS = 3
+# How often runs in other processes are looked at [s].
+_LOOK_PERIOD = 0.2
+_SIMULATING = "simulating the model against the log"
+
+
+@dataclass(frozen=True)
+class RolloutError:
+    """How far the simulated model is from a log, root mean squares over the time that both have."""
+
+    # By joint [rad], [rad/s], [Nm].
+    position: dict[str, float]
+    velocity: dict[str, float]
+    torque_command: dict[str, float]
+    # Simulated time [s], and why it ended early, or None.
+    time: float
+    failure: str | None
+    # By joint: mean absolute error of the position [rad], and |simulated - recorded| / |recorded| of it, 2-norms.
+    mean_absolute_position: dict[str, float] = field(default_factory=dict)
+    relative_position: dict[str, float] = field(default_factory=dict)
+    # Error over time: N sample times [s], and simulated less recorded position (N, n) [rad].
+    sample_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    position_error: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def mean_position(self) -> float:
+        """Root mean square over all joints [rad]."""
+        return float(np.sqrt(np.mean(np.square(list(self.position.values())))))
+
+    @property
+    def mean_torque_command(self) -> float:
+        """Root mean square over all joints [Nm]."""
+        return float(np.sqrt(np.mean(np.square(list(self.torque_command.values())))))
+
+
+def rollout(
+    scenario: Scenario,
+    log: Log,
+    *,
+    planned_with: RobotConfig | None = None,
+    progress: Progress = silent,
+    jobs: int = 1,
+) -> RolloutError | None:
+    """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
+
+    Reference and controller are the scenario's, and so are estimator and compensation where there
+    is one: what is compensated moves the robot. Sensor noise is drawn anew, three times, and the
+    median of the errors is returned. A `!Recorded` reference is that of the log: the model starts
+    where each stretch of the log starts, its sensors are exact, and its position loop gets what the
+    robot's got. Played open loop, a recorded torque would say little: its errors add up, and what
+    is not stable in itself falls.
+
+    Args:
+        progress: is told what is being done.
+        jobs: how many simulations run side by side, each in a process of its own.
+        planned_with: the model that reference and feed-forward were planned with, and that the
+            estimator believed, when the log was made, which did not know what has been added since;
+            by default the scenario's.
+
+    Returns:
+        None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
+
+    Raises:
+        InputError: see `simulate`; or the log and the simulation share no time.
+    """
+    believed = _believed(scenario, planned_with or scenario.believed)
+    if isinstance(scenario.reference, Recorded):
+        if "reference/joint/position" not in log:
+            return None
+        return _recorded_rollout(believed, scenario.reference, log, progress)
+    believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
+    seeds = range(scenario.seed + 1, scenario.seed + 1 + _DRAWS)
+    drawn = [replace(believed, seed=seed) for seed in seeds]
+    draws = (
+        _side_by_side(drawn, log, progress, jobs)
+        if jobs > 1
+        else [_simulated_error(one, log, progress) for one in drawn]
+    )
+    return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[
+        _DRAWS // 2
+    ]
+
+
+def _side_by_side(
+    scenarios: Sequence[Scenario], log: Log, progress: Progress, jobs: int
+) -> list[RolloutError]:
+    """The errors of several scenarios, so many at a time.
+
+    Processes are forked: a plant's configuration does not go through a pipe, and a user's own effects are known here only.
+    """
+    context = multiprocessing.get_context("fork")
+    waiting = dict(enumerate(scenarios))
+    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    found: dict[int, RolloutError] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                place = min(waiting)
+                receiver, sender = context.Pipe(duplex=False)
+                run = context.Process(target=_send_error, args=(sender, waiting.pop(place), log))
+                run.start()
+                sender.close()
+                running[receiver] = place, run
+            progress(_SIMULATING, len(found) / len(scenarios))
+            for receiver in wait(list(running), timeout=_LOOK_PERIOD):
+                place, run = running.pop(receiver)
+                result = receiver.recv()
+                run.join()
+                if isinstance(result, Exception):
+                    raise result
+                found[place] = result
+    finally:
+        for _, run in running.values():
+            run.terminate()
+    return [found[place] for place in range(len(scenarios))]
+
+
+def _send_error(sender: Connection, scenario: Scenario, log: Log) -> None:
+    """In a process of its own; who started it decides about its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        sender.send(_simulated_error(scenario, log, silent))
+    except Exception as error:
+        sender.send(error)
+
+
+def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
+    """The scenario with its model in the robot's place; the rest believes what it believed.
+
+    An estimate that nobody uses does not move the robot, and takes its time.
+    """
+    estimator = scenario.estimator if scenario.compensation.uses_estimate else NoEstimator()
+    return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
+
+
+def _simulated_error(scenario: Scenario, log: Log, progress: Progress) -> RolloutError:
+    """The error of a scenario's robot as it is simulated."""
+
+    def tell(time: float) -> None:
+        progress(_SIMULATING, time / scenario.duration)
+
+    result = simulate(scenario, progress=tell)
+    if result.failure == INTERRUPTED:
+        raise Interrupted("it was interrupted")
+    simulated = result.log
+    rows = np.searchsorted(simulated.time, log.time - 1e-9)
+    shared = (rows < len(simulated.time)) & (
+        np.abs(simulated.time[np.minimum(rows, len(simulated.time) - 1)] - log.time) < 1e-6
+    )
+    if not shared.any():
+        raise InputError("the log and the simulated model have no sample time in common")
+    there = {name: simulated[name][rows[shared]] for name in _COMPARED if name in log}
+    return _rollout_error(log, shared, there, float(simulated.time[-1]), result.failure)
+
+
+_COMPARED = ("joint/position", "joint/velocity", "joint/torque_command")
+
+
+def _rollout_error(
+    log: Log,
+    rows: np.ndarray,
+    simulated: Mapping[str, np.ndarray],
+    time: float,
+    failure: str | None,
+) -> RolloutError:
+    """The error of what was simulated.
+
+    Args:
+        rows: which of the log's samples were simulated, (N,).
+        simulated: channels at these samples.
+    """
+
+    def by_joint(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(log.joints, values.tolist(), strict=True))
+
+    error = {name: values - log[name][rows] for name, values in simulated.items()}
+    rms = [
+        by_joint(np.sqrt((error[name] ** 2).mean(axis=0))) if name in error else {}
+        for name in _COMPARED
+    ]
+    q = error["joint/position"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.linalg.norm(q, axis=0) / np.linalg.norm(log["joint/position"][rows], axis=0)
+    return RolloutError(
+        *rms, time, failure, by_joint(np.abs(q).mean(axis=0)), by_joint(relative), log.time[rows], q
+    )
+
+
+def _recorded_rollout(
+    scenario: Scenario, recorded: Recorded, log: Log, progress: Progress
+) -> RolloutError:
+    rows, channels, failure, simulated_time = np.zeros(len(log.time), dtype=bool), [], None, 0.0
+    for stretch, constants in stretches(log):
+        with located("control: "):
+            control = scaled_gains(scenario.control, recorded, constants)
+        done, failure = _simulate_stretch(replace(scenario, control=control), log.part(stretch))
+        count = len(next(iter(done.values())))
+        rows[stretch.start : stretch.start + count] = True
+        channels.append(done)
+        if count:
+            simulated_time += float(log.time[stretch.start + count - 1] - log.time[stretch.start])
+        progress(_SIMULATING, float(rows.mean()))
+        if failure is not None:
+            break
+    names = [name for name in _COMPARED if name in log]
+    return _rollout_error(
+        log,
+        rows,
+        {name: np.concatenate([c[name] for c in channels]) for name in names},
+        simulated_time,
+        failure,
+    )
+
+
+def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarray], str | None]:
+    """The scenario's robot, which here is the model, in the log's place, from its first state on.
+
+    Returns:
+        What it did at the log's sample times, by channel; and why these are fewer than the log's,
+        or None.
+    """
+    time_step, start = scenario.plant.time_step, float(log.time[0])
+    duration = float(log.time[-1]) - start + time_step
+    exact = replace(scenario, sensors=scenario.sensors.without_errors, duration=duration)
+    builder = DiagramBuilder()
+    station = builder.AddSystem(build_station(exact, recorded=RecordedReference(log)))
+    robot = station.robot
+    sink = add_record(builder, station, ("measured_joint_state", "torque_command"), time_step)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    effects = scenario.robot.effects_of(SensorEffect, robot.description, key="model")
+    state = _first_state(robot, effects, log, scenario.control.period)
+    robot.set_state(robot.plant.GetMyMutableContextFromRoot(context), *state)
+
+    failure = None
+    try:
+        simulator.AdvanceTo(duration)
+    except RuntimeError as error:
+        failure = f"t = {start + context.get_time():.3f} s: the solver failed: {str(error).splitlines()[0]}"
+    found = sink.FindLog(context)
+    time, rows = found.sample_times(), found.data().T
+    finite = np.logical_and.accumulate(np.isfinite(rows).all(axis=1))
+    if failure is None and not finite.all():
+        failure = f"t = {start + time[finite.argmin()]:.3f} s: the state is not finite any more"
+    time, rows = time[finite], rows[finite]
+    wanted = (log.time - start)[log.time - start <= time[-1] + 1e-9]
+    # Motion between the steps, and the command of the step that a sample is in.
+    n = len(robot.joint_names)
+    motion = np.stack([np.interp(wanted, time, column) for column in rows[:, : 2 * n].T], axis=1)
+    command = rows[np.clip(np.searchsorted(time, wanted + 1e-9) - 1, 0, None), 2 * n :]
+    channels = channels_of("measured_joint_state", motion, n)
+    release(diagram)
+    return channels | channels_of("torque_command", command, n), failure
+
+
+def _first_state(
+    robot: Robot,
+    effects: list[ResolvedEffect],
+    log: Log,
+    period: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
+    few = slice(0, _STARTING_SAMPLES)
+    q = log["joint/position"][0]
+    v = (
+        log["joint/velocity"][0]
+        if "joint/velocity" in log
+        else np.polyfit(log.time[few] - log.time[0], log["joint/position"][few], 2)[1]
+    )
+    points = sum(leg.points for leg in robot.description.legs.values())
+    signals = SensorSignals(
+        q[None],
+        v[None],
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        np.zeros((1, points, 3)),
+        np.zeros_like(q)[None],
+    )
+    for effect in reversed(effects):
+        memory = np.zeros((effect.effect.memory_size, 1, len(effect.targets)))
+        signals = effect.effect.undone(signals, memory, effect, robot, period)
+    return signals.joint_position[0], signals.joint_velocity[0]
