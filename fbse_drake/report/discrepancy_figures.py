@@ -281,7 +281,7 @@ def _draw_falls(
     axes.set_yticks(places, names, fontsize=9)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xscale("log")
-    smallest, largest = min(0.8, *before, *after), max(1.0, *before, *after)
+    smallest, largest = min([0.8, *before, *after]), max([1.0, *before, *after])
     # Room for the numbers.
     axes.set_xlim(0.9 * smallest, largest * (largest / smallest) ** 0.2)
     _plain_log(axes.xaxis)
