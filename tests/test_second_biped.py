@@ -284,7 +284,7 @@ def test_the_noise_floor_is_that_of_six_axis_sensors():
     floor = dict(
         zip(
             (row.name for row in residual.rows),
-            Predictor(forces, log).residual.noise_floor,
+            Predictor(forces, simulate(forces).log).residual.noise_floor,
             strict=True,
         )
     )

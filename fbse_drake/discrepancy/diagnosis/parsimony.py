@@ -42,7 +42,7 @@ def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
     Members that do not pay go, the least useful first; then laws are reduced, then joints pooled;
     until nothing changes.
     """
-    judge = _Judge(proposals.fits, explanation)
+    judge = Judge(proposals.fits, explanation)
     while True:
         proposals.fits.dictionary.progress("looking for a smaller explanation")
         smaller = next(_smaller(proposals, judge, explanation), None)
@@ -74,7 +74,7 @@ def blocks_per_sample(scores: np.ndarray) -> np.ndarray:
 
 
 def _smaller(
-    proposals: Proposals, judge: "_Judge", explanation: Explanation
+    proposals: Proposals, judge: "Judge", explanation: Explanation
 ) -> Iterator[Explanation]:
     """Smaller explanations that are as good, the first to be taken first."""
     fits = proposals.fits
@@ -90,7 +90,7 @@ def _smaller(
     yield from _pooled(proposals, judge, explanation)
 
 
-class _Judge:
+class Judge:
     """What members of an explanation bring, in effectively independent samples."""
 
     def __init__(self, fits: Fits, explanation: Explanation):
@@ -209,7 +209,7 @@ def _is_beyond_its_range(member: Candidate) -> bool:
 
 
 def _on_fewer_targets(
-    proposals: Proposals, judge: _Judge, explanation: Explanation
+    proposals: Proposals, judge: Judge, explanation: Explanation
 ) -> Iterator[Explanation]:
     """Without targets of a member whose held-out error the shared values raise."""
     for member in explanation.candidates:
@@ -224,9 +224,7 @@ def _on_fewer_targets(
             yield proposals.beside(rest, member.effect, kept)
 
 
-def _reduced(
-    proposals: Proposals, judge: _Judge, explanation: Explanation
-) -> Iterator[Explanation]:
+def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With simpler laws in the place of one that contains them, wherever it is: it is one law for
     all joints unless none of them needs it."""
     tried = set(proposals.fits.dictionary.effects)
@@ -269,7 +267,7 @@ def _with_laws(
     return result
 
 
-def _pooled(proposals: Proposals, judge: _Judge, explanation: Explanation) -> Iterator[Explanation]:
+def _pooled(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With one member for the same joint of all legs, in the place of one for each."""
     fits = proposals.fits
     alone = {

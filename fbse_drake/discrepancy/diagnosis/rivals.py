@@ -10,6 +10,7 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
 from fbse_drake.discrepancy.diagnosis.selection import best_additions
@@ -49,13 +50,14 @@ def rival_name(rival: Candidate, member: Candidate) -> str:
 
 
 def equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
-    """Does a rival explain as much as the final explanation?
+    """Does a rival explain as much as the final explanation, as far as samples are independent?
 
     One with fewer parameters does also if chance may have brought what the final explanation has more.
     """
     more = len(final.fit.parameters) - len(rival.fit.parameters)
     least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-    return rival.deviance < final.deviance + least
+    worse = min(rival.deviance - final.deviance, Judge(fits, final).gain(rival, final))
+    return worse < least
 
 
 def settled(
