@@ -97,17 +97,25 @@ class Judge:
         """Measures what the largest explanation leaves: what a smaller one leaves is no noise."""
         self._fits, self._left = fits, fits.leftover(explanation)
 
-    def gain_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
-        """Drop of the held-out deviance in each row, (R,)."""
-        fits, white = self._fits, self._fits.white
+    def drop_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
+        """Drop of the held-out deviance in each row, as if blocks were independent, (R,)."""
+        white = self._fits.white
 
         def deviance(sse: np.ndarray) -> np.ndarray:
             scale = white.scale(sse)
             return white.count * np.log(scale) + sse / scale
 
-        drop = deviance(base.held_out_sse) - deviance(wider.held_out_sse)
-        explained = fits.leftover(base) - fits.leftover(wider)
-        return drop / blocks_per_sample(explained * self._left)
+        return deviance(base.held_out_sse) - deviance(wider.held_out_sse)
+
+    def gain_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
+        """The same in effectively independent samples, (R,)."""
+        explained = self._fits.leftover(base) - self._fits.leftover(wider)
+        return self.drop_by_row(base, wider) / blocks_per_sample(explained * self._left)
+
+    def independent_share(self, base: Explanation, wider: Explanation) -> float:
+        """How much of a drop of the deviance counts, for blocks are correlated, at most 1."""
+        drop, gain = (f(base, wider).sum() for f in (self.drop_by_row, self.gain_by_row))
+        return min(1.0, float(gain / drop)) if min(drop, gain) > 0 else 1.0
 
     def gain(self, base: Explanation, wider: Explanation) -> float:
         """The same in all rows, without what the parameters cost."""

@@ -56,8 +56,8 @@ def equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
     """
     more = len(final.fit.parameters) - len(rival.fit.parameters)
     least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-    worse = min(rival.deviance - final.deviance, Judge(fits, final).gain(rival, final))
-    return worse < least
+    share = Judge(fits, final).independent_share(rival, final)
+    return share * (rival.deviance - final.deviance) < least
 
 
 def settled(
