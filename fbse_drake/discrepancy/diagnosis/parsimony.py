@@ -99,12 +99,7 @@ class Judge:
 
     def drop_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
         """Drop of the held-out deviance in each row, as if blocks were independent, (R,)."""
-        white = self._fits.white
-
-        def deviance(sse: np.ndarray) -> np.ndarray:
-            scale = white.scale(sse)
-            return white.count * np.log(scale) + sse / scale
-
+        deviance = self._fits.white.deviance_by_row
         return deviance(base.held_out_sse) - deviance(wider.held_out_sse)
 
     def gain_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
@@ -112,15 +107,15 @@ class Judge:
         explained = self._fits.leftover(base) - self._fits.leftover(wider)
         return self.drop_by_row(base, wider) / blocks_per_sample(explained * self._left)
 
-    def independent_share(self, base: Explanation, wider: Explanation) -> float:
-        """How much of a drop of the deviance counts, for blocks are correlated, at most 1."""
-        drop, gain = (f(base, wider).sum() for f in (self.drop_by_row, self.gain_by_row))
-        return min(1.0, float(gain / drop)) if min(drop, gain) > 0 else 1.0
-
     def gain(self, base: Explanation, wider: Explanation) -> float:
         """The same in all rows, without what the parameters cost."""
         more = _size(wider) - _size(base)
         return float(self.gain_by_row(base, wider).sum()) - COMPLEXITY * more
+
+    def independent_share(self, base: Explanation, wider: Explanation) -> float:
+        """How much of a drop of the deviance counts, for blocks are correlated, at most 1."""
+        drop, gain = (f(base, wider).sum() for f in (self.drop_by_row, self.gain_by_row))
+        return min(1.0, float(gain / drop)) if min(drop, gain) > 0 else 1.0
 
     def pays(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
         """Is a member worth its parameters, is it more than nothing, and does it worsen no row?"""

@@ -158,10 +158,17 @@ class WhitenedResidual:
         """Mean square of each row's whitened residual, not less than 1: what the sensors' noise is to be multiplied with, shape (R,)."""
         return np.maximum(sse / np.maximum(self.count, 1), 1.0)
 
-    def deviance(self, sse: np.ndarray) -> float:
-        """Minus twice the log-likelihood of whitened residuals, whose variance is what it is but at least 1, up to a constant."""
+    def deviance_by_row(self, sse: np.ndarray) -> np.ndarray:
+        """Minus twice the log-likelihood of whitened residuals, up to a constant, (R,).
+
+        Their variance is what it is, but at least 1.
+        """
         scale = self.scale(sse)
-        return float((self.count * np.log(scale) + sse / scale).sum())
+        return self.count * np.log(scale) + sse / scale
+
+    def deviance(self, sse: np.ndarray) -> float:
+        """The same of all rows."""
+        return float(self.deviance_by_row(sse).sum())
 
 
 class PartialFit:
