@@ -168,6 +168,8 @@ _TABLE: list[Signal] = [
     Signal(r"((truth|reference|estimate)/)?joint/\w*torque\w*", "Nm", ("n",)),
     Signal(r"\w+/foot/\w+/position", "m", (3,)),
     Signal(r"\w+/foot/\w+/support", "1", ()),
+    # Turn to the left, where a foot turns.
+    Signal(r"\w+/foot/\w+/yaw", "rad", ()),
     Signal(r"\w+/(base|com)/position", "m", (3,)),
     Signal(r"\w+/base/orientation", "1", (4,)),
     Signal(r"\w+/(base|com)/velocity", "m/s", (3,)),

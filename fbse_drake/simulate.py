@@ -311,6 +311,8 @@ def _reference_channels(reference: Reference, time: np.ndarray) -> dict[str, np.
         for side, foot in plan.feet.items():
             channels[f"reference/foot/{side}/position"] = foot.position[rows]
             channels[f"reference/foot/{side}/support"] = plan.support(side)[rows].astype(float)
+            if plan.yaw[side].angle.any():
+                channels[f"reference/foot/{side}/yaw"] = plan.yaw[side].angle[rows]
     return channels
 
 

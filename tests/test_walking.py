@@ -2,15 +2,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
-from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
-from fbse_drake.robot.plant import Robot, make_robot
+from fbse_drake.robot.plant import Ground, Robot, Stairs, make_robot
 from fbse_drake.walking.leg_kinematics import LegKinematics, UnreachableError
 from fbse_drake.walking.plan import support_margin
-from fbse_drake.walking.reference import Reference, make_reference, share_load
+from fbse_drake.walking.reference import Reference, load_shares, make_reference
 from fbse_drake.walking.stand import Squat, Sway
 from fbse_drake.walking.walk import Walk
 
@@ -159,11 +160,13 @@ def test_support_margin_of_a_square():
 
 
 def test_shared_load_gives_the_zmp_and_sums_to_one(walk: Reference):
-    shares, cops = share_load(walk.plan, walk.plan.zmp)
+    shares = load_shares(walk.plan)
     np.testing.assert_allclose(sum(shares.values()), 1.0)
-    np.testing.assert_allclose(
-        sum(shares[s][:, None] * cops[s] for s in shares), walk.plan.zmp, atol=1e-12
-    )
+    both = np.all([walk.plan.support(side) for side in shares], axis=0)
+    zmp = sum(shares[side][:, None] * walk.plan.anchor(side) for side in shares)
+    # On the line between the feet; the CoM sways a little beyond at start and end.
+    middle = both & (TIME > 1.0) & (TIME < 10.0)
+    np.testing.assert_allclose(zmp[middle], walk.plan.zmp[middle], atol=1e-12)
     assert all(np.all((share >= 0) & (share <= 1)) for share in shares.values())
     # No jumps: a foot takes over the load gradually.
     assert max(np.abs(np.diff(share)).max() for share in shares.values()) < 0.03
@@ -220,6 +223,157 @@ def test_sway_zmp_of_a_point_mass(robot: Robot):
     )
     np.testing.assert_allclose(moment, 0, atol=1e-9)
     assert np.abs(reference.plan.zmp[:, 1]).max() > 0.04
+
+
+SHORT = np.arange(0, 3.6, 0.005)
+WALKS = {
+    "turning": {"step_length": 0.08, "step_turn": 0.15},
+    "sideways": {"step_length": 0.0, "step_left": 0.05},
+    "backwards and round": {"step_length": -0.05, "step_left": -0.03, "step_turn": -0.2},
+    "stairs": {"step_length": 0.2, "step_rise": 0.04, "com_height": 0.6},
+    "down": {"step_length": 0.2, "step_rise": -0.03, "com_height": 0.6},
+    "slope": {"slope": [0.05, -0.08], "com_height": 0.63},
+}
+
+
+@pytest.fixture(scope="module", params=list(WALKS))
+def other(request: pytest.FixtureRequest, robot: Robot) -> tuple[Walk, Reference]:
+    walk = Walk(single_supports=2, **WALKS[request.param])
+    return walk, make_reference(walk, robot, SHORT)
+
+
+def test_base_and_joints_of_any_walk_move_as_planned(robot: Robot, other: tuple[Walk, Reference]):
+    """Drake's forward kinematics of posture and velocities is the plan's CoM and feet."""
+    plan, reference = other[1].plan, other[1]
+    context, trunk = robot.plant.CreateDefaultContext(), plan.trunk_yaw
+    for k in range(0, len(SHORT), 73):
+        turn = np.concatenate([trunk.angular_velocity[k], reference.base.velocity[k]])
+        X_WB = RigidTransform(RotationMatrix(trunk.rotation[k]), reference.base.position[k])
+        state = (reference.joint_position[k], reference.joint_velocity[k])
+        robot.set_state(context, *state, X_WB, turn)
+        plant = robot.plant
+        com = plant.CalcCenterOfMassPositionInWorld(context)
+        speed = plant.CalcCenterOfMassTranslationalVelocityInWorld(context)
+        np.testing.assert_allclose(com, plan.com.position[k], atol=1e-10)
+        np.testing.assert_allclose(speed, plan.com.velocity[k], atol=1e-10)
+        for side, foot in plan.feet.items():
+            X_WF = robot.sole(side).CalcPoseInWorld(context)
+            V_WF = robot.sole(side).CalcSpatialVelocityInWorld(context)
+            yaw = plan.yaw[side]
+            np.testing.assert_allclose(X_WF.translation(), foot.position[k], atol=1e-10)
+            np.testing.assert_allclose(X_WF.rotation().matrix(), yaw.rotation[k], atol=1e-10)
+            np.testing.assert_allclose(V_WF.translational(), foot.velocity[k], atol=1e-9)
+            np.testing.assert_allclose(V_WF.rotational(), yaw.angular_velocity[k], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", list(WALKS))
+def test_accelerations_of_any_walk_are_the_derivatives(robot: Robot, name: str):
+    h, middle = 1e-4, np.array([0.2, 0.85, 1.0, 1.5, 2.33, 2.5])
+    time = np.sort(np.concatenate([middle - h, middle, middle + h, [0.0, 3.5]]))
+    reference = make_reference(Walk(single_supports=2, **WALKS[name]), robot, time)
+    k, base = np.searchsorted(time, middle), reference.base
+    for rate, acceleration in (
+        (reference.joint_velocity, reference.joint_acceleration),
+        (base.velocity, base.acceleration),
+    ):
+        difference = (rate[k + 1] - rate[k - 1]) / (2 * h)
+        np.testing.assert_allclose(difference, acceleration[k], atol=2e-4)
+
+
+def test_a_point_mass_balances_on_the_zmp_of_any_walk(other: tuple[Walk, Reference]):
+    """Inertia and gravity of the CoM have no horizontal moment about the ZMP, which lies on the
+    ground, or on the line through the footholds."""
+    walk, plan = other[0], other[1].plan
+    ascent = walk.step_rise / walk.step_length if walk.step_rise else 0.0
+    height = ascent * (plan.zmp[:, 0] - walk.start - walk.zmp_forward)
+    arm = plan.com.position - np.column_stack([plan.zmp, height])
+    moment = np.cross(arm, plan.com.acceleration - plan.gravity)
+    np.testing.assert_allclose(moment[:, :2], 0, atol=1e-8)
+
+
+def test_feedforward_and_the_ground_carry_the_robot(robot: Robot, other: tuple[Walk, Reference]):
+    """The ground's forces that are left when the joints give the feed-forward have their ZMP under
+    the feet that stand: the base's rows of the equation of motion close with them alone."""
+    reference, plan, plant = other[1], other[1].plan, robot.plant
+    context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
+    start, trunk = robot.base.floating_velocities_start_in_v(), plan.trunk_yaw
+    for k in range(0, len(SHORT), 73):
+        turn = np.concatenate([trunk.angular_velocity[k], reference.base.velocity[k]])
+        X_WB = RigidTransform(RotationMatrix(trunk.rotation[k]), reference.base.position[k])
+        state = (reference.joint_position[k], reference.joint_velocity[k])
+        robot.set_state(context, *state, X_WB, turn)
+        plant.mutable_gravity_field().set_gravity_vector(plan.gravity)
+        plant.CalcForceElementsContribution(context, forces)
+        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -9.81])
+        rate = np.zeros(plant.num_velocities())
+        rate[start : start + 3] = trunk.angular_acceleration[k]
+        rate[start + 3 : start + 6] = reference.base.acceleration[k]
+        rate[robot.velocity_index] = reference.joint_acceleration[k]
+        left = plant.CalcInverseDynamics(context, rate, forces)
+        left[robot.velocity_index] -= reference.feedforward_torque[k]
+        # Wrenches of the feet that stand, by least squares over all rows.
+        world, columns = plant.world_frame(), []
+        for side in plan.feet:
+            if plan.support(side)[k]:
+                J = plant.CalcJacobianSpatialVelocity(
+                    context, JacobianWrtVariable.kV, robot.sole(side), [0, 0, 0], world, world
+                )
+                columns.append(J.T)
+        J_T = np.hstack(columns)
+        wrench = np.linalg.lstsq(J_T, left, rcond=None)[0]
+        np.testing.assert_allclose(J_T @ wrench, left, atol=1e-6)
+        for moment, force in wrench.reshape(-1, 2, 3):
+            if force[2] > 1.0:
+                assert np.abs(moment[:2] / force[2]).max() < 0.1
+
+
+def test_swing_feet_clear_the_edges_of_the_stairs(robot: Robot):
+    """With treads as deep as a step, edges in the middle between footholds."""
+    walk = Walk(
+        step_length=0.26,
+        step_rise=0.04,
+        step_height=0.03,
+        com_height=0.58,
+        single_support=1.0,
+        single_supports=2,
+    )
+    plan = make_reference(walk, robot, SHORT).plan
+    edges = walk.start + 0.13 + 0.26 * np.arange(walk.single_supports - 1)
+    for side, foot in plan.feet.items():
+        pads = foot.position[:, None] + robot.pad_positions(side)
+        ground = 0.04 * np.searchsorted(edges, pads[:, :, 0])
+        assert (pads[:, :, 2] - ground).min() > -1e-9
+
+
+def test_stairs_are_where_they_are_said_to_be():
+    builder = DiagramBuilder()
+    stairs = Stairs(begin=0.4, depth=0.25, rise=0.05, count=3)
+    _, scene_graph = make_robot("biped", builder=builder, ground=Ground(stairs=stairs))
+    diagram = builder.Build()
+    context = scene_graph.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    query = scene_graph.get_query_output_port().Eval(context)
+    for x, height in ((0.39, 0.0), (0.41, 0.05), (0.64, 0.05), (0.66, 0.1), (5.0, 0.15)):
+        below, above = (
+            min(
+                found.distance
+                for found in query.ComputeSignedDistanceToPoint([x, 3.0, height + offset])
+            )
+            for offset in (-1e-3, 1e-3)
+        )
+        assert (below, above) == (pytest.approx(-1e-3), pytest.approx(1e-3))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"step_rise": 0.03, "step_turn": 0.1}, "straight ahead"),
+        ({"step_rise": 0.03, "step_length": 0.0}, "straight ahead"),
+        ({"slope": [0.1]}, "expected two numbers"),
+    ],
+)
+def test_walks_that_make_no_sense_are_refused(changes: dict[str, object], told: str):
+    with pytest.raises(InputError, match=told):
+        Walk(**changes)
 
 
 def test_feet_of_a_leg_can_be_tilted(robot: Robot):

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import LogLocator, NullFormatter
 from pydrake.common.yaml import yaml_load
+from scipy.spatial.transform import Rotation
 
 from fbse_drake import schema
 from fbse_drake.errors import InputError
@@ -304,7 +305,7 @@ def footprints(
     outlines: Mapping[str, np.ndarray] | None = None,
     pads: Mapping[str, np.ndarray] | None = None,
 ) -> Figure:
-    """Footholds, ZMP and CoM seen from above; the soles are taken to be parallel to the world's axes.
+    """Footholds, ZMP and CoM seen from above; the soles are taken to be turned as planned.
 
     Args:
         outlines: corners of each side's sole in its sole frame, (K, 2) [m]; without them a foothold is a cross.
@@ -316,7 +317,7 @@ def footprints(
     for source, label in (("truth", "{} foot"), ("reference", "planned foothold")):
         for side in log.sides if has_feet(log, f"{source}/foot/{{}}/position") else ():
             color = _side_color(log, side) if source == "truth" else PLANNED
-            for place in _footholds(log, side, f"{source}/foot/{side}/position"):
+            for place, R in _footholds(log, side, f"{source}/foot/{side}/position"):
                 if outlines is None:
                     axes.plot(
                         *place,
@@ -327,7 +328,7 @@ def footprints(
                     )
                 else:
                     patch = Polygon(
-                        place + outlines[side], edgecolor=color, label=label.format(side)
+                        place + outlines[side] @ R.T, edgecolor=color, label=label.format(side)
                     )
                     patch.set(
                         **(
@@ -982,24 +983,35 @@ def _stretches(log: Log, holds: np.ndarray) -> list[tuple[float, float]]:
     return [(float(log.time[start]), float(ends[end] - log.time[start])) for start, end in edges]
 
 
-def _footholds(log: Log, side: str, channel: str) -> Iterable[np.ndarray]:
-    """Where the sole is in the middle of each planned stance, (2,) [m]."""
+def _footholds(log: Log, side: str, channel: str) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+    """Where the sole is in the middle of each planned stance, (2,) [m], and how it is planned to be turned, (2, 2)."""
     standing = log[f"reference/foot/{side}/support"] > 0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(int)))
-    return [np.median(log[channel][start:end, :2], axis=0) for start, end in edges.reshape(-1, 2)]
+    R = _level_rotation(log, side)
+    return [
+        (np.median(log[channel][start:end, :2], axis=0), R[start, :2, :2])
+        for start, end in edges.reshape(-1, 2)
+    ]
+
+
+def _level_rotation(log: Log, side: str) -> np.ndarray:
+    """R_WF of a level sole that is turned as planned, (N, 3, 3)."""
+    yaw = log.get(f"reference/foot/{side}/yaw", np.zeros(len(log.time)))
+    return Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_matrix()
 
 
 def _measured_zmp(log: Log, pads: Mapping[str, np.ndarray]) -> np.ndarray:
     """ZMP of the measured foot forces, (N, 2) [m]; soles taken as level."""
     forces, places = [], []
     for side in log.sides:
-        sole = log[f"truth/foot/{side}/position"][:, None]
+        sole, R = log[f"truth/foot/{side}/position"][:, None], _level_rotation(log, side)
         if f"foot/{side}/pad_force" in log:
             forces.append(log[f"foot/{side}/pad_force"])
-            places.append(sole + pads[side])
+            places.append(sole + pads[side] @ R.transpose(0, 2, 1))
         else:
             forces.append(_force(log, side)[:, None])
-            places.append(sole + np.pad(_centre_of_pressure(log, side), ((0, 0), (0, 1)))[:, None])
+            centre = np.pad(_centre_of_pressure(log, side), ((0, 0), (0, 1)))
+            places.append(sole + np.einsum("nij,nj->ni", R, centre)[:, None])
     return zero_moment_point(np.concatenate(forces, axis=1), np.concatenate(places, axis=1))
 
 

@@ -45,8 +45,24 @@ _CORNER_RADIUS, _CORNER_STIFFNESS = 1e-9, 1e12
 
 
 @dataclass(frozen=True)
+class Stairs:
+    """Steps across the world's x axis, as wide as the ground; before the first and beyond the last it is even."""
+
+    # Where the first step begins [m], how far it is from one to the next [m], how far each is above the one before (below
+    # it, if negative) [m], and how many there are.
+    begin: float
+    depth: float
+    rise: float
+    count: int
+
+    def __post_init__(self) -> None:
+        require_positive(self, "depth", "count")
+
+
+@dataclass(frozen=True)
 class Ground:
-    """Flat ground with point contact. The world's frame is fixed to it: its surface is z = 0 also where it slopes."""
+    """Flat ground with point contact. The world's frame is fixed to it: its surface is z = 0 also where it slopes, but for
+    its stairs."""
 
     # Coulomb friction coefficient of the ground's surface; the pads' own is in the robot's model.
     friction: float = 0.8
@@ -56,6 +72,7 @@ class Ground:
     dissipation: float = 100.0
     # Rotation vector, about world x and y, that tilts it from level [rad]. A robot in a gantry hangs level all the same.
     slope: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    stairs: Stairs | None = None
 
     def __post_init__(self) -> None:
         if len(self.slope) != 2:
@@ -279,6 +296,16 @@ def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
     return np.concatenate([np.concatenate([moment, np.eye(3)]) for moment in moments], axis=1)
 
 
+def gravity_on_slope(gravity: np.ndarray, slope: Sequence[float]) -> np.ndarray:
+    """Gravity as a world has it that is fixed to sloping ground, (3,) [m/s^2].
+
+    Args:
+        gravity: where the ground is level, (3,) [m/s^2].
+        slope: see `Ground.slope` [rad].
+    """
+    return Rotation.from_rotvec([*slope, 0.0]).inv().apply(gravity)
+
+
 def make_robot(
     description: str | Path,
     *,
@@ -335,9 +362,7 @@ def make_robot(
             _add_corners(plant, side, leg, ground)
         if gantry_height is None:
             gravity = plant.mutable_gravity_field()
-            gravity.set_gravity_vector(
-                Rotation.from_rotvec([*ground.slope, 0.0]).inv().apply(gravity.gravity_vector())
-            )
+            gravity.set_gravity_vector(gravity_on_slope(gravity.gravity_vector(), ground.slope))
     plant.Finalize()
     if builder is None:
         # A builder that never builds is never freed.
@@ -571,7 +596,6 @@ def _add_corners(plant: MultibodyPlant, side: str, leg: Leg, ground: Ground) -> 
 
 def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
     size, thickness = 20.0, 1.0
-    X_WG = RigidTransform([0, 0, -thickness / 2])
     properties = ProximityProperties()
     AddContactMaterial(
         properties=properties,
@@ -579,13 +603,20 @@ def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
         point_stiffness=ground.stiffness,
         dissipation=ground.dissipation,
     )
-    plant.RegisterCollisionGeometry(
-        plant.world_body(), X_WG, Box(size, size, thickness), "ground", properties
-    )
-    plant.RegisterVisualGeometry(
-        plant.world_body(),
-        X_WG,
-        Box(size, size, thickness),
-        "ground",
-        np.array([0.86, 0.88, 0.9, 1.0]),
-    )
+    # Where each even part begins and ends in x, and its height.
+    parts = [(-size / 2, size / 2, 0.0)]
+    if (stairs := ground.stairs) is not None:
+        edges = stairs.begin + stairs.depth * np.arange(stairs.count)
+        if not -size / 2 < edges[0] <= edges[-1] < size / 2:
+            raise InputError(
+                f"stairs: expected them within {size / 2:g} m of the origin, found {edges[0]:g} to {edges[-1]:g} m"
+            )
+        begins, ends = [-size / 2, *edges], [*edges, size / 2]
+        parts = zip(begins, ends, stairs.rise * np.arange(stairs.count + 1), strict=True)
+    for number, (begin, end, height) in enumerate(parts):
+        name = f"ground_{number}" if number else "ground"
+        X_WG = RigidTransform([(begin + end) / 2, 0.0, height - thickness / 2])
+        shape = Box(end - begin, size, thickness)
+        plant.RegisterCollisionGeometry(plant.world_body(), X_WG, shape, name, properties)
+        color = np.array([0.86, 0.88, 0.9, 1.0])
+        plant.RegisterVisualGeometry(plant.world_body(), X_WG, shape, name, color)

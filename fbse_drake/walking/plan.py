@@ -1,6 +1,7 @@
 """What a reference motion is before it becomes joint angles: CoM, feet, ZMP and support over time, in the world frame."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -15,6 +16,44 @@ class PointMotion:
     position: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
+
+
+@dataclass(frozen=True)
+class YawMotion:
+    """A level body's turn to the left from the world's x axis, and its first two derivatives over
+    time, each of shape (N,) [rad, rad/s, rad/s^2]."""
+
+    angle: np.ndarray
+    rate: np.ndarray
+    acceleration: np.ndarray
+
+    @classmethod
+    def none(cls, samples: int) -> "YawMotion":
+        """One that looks along x all the time."""
+        return cls(*(np.zeros(samples) for _ in range(3)))
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """R_WB of the body, (N, 3, 3)."""
+        R = np.zeros((len(self.angle), 3, 3))
+        R[:, 0, 0] = R[:, 1, 1] = np.cos(self.angle)
+        R[:, 1, 0], R[:, 0, 1] = np.sin(self.angle), -np.sin(self.angle)
+        R[:, 2, 2] = 1.0
+        return R
+
+    @cached_property
+    def angular_velocity(self) -> np.ndarray:
+        """In the world, (N, 3) [rad/s]."""
+        return _along_z(self.rate)
+
+    @cached_property
+    def angular_acceleration(self) -> np.ndarray:
+        """In the world, (N, 3) [rad/s^2]."""
+        return _along_z(self.acceleration)
+
+
+def _along_z(values: np.ndarray) -> np.ndarray:
+    return np.stack([np.zeros_like(values), np.zeros_like(values), values], axis=1)
 
 
 @dataclass(frozen=True)
@@ -42,17 +81,35 @@ class Phase:
 
 @dataclass(frozen=True)
 class TaskPlan:
-    """A reference motion in task space; feet flat, trunk upright."""
+    """A reference motion in task space; feet and trunk level."""
 
     time: np.ndarray
     com: PointMotion
-    # Sole frame origins.
+    # Sole frame origins, and how the soles are turned.
     feet: dict[str, PointMotion]
+    yaw: dict[str, YawMotion]
     # (N, 2) [m].
     zmp: np.ndarray
     phases: tuple[Phase, ...]
     # Place in each sole frame where the ZMP rests when the foot carries all the load, (2,) [m].
     rest_point: dict[str, np.ndarray]
+    # Of the world, whose ground is z = 0 where it is even, (3,) [m/s^2].
+    gravity: np.ndarray
+
+    @cached_property
+    def trunk_yaw(self) -> YawMotion:
+        """The trunk looks where the feet look in the mean."""
+        yaws = self.yaw.values()
+        return YawMotion(
+            np.mean([yaw.angle for yaw in yaws], axis=0),
+            np.mean([yaw.rate for yaw in yaws], axis=0),
+            np.mean([yaw.acceleration for yaw in yaws], axis=0),
+        )
+
+    def anchor(self, side: str) -> np.ndarray:
+        """Where the ZMP rests when the foot carries all the load, (N, 2) [m]."""
+        turned = self.yaw[side].rotation[:, :2, :2] @ self.rest_point[side]
+        return self.feet[side].position[:, :2] + turned
 
     def support(self, side: str) -> np.ndarray:
         """Does the foot stand at each sample? Shape (N,), bool."""
@@ -108,8 +165,10 @@ def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float
         inside = (phase.start < plan.time) & (plan.time < phase.end)
         if not inside.any():
             continue
+        first = int(inside.argmax())
         corners = [
-            plan.feet[side].position[inside][0, :2] + foot_corners[side][:, :2]
+            plan.feet[side].position[first, :2]
+            + foot_corners[side][:, :2] @ plan.yaw[side].rotation[first, :2, :2].T
             for side in phase.support
         ]
         distance = support_margin(plan.zmp[inside], np.concatenate(corners))

@@ -21,6 +21,8 @@ from fbse_drake.walking.walk import Walk
 
 # A sample that is late by less than this share of a step still belongs to it.
 _EARLY = 0.1
+# Legs that begin less far from each other are beside each other [m].
+_SAME_PLACE = 1e-3
 # The base position is found to this [m].
 _COM_TOLERANCE = 1e-12
 _MAX_ITERATIONS = 100
@@ -156,10 +158,9 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
             f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
         )
     legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
-    lateral = {side: float(np.sign(leg.offsets[:, 1].sum())) for side, leg in legs.items()}
     corners = {side: robot.pad_positions(side) for side in legs}
     gravity = robot.plant.gravity_field().gravity_vector()
-    plan = config.plan(time, lateral, corners, float(np.linalg.norm(gravity)))
+    plan = config.plan(time, _stance(legs), corners, gravity)
     try:
         joint_motion, base, motions = _inverse_kinematics(
             robot, legs, plan, _posture(config.posture, robot.description)
@@ -181,6 +182,14 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
     )
 
 
+def _stance(legs: Mapping[str, LegKinematics]) -> dict[str, np.ndarray]:
+    """Direction of each leg from the middle of the legs, (x, y), each +1, 0 or -1."""
+    begins = np.array([leg.offsets[:, :2].sum(axis=0) for leg in legs.values()])
+    away = begins - begins.mean(axis=0)
+    away[np.abs(away) < _SAME_PLACE] = 0.0
+    return dict(zip(legs, np.sign(away), strict=True))
+
+
 def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarray:
     """Positions of all joints, those of the legs at zero, shape (n,)."""
     for joint in posture:
@@ -194,7 +203,7 @@ def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarra
 def _inverse_kinematics(
     robot: Robot, legs: dict[str, LegKinematics], plan: TaskPlan, posture: np.ndarray
 ) -> tuple[PointMotion, PointMotion, dict[str, LegMotion]]:
-    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk upright, other joints still."""
+    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk level, other joints still."""
     plant, samples = robot.plant, len(plan.time)
     context = plant.CreateDefaultContext()
     total_mass = plant.CalcTotalMass(context)
@@ -204,20 +213,20 @@ def _inverse_kinematics(
     rest = {side: leg.forward(np.zeros((1, 6))).moment[0] for side, leg in legs.items()}
     base_moment = total_mass * plant.CalcCenterOfMassPositionInWorld(context) - sum(rest.values())
 
-    level = np.broadcast_to(np.eye(3), (samples, 3, 3))
+    trunk = plan.trunk_yaw
+    R_BW = trunk.rotation.transpose(0, 2, 1)
+    R_BF = {side: R_BW @ plan.yaw[side].rotation for side in legs}
     p_WB = plan.com.position.copy()
     q: dict[str, np.ndarray] = {}
     for _ in range(_MAX_ITERATIONS):
         for side, leg in legs.items():
             try:
-                q[side] = leg.inverse(level, plan.feet[side].position - p_WB, start=q.get(side))
+                p_BF = _turned(R_BW, plan.feet[side].position - p_WB)
+                q[side] = leg.inverse(R_BF[side], p_BF, start=q.get(side))
             except UnreachableError as error:
                 raise InputError(_unreachable(plan, side, error)) from None
-        com = (
-            p_WB
-            + (base_moment + sum(leg.first_moment(q[side]) for side, leg in legs.items()))
-            / total_mass
-        )
+        moment = base_moment + sum(leg.first_moment(q[side]) for side, leg in legs.items())
+        com = p_WB + _turned(trunk.rotation, moment / total_mass)
         correction = plan.com.position - com
         p_WB = p_WB + correction
         if np.abs(correction).max() < _COM_TOLERANCE:
@@ -227,38 +236,60 @@ def _inverse_kinematics(
             f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change com_height"
         )
 
-    # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m.
+    # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m. All in the trunk's axes.
     still = {side: leg.forward(q[side]) for side, leg in legs.items()}
-    gain = {
-        side: m.J_moment @ np.linalg.inv(m.J)[:, :, 3:] / total_mass for side, m in still.items()
-    }
+    inverse = {side: m.J_moment @ np.linalg.inv(m.J) / total_mass for side, m in still.items()}
+    gain = {side: values[:, :, 3:] for side, values in inverse.items()}
     lever = np.eye(3) - sum(gain.values())
 
     def solve(
-        com: np.ndarray, feet: dict[str, np.ndarray]
+        com: np.ndarray, feet: dict[str, np.ndarray], turning: dict[str, np.ndarray]
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        right = com - sum(np.einsum("nij,nj->ni", gain[side], feet[side]) for side in legs)
+        """How the base moves, and how the feet move relative to it, turning and moving (N, 6); or
+        accelerate, each as a trunk sees it that only turns."""
+        turned = {side: _turned(inverse[side][:, :, :3], turning[side]) for side in legs}
+        right = com - sum(_turned(gain[side], feet[side]) + turned[side] for side in legs)
         base = np.linalg.solve(lever, right[:, :, None])[:, :, 0]
-        return base, {side: feet[side] - base for side in legs}
+        return base, {side: np.hstack([turning[side], feet[side] - base]) for side in legs}
 
-    v_WB, relative = solve(plan.com.velocity, {side: plan.feet[side].velocity for side in legs})
-    v = {side: _solve_leg(still[side].J, np.zeros((samples, 3)), relative[side]) for side in legs}
+    # The trunk turns: points that rest in its axes move and accelerate.
+    w, w_dot = trunk.angular_velocity, trunk.angular_acceleration
+    arm = {side: plan.feet[side].position - p_WB for side in legs}
+    com_arm = plan.com.position - p_WB
+
+    def seen(velocity: np.ndarray, arm: np.ndarray) -> np.ndarray:
+        return _turned(R_BW, velocity - np.cross(w, arm))
+
+    turning = {side: _turned(R_BW, plan.yaw[side].angular_velocity - w) for side in legs}
+    v_WB, relative = solve(
+        seen(plan.com.velocity, com_arm),
+        {side: seen(plan.feet[side].velocity, arm[side]) for side in legs},
+        turning,
+    )
+    v = {side: _solve_leg(still[side].J, relative[side]) for side in legs}
     motions = {side: leg.forward(q[side], v[side]) for side, leg in legs.items()}
+    com_velocity = seen(plan.com.velocity, com_arm) - v_WB
     # The same with accelerations; what the joint rates alone cause is taken off first.
     foot_bias, com_bias = {}, np.zeros((samples, 3))
     for side, motion in motions.items():
-        solved = _solve_leg(motion.J, motion.Jdot_v[:, :3], motion.Jdot_v[:, 3:])
+        solved = _solve_leg(motion.J, motion.Jdot_v)
         foot_bias[side] = solved
-        com_bias += (
-            motion.Jdot_v_moment - np.einsum("nij,nj->ni", motion.J_moment, solved)
-        ) / total_mass
+        com_bias += (motion.Jdot_v_moment - _turned(motion.J_moment, solved)) / total_mass
+
+    def felt(acceleration: np.ndarray, arm: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Less what the trunk's turning makes of a point that moves relative to it."""
+        carried = np.cross(w_dot, arm) + np.cross(w, np.cross(w, arm))
+        return _turned(R_BW, acceleration - carried) - 2.0 * np.cross(w, velocity)
+
     a_WB, relative = solve(
-        plan.com.acceleration - com_bias, {side: plan.feet[side].acceleration for side in legs}
+        felt(plan.com.acceleration, com_arm, com_velocity) - com_bias,
+        {
+            side: felt(plan.feet[side].acceleration, arm[side], relative[side][:, 3:])
+            for side in legs
+        },
+        {side: _turned(R_BW, plan.yaw[side].angular_acceleration - w_dot) for side in legs},
     )
-    a = {
-        side: _solve_leg(motions[side].J, np.zeros((samples, 3)), relative[side]) - foot_bias[side]
-        for side in legs
-    }
+    a = {side: _solve_leg(motions[side].J, relative[side]) - foot_bias[side] for side in legs}
 
     others = np.tile(posture[6 * len(legs) :], (samples, 1))
     joints = PointMotion(
@@ -267,11 +298,17 @@ def _inverse_kinematics(
             for values, still in ((q, others), (v, 0 * others), (a, 0 * others))
         )
     )
+    v_WB, a_WB = (_turned(trunk.rotation, values) for values in (v_WB, a_WB))
     return joints, PointMotion(p_WB, v_WB, a_WB), motions
 
 
-def _solve_leg(J: np.ndarray, angular: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(J, np.concatenate([angular, linear], axis=1)[:, :, None])[:, :, 0]
+def _turned(A: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Matrices (N, 3, k) times vectors (N, k)."""
+    return np.einsum("nij,nj->ni", A, vectors)
+
+
+def _solve_leg(J: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(J, twist[:, :, None])[:, :, 0]
 
 
 def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
@@ -304,24 +341,30 @@ def _feedforward(
 ) -> np.ndarray:
     """Joint torques that let the model follow the reference, feet loaded so that the ZMP is where inverse dynamics has it.
 
-    Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot, the place
-    of the ZMP on the line between the feet's centres of pressure, which move sideways together so that the ZMP comes out exactly.
+    Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot
+    (`load_shares`). The centres of pressure are the points where the ZMP rests in each foot (`TaskPlan.anchor`), moved together so
+    that the ZMP comes out exactly.
     """
-    plant, samples = robot.plant, len(plan.time)
+    plant, samples, trunk = robot.plant, len(plan.time), plan.trunk_yaw
     context = plant.CreateDefaultContext()
     forces = MultibodyForces(plant)
     positions = np.tile(robot.base_pose_positions(RigidTransform()), (samples, 1))
-    positions[:, robot.base.floating_positions_start() + 4 :][:, :3] = base.position
+    pose = positions[:, robot.base.floating_positions_start() :]
+    pose[:, 0], pose[:, 3] = np.cos(trunk.angle / 2), np.sin(trunk.angle / 2)
+    pose[:, 4:7] = base.position
     positions[:, robot.position_index] = joints.position
     start = robot.base.floating_velocities_start_in_v()
     rates, accelerations = (
         np.zeros((samples, plant.num_velocities())),
         np.zeros((samples, plant.num_velocities())),
     )
-    for target, linear, joint in (
-        (rates, base.velocity, joints.velocity),
-        (accelerations, base.acceleration, joints.acceleration),
+    # Another gravity than the plant's is as if all accelerated by the difference.
+    felt = base.acceleration + (plant.gravity_field().gravity_vector() - plan.gravity)
+    for target, angular, linear, joint in (
+        (rates, trunk.angular_velocity, base.velocity, joints.velocity),
+        (accelerations, trunk.angular_acceleration, felt, joints.acceleration),
     ):
+        target[:, start : start + 3] = angular
         target[:, start + 3 : start + 6] = linear
         target[:, robot.velocity_index] = joint
     generalized = np.empty((samples, plant.num_velocities()))
@@ -333,54 +376,45 @@ def _feedforward(
 
     # Total contact wrench: moment about the base origin and force, world axes.
     moment, force = generalized[:, start : start + 3], generalized[:, start + 3 : start + 6]
-    # Its ZMP: where the horizontal moment vanishes on the ground.
+    # Its ZMP: where the horizontal moment vanishes at the height of the feet that carry it.
+    shares = load_shares(plan)
+    ground = sum(shares[side] * plan.feet[side].position[:, 2] for side in plan.feet)
+    height = (base.position[:, 2] - ground)[:, None]
     zmp = (
         base.position[:, :2]
-        + (np.stack([-moment[:, 1], moment[:, 0]], axis=1) - base.position[:, 2:] * force[:, :2])
-        / force[:, 2:]
+        + (np.stack([-moment[:, 1], moment[:, 0]], axis=1) - height * force[:, :2]) / force[:, 2:]
     )
-    weights, cops = share_load(plan, zmp)
+    offset = zmp - sum(shares[side][:, None] * plan.anchor(side) for side in plan.feet)
     spin = moment[:, 2] - (
         (zmp[:, 0] - base.position[:, 0]) * force[:, 1]
         - (zmp[:, 1] - base.position[:, 1]) * force[:, 0]
     )
+    R_BW = trunk.rotation.transpose(0, 2, 1)
     torque = generalized[:, robot.velocity_index].copy()
     for k, (side, motion) in enumerate(motions.items()):
-        F = weights[side][:, None] * force
-        arm = np.hstack([cops[side], np.zeros((samples, 1))]) - plan.feet[side].position
-        M = np.cross(arm, F) + np.stack([0 * spin, 0 * spin, weights[side] * spin], axis=1)
-        torque[:, 6 * k : 6 * k + 6] -= np.einsum(
-            "nji,nj->ni", motion.J, np.concatenate([M, F], axis=1)
-        )
+        F = shares[side][:, None] * force
+        arm = np.zeros((samples, 3))
+        arm[:, :2] = plan.anchor(side) + offset - plan.feet[side].position[:, :2]
+        M = np.cross(arm, F) + np.stack([0 * spin, 0 * spin, shares[side] * spin], axis=1)
+        wrench = np.concatenate([_turned(R_BW, M), _turned(R_BW, F)], axis=1)
+        torque[:, 6 * k : 6 * k + 6] -= np.einsum("nji,nj->ni", motion.J, wrench)
     return torque
 
 
-def share_load(
-    plan: TaskPlan, zmp: np.ndarray
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Load share and centre of pressure of each foot.
+def load_shares(plan: TaskPlan) -> dict[str, np.ndarray]:
+    """Load share of each foot, in [0, 1]; they sum to 1; (N,) each.
 
-    The share follows the planned ZMP along the line between the points where it rests in each foot (`plan.rest_point`); the centres
-    of pressure are those points, moved together so that their weighted mean is `zmp`.
-
-    Args:
-        zmp: the ZMP to be produced, (N, 2) [m].
-
-    Returns:
-        Shares in [0, 1] that sum to 1, each (N,); centres of pressure in the world, each (N, 2) [m].
+    The share follows the planned ZMP along the line between the points where it rests in each foot.
     """
     first, second = plan.feet
-    anchor = {side: plan.feet[side].position[:, :2] + plan.rest_point[side] for side in plan.feet}
-    between = anchor[first] - anchor[second]
-    place = np.einsum("ni,ni->n", plan.zmp - anchor[second], between) / np.einsum(
+    between = plan.anchor(first) - plan.anchor(second)
+    place = np.einsum("ni,ni->n", plan.zmp - plan.anchor(second), between) / np.einsum(
         "ni,ni->n", between, between
     )
     share = np.where(
         plan.support(first), np.where(plan.support(second), np.clip(place, 0.0, 1.0), 1.0), 0.0
     )
-    shares = {first: share, second: 1.0 - share}
-    offset = zmp - sum(shares[side][:, None] * anchor[side] for side in plan.feet)
-    return shares, {side: anchor[side] + offset for side in plan.feet}
+    return {first: share, second: 1.0 - share}
 
 
 def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Reference:

@@ -1,11 +1,19 @@
 """Motions with both feet on the ground: squatting and swaying."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fbse_drake.errors import require_positive
-from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
+from fbse_drake.walking.plan import (
+    Phase,
+    PointMotion,
+    TaskPlan,
+    YawMotion,
+    check_zmp,
+    smooth_step,
+)
 
 
 def smooth_sine(
@@ -58,9 +66,9 @@ class _Stand:
         self,
         axis: int,
         time: np.ndarray,
-        lateral: dict[str, float],
+        stance: Mapping[str, np.ndarray],
         foot_corners: dict[str, np.ndarray],
-        gravity: float,
+        gravity: np.ndarray,
     ) -> TaskPlan:
         com = [np.zeros((len(time), 3)) for _ in range(3)]
         com[0][:, 2] = self.com_height
@@ -71,20 +79,23 @@ class _Stand:
         still = np.zeros((len(time), 3))
         feet = {
             side: PointMotion(
-                still + [-self.zmp_forward, sign * self.foot_spacing / 2, 0.0], still, still
+                still + [-self.zmp_forward, sign[1] * self.foot_spacing / 2, 0.0], still, still
             )
-            for side, sign in lateral.items()
+            for side, sign in stance.items()
         }
         # A point mass: the ZMP is where the line along (acceleration - gravity) meets the ground.
-        zmp = com[0][:, :2] - com[2][:, :2] * (com[0][:, 2] / (gravity + com[2][:, 2]))[:, None]
-        rest_point = {side: np.array([self.zmp_forward, 0.0]) for side in lateral}
+        lever = com[0][:, 2] / (com[2][:, 2] - gravity[2])
+        zmp = com[0][:, :2] - com[2][:, :2] * lever[:, None]
+        rest_point = {side: np.array([self.zmp_forward, 0.0]) for side in stance}
         plan = TaskPlan(
             time,
             PointMotion(*com),
             feet,
+            dict.fromkeys(stance, YawMotion.none(len(time))),
             zmp,
-            (Phase(0.0, float(time[-1]), tuple(lateral)),),
+            (Phase(0.0, float(time[-1]), tuple(stance)),),
             rest_point,
+            gravity,
         )
         check_zmp(plan, foot_corners, self.zmp_margin)
         return plan
@@ -97,12 +108,12 @@ class Squat(_Stand):
     def plan(
         self,
         time: np.ndarray,
-        lateral: dict[str, float],
+        stance: Mapping[str, np.ndarray],
         foot_corners: dict[str, np.ndarray],
-        gravity: float,
+        gravity: np.ndarray,
     ) -> TaskPlan:
         """See `Walk.plan`."""
-        return self._plan(2, time, lateral, foot_corners, gravity)
+        return self._plan(2, time, stance, foot_corners, gravity)
 
 
 @dataclass(frozen=True)
@@ -112,9 +123,9 @@ class Sway(_Stand):
     def plan(
         self,
         time: np.ndarray,
-        lateral: dict[str, float],
+        stance: Mapping[str, np.ndarray],
         foot_corners: dict[str, np.ndarray],
-        gravity: float,
+        gravity: np.ndarray,
     ) -> TaskPlan:
         """See `Walk.plan`."""
-        return self._plan(1, time, lateral, foot_corners, gravity)
+        return self._plan(1, time, stance, foot_corners, gravity)

@@ -1,25 +1,75 @@
-"""Straight walking: footsteps, ZMP and swing feet, with the timing of the paper (Sec. 7.1, Fig. 5) as default."""
+"""Walking from rest to rest: footsteps, ZMP and swing feet, with the timing of the paper (Sec. 7.1, Fig. 5) as default."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import PPoly
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.robot.plant import gravity_on_slope
 from fbse_drake.walking.lipm import LipmTrajectory, solve_lipm
-from fbse_drake.walking.plan import Phase, PointMotion, TaskPlan, check_zmp, smooth_step
+from fbse_drake.walking.plan import (
+    Phase,
+    PointMotion,
+    TaskPlan,
+    YawMotion,
+    check_zmp,
+    smooth_step,
+)
 
 # Coefficients, highest power first, of the quintic step 0 -> 1 and of the bump 64 s^3 (1 - s)^3, in local time s in [0, 1].
 _STEP = np.array([0.0, 6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
 _BUMP = np.array([-64.0, 192.0, -192.0, 64.0, 0.0, 0.0, 0.0])
+# The vertical part of a place.
+_UP = np.array([0.0, 0.0, 1.0, 0.0])
+# The share of its time that a foot on stairs moves but up at first, and but down in the end.
+_UPRIGHT = 0.2
+
+
+class Place(NamedTuple):
+    """A level place on the ground: its point in the world [m], and its turn to the left [rad]."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float
+
+    def beside(self, ahead: float, left: float, above: float = 0.0, yaw: float = 0.0) -> "Place":
+        """The place that lies so in its axes."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return Place(
+            self.x + (c * ahead - s * left),
+            self.y + (s * ahead + c * left),
+            self.z + above,
+            self.yaw + yaw,
+        )
+
+
+class Step(NamedTuple):
+    """What happens in a single support."""
+
+    # Feet that swing.
+    swing: tuple[str, ...]
+    # Middle between the feet, as it is for those that swing, where they leave and where they land.
+    leave: Place
+    land: Place
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Walks straight ahead from rest to rest: the first and the last step bring the feet side by side."""
+    """Walks from rest to rest: the first and the last step bring the feet side by side."""
 
     # Advance of the stance position from one step to the next [m]; a swing foot travels twice that.
     step_length: float = 0.10
+    # The same to the left [m], as a turn to the left [rad], and upwards [m], which is how far each of the ground's steps
+    # is above the one before.
+    step_left: float = 0.0
+    step_turn: float = 0.0
+    step_rise: float = 0.0
+    # The ground's slope that is known of, see `Ground.slope` [rad].
+    slope: list[float] = field(default_factory=lambda: [0.0, 0.0])
     # Lift of the swing foot [m].
     step_height: float = 0.04
     # Number of single supports, and the side that supports first.
@@ -30,7 +80,7 @@ class Walk:
     initial_double_support: float = 0.5
     single_support: float = 0.6
     double_support: float = 0.9
-    # Height of the centre of mass above the ground [m], constant.
+    # Height of the centre of mass above the ground [m], constant; on a staircase above the line through its steps.
     com_height: float = 0.66
     # Distance between the soles' centres [m].
     foot_spacing: float = 0.20
@@ -58,8 +108,19 @@ class Walk:
                 f"single_supports: expected a whole number >= 1, found {self.single_supports}"
             )
         require_not_negative(self, "step_height")
+        if len(self.slope) != 2:
+            raise InputError(f"slope: expected two numbers, found {self.slope}")
+        if self.step_rise != 0 and (self.step_left or self.step_turn or self.step_length == 0):
+            raise InputError(
+                "step_rise: stairs are climbed straight ahead: expected a step_length, and no step_left or step_turn"
+            )
 
-    def phases(self, sides: tuple[str, str], duration: float) -> list[Phase]:
+    @property
+    def ascent(self) -> float:
+        """How much the line through the footholds rises per way ahead."""
+        return self.step_rise / self.step_length if self.step_rise else 0.0
+
+    def phases(self, sides: tuple[str, ...], duration: float) -> list[Phase]:
         """Double and single supports in turn, up to the end of the last double support or `duration`, whichever is later.
 
         Raises:
@@ -83,104 +144,144 @@ class Walk:
         last = phases[-1]
         return [*phases[:-1], Phase(last.start, max(last.end, duration), sides)]
 
-    def footholds(self, phases: list[Phase]) -> dict[int, tuple[str, float, float]]:
-        """For each single support, by phase number: swing side, and where its sole leaves and lands in x [m]."""
+    def steps(self, phases: list[Phase]) -> dict[int, Step]:
+        """What happens in each single support, by phase number."""
         singles = [(number, phase) for number, phase in enumerate(phases) if phase.is_single]
         sides = phases[0].support
-        x = dict.fromkeys(sides, self.start)
+        # Of each foot, the middle between the feet as it sees it.
+        middle = dict.fromkeys(sides, Place(self.start, 0.0, 0.0, 0.0))
         result = {}
         for k, (number, phase) in enumerate(singles):
-            stance = phase.support[0]
-            swing = next(side for side in sides if side != stance)
-            landing = x[stance] + (
-                0.0 if k == len(singles) - 1 and len(singles) > 1 else self.step_length
-            )
-            result[number] = (swing, x[swing], landing)
-            x[swing] = landing
+            swing = tuple(side for side in sides if side not in phase.support)
+            land = middle[phase.support[0]]
+            if k < len(singles) - 1 or len(singles) == 1:
+                land = land.beside(self.step_length, self.step_left, self.step_rise, self.step_turn)
+            result[number] = Step(swing, middle[swing[0]], land)
+            middle |= dict.fromkeys(swing, land)
         return result
 
     def plan(
         self,
         time: np.ndarray,
-        lateral: dict[str, float],
+        stance: Mapping[str, np.ndarray],
         foot_corners: dict[str, np.ndarray],
-        gravity: float,
+        gravity: np.ndarray,
     ) -> TaskPlan:
         """CoM, feet and ZMP at `time` (N,) [s].
 
         Args:
-            lateral: direction of each side in y, +1 or -1; its order is that of the sides.
+            stance: direction of each leg from the middle of the legs, (x, y), each +1, 0 or -1.
             foot_corners: places of the pads in each sole frame, (pads, 3) [m].
-            gravity: g [m/s^2].
+            gravity: of a level world, (3,) [m/s^2].
 
         Raises:
             InputError: the ZMP leaves the support polygon less its margin, or a value is impossible.
         """
-        phases = self.phases(tuple(lateral), float(time[-1]))
-        footholds = self.footholds(phases)
-        feet = {side: self._foot(side, lateral[side], time, phases, footholds) for side in lateral}
+        phases = self.phases(tuple(stance), float(time[-1]))
+        steps = self.steps(phases)
+        beside = {side: sign * [0.0, self.foot_spacing / 2] for side, sign in stance.items()}
         rest_point = {
-            side: np.array([self.zmp_forward, -sign * self.zmp_inward])
-            for side, sign in lateral.items()
+            side: np.array([self.zmp_forward, -sign[1] * self.zmp_inward])
+            for side, sign in stance.items()
         }
-        zmp, com = self._com(phases, footholds, lateral, rest_point, gravity)
-        height = [np.full((len(time), 1), value) for value in (self.com_height, 0.0, 0.0)]
-        com_motion = PointMotion(*(np.hstack([com(time, k), height[k]]) for k in range(3)))
+        feet = {side: self._foot(side, beside[side], time, phases, steps) for side in stance}
+        tilted = gravity_on_slope(gravity, self.slope)
+        zmp, com = self._com(phases, steps, beside, rest_point, -tilted[2])
+        # Gravity along the ground is balanced where the CoM is so far uphill.
+        uphill = self.com_height * tilted / tilted[2]
+        motion = PointMotion(*(self._on_line(com(time, order), order) for order in range(3)))
+        motion = replace(motion, position=motion.position + [*uphill[:2], 0.0])
         plan = TaskPlan(
-            time, com_motion, feet, zmp(np.clip(time, 0, zmp.x[-1])), tuple(phases), rest_point
+            time,
+            motion,
+            {side: foot for side, (foot, _) in feet.items()},
+            {side: yaw for side, (_, yaw) in feet.items()},
+            zmp(np.clip(time, 0, zmp.x[-1])),
+            tuple(phases),
+            rest_point,
+            tilted,
         )
         check_zmp(plan, foot_corners, self.zmp_margin)
         return plan
 
+    def _on_line(self, com: np.ndarray, order: int) -> np.ndarray:
+        """The centre of mass or its derivative (N, 3) from its course in x and y (N, 2).
+
+        Its height above the line through the footholds is constant: so the LIPM holds on a slanted
+        plane as well (Kajita et al. 2001).
+        """
+        ahead = com[:, :1] - (self.start + self.zmp_forward if order == 0 else 0.0)
+        height = self.ascent * ahead + (self.com_height if order == 0 else 0.0)
+        return np.hstack([com, height])
+
     def _foot(
         self,
         side: str,
-        lateral: float,
+        beside: np.ndarray,
         time: np.ndarray,
         phases: list[Phase],
-        footholds: dict[int, tuple[str, float, float]],
-    ) -> PointMotion:
-        position = np.tile([self.start, lateral * self.foot_spacing / 2, 0.0], (len(time), 1))
-        velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
-        for number, (swing, leave, land) in footholds.items():
-            if swing != side:
+        steps: dict[int, Step],
+    ) -> tuple[PointMotion, YawMotion]:
+        # Place [m, rad] and its derivatives, (N, 4) each.
+        first = Place(self.start, 0.0, 0.0, 0.0).beside(*beside)
+        motion = [np.tile(np.array(first), (len(time), 1))]
+        motion += [np.zeros_like(motion[0]) for _ in range(2)]
+        for number, step in steps.items():
+            if side not in step.swing:
                 continue
+            leave, land = (np.array(x.beside(*beside)) for x in (step.leave, step.land))
             length = phases[number].end - phases[number].start
             s = (time - phases[number].start) / length
-            position[s >= 1, 0] = land
+            motion[0][s >= 1] = land
             inside = (0 < s) & (s < 1)
-            s = s[inside]
-            for order, target in enumerate((position, velocity, acceleration)):
-                forward = (land - leave) * smooth_step(s, order)
-                lift = self.step_height * np.polyval(np.polyder(_BUMP, order), s)
-                target[inside, 0] = (forward + (leave if order == 0 else 0.0)) / length**order
-                target[inside, 2] = lift / length**order
-        return PointMotion(position, velocity, acceleration)
+            swing = self._climb if self.step_rise else self._swing
+            for order, target in enumerate(motion):
+                target[inside] = swing(leave, land, s[inside][:, None], order) / length**order
+        place = [values[:, :3] for values in motion]
+        return PointMotion(*place), YawMotion(*(values[:, 3] for values in motion))
+
+    def _swing(self, leave: np.ndarray, land: np.ndarray, s: np.ndarray, order: int) -> np.ndarray:
+        """A swing foot's place or its derivative (N, 4) at the share s (N, 1) of its time."""
+        moved = (land - leave) * smooth_step(s, order)
+        lift = self.step_height * np.polyval(np.polyder(_BUMP, order), s)
+        return moved + ((leave if order == 0 else 0.0) + lift * _UP)
+
+    def _climb(self, leave: np.ndarray, land: np.ndarray, s: np.ndarray, order: int) -> np.ndarray:
+        """The same on stairs, whose edges are in the way: first up, then ahead, and down again."""
+        apex = max(leave[2], land[2]) + self.step_height
+        up, down = (2.0**order * smooth_step(2.0 * s - late, order) for late in (0.0, 1.0))
+        height = (apex - leave[2]) * up + (land[2] - apex) * down
+        duration = 1.0 - 2.0 * _UPRIGHT
+        ahead = smooth_step((s - _UPRIGHT) / duration, order) / duration**order
+        moved = (land - leave) * (1.0 - _UP) * ahead + height * _UP
+        return moved + (leave if order == 0 else 0.0)
 
     def _com(
         self,
         phases: list[Phase],
-        footholds: dict[int, tuple[str, float, float]],
-        lateral: dict[str, float],
+        steps: dict[int, Step],
+        beside: Mapping[str, np.ndarray],
         rest_point: dict[str, np.ndarray],
         gravity: float,
     ) -> tuple[PPoly, LipmTrajectory]:
         """ZMP (x, y) and the CoM that goes with it, at rest at both ends.
 
-        In a single support the ZMP rests in the supporting foot, in double support it moves smoothly from foot to foot. The first
+        In a single support the ZMP rests in the supporting feet, in double support it moves smoothly from foot to foot. The first
         and last double support hold a bump that first sends the ZMP the other way, as people do who start to walk.
         """
-        middle = np.array([self.start + self.zmp_forward, 0.0])
-        x = dict.fromkeys(lateral, self.start)
-        targets = [middle]
+        middle = dict.fromkeys(beside, Place(self.start, 0.0, 0.0, 0.0))
+
+        def rest(sides: tuple[str, ...]) -> np.ndarray:
+            """The middle of where the ZMP rests in these feet."""
+            places = [middle[side].beside(*(beside[side] + rest_point[side])) for side in sides]
+            return np.mean([place[:2] for place in places], axis=0)
+
+        targets = [rest(phases[0].support)]
         for number, phase in enumerate(phases):
             if phase.is_single:
-                side = phase.support[0]
-                targets.append(
-                    np.array([x[side], lateral[side] * self.foot_spacing / 2]) + rest_point[side]
-                )
-                x[footholds[number][0]] = footholds[number][2]
-        targets.append(np.array([np.mean(list(x.values())) + self.zmp_forward, 0.0]))
+                targets.append(rest(phase.support))
+                middle |= dict.fromkeys(steps[number].swing, steps[number].land)
+        targets.append(rest(phases[-1].support))
 
         # Double supports move, single supports rest, and after the last double support the robot stands.
         breaks = [phase.start for phase in phases] + [

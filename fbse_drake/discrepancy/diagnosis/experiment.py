@@ -18,6 +18,7 @@ from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, load_scenario
+from fbse_drake.walking.plan import YawMotion
 from fbse_drake.walking.reference import make_reference
 
 # A planned motion is evaluated at this period and interpolated [s].
@@ -37,26 +38,25 @@ def planned_log(scenario: Scenario) -> Log:
     with located("reference: "):
         reference = make_reference(scenario.reference, robot, coarse)
     n = len(robot.joint_names)
-    gravity = -robot.plant.gravity_field().gravity_vector()
-    still = np.zeros((len(coarse), 3))
+    plan, R_BI = reference.plan, _imu_axes(robot)
+    gravity = robot.plant.gravity_field().gravity_vector() if plan is None else plan.gravity
     # The IMU sits in an upright trunk.
-    specific_force = (reference.base.acceleration + gravity) @ _imu_axes(robot)
+    trunk = YawMotion.none(len(coarse)) if plan is None else plan.trunk_yaw
+    specific_force = np.einsum("nji,nj->ni", trunk.rotation, reference.base.acceleration - gravity)
     equation = EquationOfMotion(robot)
     pads = len(equation.pads.foot)
     at = Instants(
         reference.joint_position,
         reference.joint_velocity,
         reference.joint_acceleration,
-        still,
-        still,
-        specific_force,
+        trunk.angular_velocity @ R_BI,
+        trunk.angular_acceleration @ R_BI,
+        specific_force @ R_BI,
         np.zeros((len(coarse), pads, 3)),
         np.zeros((len(coarse), n)),
     )
-    if robot.has_floating_base and reference.plan is not None:
-        support = np.stack(
-            [reference.plan.support(side) for side in robot.description.sides], axis=1
-        )
+    if robot.has_floating_base and plan is not None:
+        support = np.stack([plan.support(side) for side in robot.description.sides], axis=1)
         at = replace(at, pad_force=_standing_forces(equation, at, support))
     at = replace(at, torque_command=-equation.residual(at, kinematic=False)[:, :n])
     fine = np.arange(int(scenario.duration / period) + 1) * period
