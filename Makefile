@@ -30,6 +30,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.effects
 	$(VENV)/bin/python -m benchmarks.estimator_tick
 	$(VENV)/bin/python -m benchmarks.convert
+	$(VENV)/bin/python -m benchmarks.campaigns
 
 # How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores; then on walks that nobody tuned to,
 # with faults of the sensors, beside the smallest error that the sensors allow, and whether it is as sure as it says, a quarter of an hour

@@ -37,13 +37,13 @@ from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import study, study_json
 from fbse_drake.discrepancy.exercises.hidden import (
-    SIZES,
     Answer,
     HiddenEffect,
     make_exercise,
     record,
     score,
 )
+from fbse_drake.discrepancy.exercises.sizes import SIZES
 from fbse_drake.discrepancy.exercises.strangers import STRANGERS
 from fbse_drake.effects.effect import library
 from fbse_drake.report.html import (

@@ -15,7 +15,10 @@ from scipy.stats import kstest
 
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.cli import BAD_INPUT, DONE, main
+from fbse_drake.discrepancy.diagnosis.study import study
+from fbse_drake.discrepancy.exercises.hidden import make_exercise
 from fbse_drake.errors import InputError
+from fbse_drake.estimate import estimate
 from fbse_drake.report.metrics import run_metrics
 
 pytest.importorskip("distributed")
@@ -33,7 +36,7 @@ from fbse_drake.campaign.campaign import Campaign, dump_campaign, load_campaign
 from fbse_drake.campaign.cluster import Outcome, run_campaign
 from fbse_drake.campaign.design import Choice, Grid, Listed, LogUniform, Normal, Random, Uniform
 from fbse_drake.campaign.rows import Folder, units_of
-from fbse_drake.campaign.steps import Call, Simulate
+from fbse_drake.campaign.steps import Call, Estimate, Hide, Simulate, Study
 from fbse_drake.campaign.table import Summary, groups, picture, usual_groups
 
 STEPS = """
@@ -339,3 +342,58 @@ def test_runs_of_a_benchmark_that_other_sources_made_are_forgotten(tmp_path: Pat
     assert runs(None).results() == [0, 1, 2]
     assert runs("new").results() == [1, 2]
     assert runs(None).results() == [1, 2]
+
+
+PENDULUM = """
+pendulum:
+  duration: 5
+  robot: {description: pendulum}
+  reference: !JointSines {amplitude: {servo: 0.6}, frequency: {servo: 0.7}, ramp: 0.5}
+  control: {kp: {all: 100}, kd: {all: 2}}
+  sensors: {encoders: {velocity_noise: 1.0e-4}}
+"""
+
+
+def test_steps_hand_on_what_they_made(tmp_path: Path, scheduler: str):
+    """Hidden, then found: the row says what exercise and study say by themselves."""
+    path = tmp_path / "pendulum.yaml"
+    path.write_text(PENDULUM)
+    campaign = Campaign(
+        {"hide": Hide(what="CoulombFriction", size="large"), "study": Study()},
+        scenarios=[str(path)],
+        design=Grid(seeds=1),
+    )
+    run_campaign(campaign, str(tmp_path / "out"), scheduler=scheduler)
+    (row,) = Folder(str(tmp_path / "out")).table().to_pylist()
+    scenario = load_scenario(str(path), overrides=["seed=0"])
+    exercise = make_exercise(scenario, "pendulum", 0, what="CoulombFriction", size="large")
+    alone = study(exercise.scenario, exercise.log, rollouts=False)
+    assert row["failure"] is None
+    assert (row["hide.effects"], row["hide.targets"]) == ("CoulombFriction", "servo")
+    assert row["study.added"] == ", ".join(found.effect for found in alone.found)
+    assert row["study.held_out_before"] == alone.steps[0].held_out_rmse
+    assert row["study.held_out_after"] == alone.steps[-1].held_out_rmse
+    assert all(row[f"study.{name}"] for name in ("right_verdict", "all_found", "first"))
+    assert row["study.held_out_after"] < 0.5 * row["study.held_out_before"]
+
+
+def test_an_estimate_is_that_of_the_log_of_the_step_before(tmp_path: Path, scheduler: str):
+    """With two settings: each sees the log as it was recorded, not the other's estimate."""
+    settings = ["estimator=!DisturbanceObserver {}"]
+    slow = ["estimator=!DisturbanceObserver {bandwidth: 1.0}"]
+    campaign = Campaign(
+        {"walk": Simulate(), "quick": Estimate(set=settings), "slow": Estimate(set=slow)},
+        scenarios=["sway"],
+        set=["duration=0.5"],
+        design=Grid(seeds=1),
+    )
+    run_campaign(campaign, str(tmp_path), scheduler=scheduler)
+    (row,) = Folder(str(tmp_path)).table().to_pylist()
+    log = simulate(load_scenario("sway", overrides=["duration=0.5", "seed=0"])).log
+    for name, changed in (("quick", settings), ("slow", slow)):
+        scenario = load_scenario("sway", overrides=["duration=0.5", "seed=0", *changed])
+        found = run_metrics(estimate(scenario, log).log, 1.0)["friction_rmse"]["stance"]
+        assert found == {joint: row[f"{name}.friction_rmse.stance.{joint}"] for joint in found}
+        assert np.isfinite(list(found.values())).all()
+    joint = "friction_rmse.stance.left_knee_pitch"
+    assert row[f"quick.{joint}"] != row[f"slow.{joint}"]

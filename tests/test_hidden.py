@@ -12,7 +12,6 @@ import pytest
 from fbse_drake import InputError, Log, Scenario, load_scenario
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.exercises.hidden import (
-    SIZES,
     Answer,
     HiddenEffect,
     draw,
@@ -24,6 +23,7 @@ from fbse_drake.discrepancy.exercises.hidden import (
     seal,
     unseal,
 )
+from fbse_drake.discrepancy.exercises.sizes import SIZES
 from fbse_drake.discrepancy.exercises.strangers import STRANGERS
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.effects.effect import library

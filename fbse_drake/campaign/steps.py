@@ -1,4 +1,7 @@
-"""Steps that a run can have. Each hands on what it made to the next: a log, an answer to find."""
+"""Steps that a run can have. Each hands on what it made to the next: a log, an answer to find.
+
+A step imports what it alone needs when it runs: every worker of a campaign pays for it anew.
+"""
 
 import importlib
 import importlib.util
@@ -6,12 +9,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fbse_drake.campaign.columns import Column, run_columns, run_figures
-from fbse_drake.discrepancy.diagnosis.diagnose import diagnosis_json
-from fbse_drake.discrepancy.diagnosis.study import study
-from fbse_drake.discrepancy.exercises.hidden import Answer, Size, make_exercise, score
+from fbse_drake.discrepancy.exercises.sizes import Size
 from fbse_drake.errors import InputError
 from fbse_drake.estimate import estimate
 from fbse_drake.interop.convert import read_log
@@ -20,6 +21,9 @@ from fbse_drake.report.metrics import run_metrics
 from fbse_drake.robot.description import load_description
 from fbse_drake.scenario import Scenario, ScenarioTree
 from fbse_drake.simulate import simulate
+
+if TYPE_CHECKING:
+    from fbse_drake.discrepancy.exercises.hidden import Answer
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Material:
     scenario: Scenario | None = None
     log: Log | None = None
     # What `!Hide` has hidden.
-    answer: Answer | None = None
+    answer: "Answer | None" = None
     # Why the robot did not get to its end.
     failure: str | None = None
 
@@ -136,6 +140,8 @@ class Hide(Step):
         return [*texts, Column("shrunk", unit="1")]
 
     def run(self, material: Material) -> tuple[Material, Figures]:
+        from fbse_drake.discrepancy.exercises.hidden import make_exercise
+
         exercise = make_exercise(
             material.needed("scenario"),
             material.needed("tree").name,
@@ -177,6 +183,10 @@ class Study(Step):
         ]
 
     def run(self, material: Material) -> tuple[Material, Figures]:
+        from fbse_drake.discrepancy.diagnosis.diagnose import diagnosis_json
+        from fbse_drake.discrepancy.diagnosis.study import study
+        from fbse_drake.discrepancy.exercises.hidden import score
+
         log = material.needed("log") if self.log is None else read_log(Path(self.log), None)
         result = study(material.needed("scenario"), log, rollouts=self.rollouts)
         figures = {

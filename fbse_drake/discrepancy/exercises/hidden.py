@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake.discrepancy.exercises.sizes import SIZES, Size
 from fbse_drake.discrepancy.exercises.strangers import STRANGERS
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.errors import InputError
@@ -23,8 +24,6 @@ from fbse_drake.simulate import simulate
 from fbse_drake.walking.reference import Reference, make_reference
 
 Kind = Literal["library", "decoy", "stranger"]
-Size = Literal["small", "medium", "large"]
-SIZES: tuple[Size, ...] = ("small", "medium", "large")
 
 # Share of exercises that hide nothing, and of those that hide a stranger.
 _SHARE = 1 / 8
