@@ -74,9 +74,7 @@ def log_with(hidden: str) -> Log:
 
 @cache
 def diagnosis_of(hidden: str) -> Diagnosis:
-    diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), effects())
-    # Explanations on the way hold what they were fitted to.
-    return replace(diagnosis, path=())
+    return diagnose(Predictor(scenario(), log_with(hidden)), effects())
 
 
 @pytest.fixture(scope="module", autouse=True)

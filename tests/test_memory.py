@@ -1,16 +1,26 @@
 """Memory of a process that simulates and estimates again and again."""
 
 import gc
+import pickle
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import scenario
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, System
 
-from fbse_drake import build_station, simulate
+from fbse_drake import Log, build_station, load_scenario, simulate
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.residual.residual import EquationOfMotion
+from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.estimate import estimate
 from fbse_drake.wiring import release
 
@@ -64,3 +74,27 @@ def test_memory_levels_off_over_simulations_and_estimates() -> None:
         estimate(walk, simulate(walk).log)
         used.append(resident())
     assert used[-1] - used[2] < 6.0
+
+
+def test_a_diagnosis_keeps_nothing_of_what_it_was_made_with() -> None:
+    """Columns and fits are gone with it, and at once: nothing is left for the garbage collector."""
+    swing = load_scenario("leg_swing_gantry", overrides=["duration=4", "log.period=0.01"])
+    believed = replace(swing, model=replace(swing.model, effects={}))
+    log = planned_log(believed)
+    torque = log["joint/torque_command"] + 2.0 * np.tanh(100 * log["joint/velocity"])
+    log = Log(log.channels | {"joint/torque_command": torque}, log.meta)
+
+    def working() -> set[int]:
+        kinds = (Fits, Dictionary, Predictor, EquationOfMotion)
+        return {id(kept) for kept in gc.get_objects() if isinstance(kept, kinds)}
+
+    gc.collect()
+    gc.disable()
+    try:
+        before = working()
+        diagnosis = diagnose(Predictor(believed, log), [CoulombFriction, ViscousFriction])
+        assert diagnosis.chosen
+        assert working() == before
+    finally:
+        gc.enable()
+    assert len(pickle.dumps(diagnosis)) < 100_000

@@ -971,25 +971,14 @@ def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
     """How the error falls on the way to a diagnosis."""
     if len(diagnosis.path) < 2:
         return []
-    steps, taken = [], set()
-    for explanation in diagnosis.path:
-        members = {(candidate.name, candidate.targets) for candidate in explanation.candidates}
+    steps, taken = [], frozenset()
+    for step in diagnosis.path:
         added = tuple(
             Finding(*member, np.nan, np.nan, {}, (), chosen=True)
-            for member in sorted(members - taken)
+            for member in sorted(step.members - taken)
         )
-        shares = (
-            sse.sum() / diagnosis.path[0].held_out_sse.sum()
-            for sse in (explanation.held_out_sse, explanation.sse)
-        )
-        steps.append(
-            StudyStep(
-                added,
-                *(diagnosis.held_out_before * float(np.sqrt(share)) for share in shares),
-                rollout=None,
-            )
-        )
-        taken = members
+        steps.append(StudyStep(added, step.held_out_rmse, step.train_rmse, rollout=None))
+        taken = step.members
     text = (
         "Effects were added one after the other, each the one that leaves least on held-out data."
     )

@@ -16,7 +16,12 @@ from fbse_drake.discrepancy.diagnosis.parsimony import frugal
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, remeasured
-from fbse_drake.discrepancy.diagnosis.rivals import equals, rival_name, rivals, settled
+from fbse_drake.discrepancy.diagnosis.rivals import (
+    indistinguishable,
+    rival_name,
+    rivals,
+    settled,
+)
 from fbse_drake.discrepancy.diagnosis.selection import select
 from fbse_drake.discrepancy.diagnosis.significance import Significance
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
@@ -85,6 +90,18 @@ class EffectStatus:
 
 
 @dataclass(frozen=True)
+class SelectionStep:
+    """An explanation on the way to a diagnosis; without the columns that it was fitted with."""
+
+    # Effects and their targets.
+    members: frozenset[tuple[str, tuple[str, ...]]]
+    # Root mean squares of the whole residual in multiples of the sensors' noise: on held-out data,
+    # and on what was fitted.
+    held_out_rmse: float
+    train_rmse: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Which effects are missing, and how sure that is."""
 
@@ -95,7 +112,7 @@ class Diagnosis:
     # What no effect of the library explains: by row, as far as it is large enough to matter.
     unexplained: tuple[Structure, ...]
     # Explanations in the order in which they were found; the first has no effects.
-    path: tuple[Explanation, ...]
+    path: tuple[SelectionStep, ...]
     # Root mean squares of the whole residual in multiples of the sensors' noise: on held-out data without and with what was chosen, and on
     # the data that it was fitted to.
     held_out_before: float
@@ -180,14 +197,16 @@ def diagnose(
     ]
     shares = {c: significance.share(final, c) for c in final.candidates}
     statuses: dict[str, EffectStatus] = {}
+    equal: dict[int, list[Explanation]] = {}
     try:
         if partial is None:
             if dictionary.inertia is not None:
                 alternatives = rivals(proposals, final)
+            equal = indistinguishable(fits, alternatives, final)
             experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
-                statuses[effect.__name__] = _status(fits, final, effect, alternatives, experiments)
+                statuses[effect.__name__] = _status(fits, final, effect, equal, experiments)
     except Interrupted as stop:
         partial = str(stop)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
@@ -204,16 +223,35 @@ def diagnose(
     return Diagnosis(
         verdict,
         (
-            *(_sized(f, tolerance) for f in _ranking(fits, path, alternatives, shares)),
+            *(_sized(f, tolerance) for f in _ranking(fits, path[-1], alternatives, equal, shares)),
             *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
         tuple(unexplained),
-        tuple(path),
+        _steps(path, root_mean_square(white, before)),
         *(root_mean_square(white, sse) for sse in (before, final.held_out_sse, final.sse)),
         inertia,
         averaging,
         partial,
+    )
+
+
+def _steps(path: Sequence[Explanation], before: float) -> tuple[SelectionStep, ...]:
+    """What is kept of explanations.
+
+    Args:
+        before: root mean square of the residual before anything is explained.
+    """
+    whole = path[0].held_out_sse.sum()
+    return tuple(
+        SelectionStep(
+            frozenset((candidate.name, candidate.targets) for candidate in explanation.candidates),
+            *(
+                before * float(np.sqrt(sse.sum() / whole))
+                for sse in (explanation.held_out_sse, explanation.sse)
+            ),
+        )
+        for explanation in path
     )
 
 
@@ -232,11 +270,17 @@ def root_mean_square(
 
 def _ranking(
     fits: Fits,
-    path: list[Explanation],
-    alternatives: dict[int, list[Explanation]],
+    final: Explanation,
+    alternatives: Mapping[int, Sequence[Explanation]],
+    equal: Mapping[int, Sequence[Explanation]],
     shares: Mapping[Candidate, float],
 ) -> list[Finding]:
-    final, white = path[-1], fits.white
+    """What was chosen, then its rivals.
+
+    Args:
+        alternatives, equal: by member, rivals and those that explain as much.
+    """
+    white = fits.white
     without = [
         fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
@@ -244,14 +288,10 @@ def _ranking(
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
-        equal = tuple(
-            dict.fromkeys(
-                rival_name(e.candidates[-1], member)
-                for e in alternatives[k]
-                if equals(fits, e, final)
-            )
+        names = tuple(
+            dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ()))
         )
-        finding = finding_of(white, rest, final, member, equal, chosen=True)
+        finding = finding_of(white, rest, final, member, names, chosen=True)
         findings.append(replace(finding, share=shares[member]))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
@@ -352,7 +392,7 @@ def _status(
     fits: Fits,
     final: Explanation,
     effect: type[Effect],
-    alternatives: dict[int, list[Explanation]],
+    equal: Mapping[int, Sequence[Explanation]],
     experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
@@ -360,8 +400,8 @@ def _status(
     scenario = None
     mistaken_for = [
         final.candidates[k]
-        for k, of_member in alternatives.items()
-        if any(e.candidates[-1].effect is effect and equals(fits, e, final) for e in of_member)
+        for k, of_member in equal.items()
+        if any(e.candidates[-1].effect is effect for e in of_member)
     ]
     if any(c.effect is effect for c in final.candidates):
         verdict: EffectVerdict = "present"

@@ -297,9 +297,12 @@ class Fits:
             offset = values[:, :, 0]
             return Signature(places, values[:, :, 1:], offset, prior=prior, lowest=np.array(lowest))
 
+        # A candidate must not hold the fits that hold it.
+        dictionary = self.dictionary
+
         def raw() -> Signature:
             # From (B, r, p, G).
-            columns = self.dictionary.columns(effect, places, stencil)
+            columns = dictionary.columns(effect, places, stencil)
             return signature(np.transpose(columns, (1, 0, 3, 2)))
 
         whitened = np.stack([s.columns for s in sets])

@@ -4,6 +4,7 @@ Far from zero an effect is not what its slope at zero says: a crooked IMU that i
 resembles. So a rival is fitted by itself, nonlinear parameters and all, before it is compared.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -49,15 +50,22 @@ def rival_name(rival: Candidate, member: Candidate) -> str:
     return f"{rival.name} on {rival.targets[0]}" if on_bodies else ""
 
 
-def equals(fits: Fits, rival: Explanation, final: Explanation) -> bool:
-    """Does a rival explain as much as the final explanation, as far as samples are independent?
+def indistinguishable(
+    fits: Fits, of_members: Mapping[int, Sequence[Explanation]], final: Explanation
+) -> dict[int, list[Explanation]]:
+    """Rivals, by member, that explain as much as the final explanation, as far as samples are independent.
 
     One with fewer parameters does also if chance may have brought what the final explanation has more.
     """
-    more = len(final.fit.parameters) - len(rival.fit.parameters)
-    least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-    share = Judge(fits, final).independent_share(rival, final)
-    return share * (rival.deviance - final.deviance) < least
+    judge = Judge(fits, final)
+
+    def equals(rival: Explanation) -> bool:
+        more = len(final.fit.parameters) - len(rival.fit.parameters)
+        least = fits.threshold[min(12, more)] if more > 0 else MARGIN
+        lost = rival.deviance - final.deviance
+        return lost < least or judge.independent_share(rival, final) * lost < least
+
+    return {k: [e for e in found if equals(e)] for k, found in of_members.items()}
 
 
 def settled(

@@ -267,16 +267,16 @@ def averaged(instants: Instants, length: int) -> Instants:
     )
 
 
-class _Remembered:
-    """A function of arrays that remembers its last results."""
+class _LastResults:
+    """The last results of a function of arrays. The function itself is not held, so that it may be
+    a method of what holds this."""
 
-    def __init__(self, function: Callable[..., np.ndarray]):
-        self._function = function
+    def __init__(self) -> None:
         self._results: Memory[np.ndarray] = Memory(_REMEMBERED)
 
-    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+    def of(self, function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
         key = tuple(array.tobytes() for array in arrays)
-        return self._results.or_made(key, lambda: self._function(*arrays))
+        return self._results.or_made(key, lambda: function(*arrays))
 
 
 class EquationOfMotion:
@@ -307,9 +307,9 @@ class EquationOfMotion:
             else []
         )
         # An effect that is tried changes some signals; what depends on the others is not computed again.
-        self._inverse_dynamics = _Remembered(self._calc_inverse_dynamics)
-        self._jacobians = _Remembered(self._calc_jacobians)
-        self._bias_accelerations = _Remembered(self._calc_bias_accelerations)
+        self._inverse_dynamics = _LastResults()
+        self._jacobians = _LastResults()
+        self._bias_accelerations = _LastResults()
 
     def sole_rotations(self, at: Instants) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each."""
@@ -369,17 +369,21 @@ class EquationOfMotion:
             ]
             return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
-        generalized = self._inverse_dynamics(states, accelerations)
+        generalized = self._inverse_dynamics.of(
+            self._calc_inverse_dynamics, states, accelerations
+        )
         rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
         if self.robot.has_floating_base:
-            J = self._jacobians(states[:, : self.robot.plant.num_positions()])
+            J = self._jacobians.of(
+                self._calc_jacobians, states[:, : self.robot.plant.num_positions()]
+            )
             for foot, wrench in enumerate(self.wrenches(at.pad_force)):
                 generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
             if kinematic:
                 velocity = np.einsum("fmij,mj->fmi", J, rates)
                 specific_force = np.einsum(
                     "fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]
-                ) + self._bias_accelerations(states)
+                ) + self._bias_accelerations.of(self._calc_bias_accelerations, states)
                 specific_force[:, :, 2] -= self.gravity
                 kinematic_rows = [
                     rows[foot]
@@ -405,7 +409,8 @@ class EquationOfMotion:
         states, _ = self.plant_motion(at)
         positions = self.robot.plant.num_positions()
         rates = states[:, positions + self._order[self._joints]]
-        return self._jacobians(states[:, :positions])[..., self._joints] * rates[:, None]
+        J = self._jacobians.of(self._calc_jacobians, states[:, :positions])
+        return J[..., self._joints] * rates[:, None]
 
     def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Generalized forces without those of the feet, (M, v), in our order."""
