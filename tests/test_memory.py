@@ -79,7 +79,8 @@ def test_memory_levels_off_over_simulations_and_estimates() -> None:
 def test_a_diagnosis_keeps_nothing_of_what_it_was_made_with() -> None:
     """Columns and fits are gone with it, and at once: nothing is left for the garbage collector."""
     swing = load_scenario("leg_swing_gantry", overrides=["duration=4", "log.period=0.01"])
-    believed = replace(swing, model=replace(swing.model, effects={}))
+    bare = replace(swing.robot, effects={})
+    believed = replace(swing, robot=bare, model=bare)
     log = planned_log(believed)
     torque = log["joint/torque_command"] + 2.0 * np.tanh(100 * log["joint/velocity"])
     log = Log(log.channels | {"joint/torque_command": torque}, log.meta)

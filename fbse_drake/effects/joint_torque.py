@@ -181,7 +181,8 @@ def basis_over_time(
     memory = effect.memory_over_time(motion, nonlinear[..., None, :]) if effect.has_memory else ()
     if memory is not None:
         basis, _ = effect.basis(motion._replace(memory=memory), nonlinear[..., None, :])
-        return np.stack([np.broadcast_to(b, (*sets, samples, n)) for b in basis])
+        columns = [np.broadcast_to(b, (*sets, samples, n)) for b in basis]
+        return np.stack(columns) if columns[1:] else columns[0][None]
     names = ("velocity", "position", "command", "time")
     columns = [np.broadcast_to(getattr(motion, name), (samples, n)) for name in names]
     result: list[list[np.ndarray]] = []

@@ -11,6 +11,7 @@ divided by the number of blocks that count as one, see `blocks_per_sample`.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 from scipy.stats import t as student
@@ -62,8 +63,9 @@ def blocks_per_sample(scores: np.ndarray) -> np.ndarray:
             are correlated as what is left is; columns that change sign meanwhile are surer.
     """
     size = len(scores)
-    power = np.abs(np.fft.rfft(scores, 2 * size, axis=0)) ** 2
-    products = np.fft.irfft(power, axis=0)[: size - size % 2]
+    padded = next_fast_len(2 * size, real=True)
+    power = np.abs(np.fft.rfft(scores, padded, axis=0)) ** 2
+    products = np.fft.irfft(power, padded, axis=0)[: size - size % 2]
     correlation = np.divide(
         products, products[0], out=np.zeros_like(products), where=products[0] > 0
     )
@@ -105,7 +107,10 @@ class Judge:
     def gain_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
         """The same in effectively independent samples, (R,)."""
         explained = self._fits.leftover(base) - self._fits.leftover(wider)
-        return self.drop_by_row(base, wider) / blocks_per_sample(explained * self._left)
+        gain = self.drop_by_row(base, wider)
+        changed = explained.any(axis=0)
+        gain[changed] /= blocks_per_sample(explained[:, changed] * self._left[:, changed])
+        return gain
 
     def gain(self, base: Explanation, wider: Explanation) -> float:
         """The same in all rows, without what the parameters cost."""

@@ -7,8 +7,8 @@ from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_banded
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dpotrf, dpotrs, dtbtrs
 from scipy.stats import t as student
 
 from fbse_drake.discrepancy.residual.memory import Memory
@@ -131,9 +131,9 @@ class WhitenedResidual:
         result = np.zeros(values.shape)
         if len(index):
             flat = values[index].reshape(len(index), -1)
-            result[index] = solve_banded(
-                (1, 0), self._factor[row], flat, check_finite=False
-            ).reshape(values[index].shape)
+            result[index] = dtbtrs(self._factor[row], flat, uplo="L")[0].reshape(
+                values[index].shape
+            )
         return result
 
     def whiten_signature(self, signature: Signature) -> Signature:

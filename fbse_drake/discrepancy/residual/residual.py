@@ -257,7 +257,9 @@ def within_steps(values: np.ndarray, share: float) -> np.ndarray:
 def block_means(values: np.ndarray, length: int) -> np.ndarray:
     """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at the end is dropped."""
     blocks = len(values) // length
-    return values[: blocks * length].reshape(blocks, length, *values.shape[1:]).mean(axis=1)
+    by_block = values[: blocks * length].reshape(blocks, length, *values.shape[1:])
+    # Faster than `mean`, which takes the few samples of a block one by one.
+    return np.einsum("bl...->b...", by_block.astype(float, copy=False)) / length
 
 
 def averaged(instants: Instants, length: int) -> Instants:
