@@ -19,7 +19,7 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.rivals import equals
+from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable
 from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_significant
 from fbse_drake.discrepancy.diagnosis.study import study, study_json
 from fbse_drake.discrepancy.identification.regression import Signature
@@ -330,10 +330,10 @@ def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_dif
     )
     for charge, as_good in ((11.0, True), (60.0, False)):
         better = replace(spring, deviance=bias.deviance - charge)
-        assert equals(fits, bias, better) == as_good
+        assert bool(indistinguishable(fits, {0: [bias]}, better)[0]) == as_good
         # The other way round, parameters that are not needed are none in its favour.
         better = replace(bias, deviance=spring.deviance - charge)
-        assert not equals(fits, spring, better)
+        assert indistinguishable(fits, {0: [spring]}, better) == {0: []}
 
 
 @pytest.mark.parametrize(

@@ -288,9 +288,7 @@ def _ranking(
     findings = []
     for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
         member, rest = final.candidates[k], without[k]
-        names = tuple(
-            dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ()))
-        )
+        names = tuple(dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ())))
         finding = finding_of(white, rest, final, member, names, chosen=True)
         findings.append(replace(finding, share=shares[member]))
     seen = {(f.effect, f.targets) for f in findings}

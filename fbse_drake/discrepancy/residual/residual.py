@@ -371,9 +371,7 @@ class EquationOfMotion:
             ]
             return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
-        generalized = self._inverse_dynamics.of(
-            self._calc_inverse_dynamics, states, accelerations
-        )
+        generalized = self._inverse_dynamics.of(self._calc_inverse_dynamics, states, accelerations)
         rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
         if self.robot.has_floating_base:
             J = self._jacobians.of(
