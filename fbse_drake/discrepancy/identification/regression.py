@@ -129,7 +129,8 @@ class WhitenedResidual:
         """Values (B, ...) of a row, whitened."""
         index = self._index[row]
         result = np.zeros(values.shape)
-        if len(index):
+        # LAPACK ends the process if it is given no columns.
+        if len(index) and values.size:
             flat = values[index].reshape(len(index), -1)
             result[index] = dtbtrs(self._factor[row], flat, uplo="L")[0].reshape(
                 values[index].shape
