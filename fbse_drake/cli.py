@@ -1,22 +1,37 @@
+# PYTHON_ARGCOMPLETE_OK
 """The `fbse` command line. Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input."""
 
 import argparse
 import os
 import signal
 import sys
+import textwrap
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from fbse_drake.errors import InputError
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
+# What can be listed.
+LISTED = ("scenarios", "robots", "effects", "estimators", "sensors", "compensations")
+_FIRST_STEPS = """first steps:
+  fbse simulate squat
+  fbse list effects
+  fbse study paper_walk out/paper_walk/log.npz
+
+To complete commands with the tab key: pip install 'fbse_drake[completion]', then
+eval "$(register-python-argcomplete fbse)" in your shell's start-up file."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command line; returns the exit status."""
     try:
-        options = _parser().parse_args(arguments)
+        parser = _parser()
+        if "_ARGCOMPLETE" in os.environ:
+            _complete(parser)
+        options = parser.parse_args(arguments)
         # Matrices are small here: more threads of the linear algebra wait for each other, at three times the cost.
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(name, "1")
@@ -48,18 +63,69 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
+class _Version(argparse.Action):
+    """Prints the version, which takes longer to find than all of the help."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        import fbse_drake
+
+        print(f"{parser.prog} {fbse_drake.__version__}")
+        parser.exit()
+
+
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Answers a shell that wants to complete a command line, if argcomplete is installed."""
+    with suppress(ModuleNotFoundError):
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+
+
+def _scenario_names(prefix: str, **_: object) -> list[str]:
+    """Scenarios that ship with the package, and files, for completion."""
+    from argcomplete.completers import FilesCompleter
+
+    from fbse_drake.resources import shipped
+
+    names = [name for name in shipped("scenarios") if name.startswith(prefix)]
+    return [*names, *FilesCompleter(("yaml",))(prefix)]
+
+
+def _add_command(
+    commands: Any, name: str, *, help: str, description: str, examples: Sequence[str]
+) -> argparse.ArgumentParser:
+    lines = "\n".join(f"  {example}" for example in examples)
+    return commands.add_parser(
+        name,
+        help=help,
+        description=textwrap.fill(description, 79),
+        epilog=f"examples:\n{lines}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="fbse", description="Find the friction, and the missing physics, of a legged robot."
+        prog="fbse",
+        description="Find the friction, and the missing physics, of a legged robot.",
+        epilog=_FIRST_STEPS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=_Parser
     )
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "simulate",
         help="run a scenario",
         description="Simulates a scenario; writes log, metrics and report.",
+        examples=(
+            "fbse simulate squat",
+            "fbse simulate paper_walk --set reference.step_length=0.05 --set seed=3 --out out/short",
+            "fbse simulate my_scenario.yaml --meshcat",
+        ),
     )
     _add_scenario(run)
     run.add_argument(
@@ -67,39 +133,66 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_output(run, "out/ and the name of the scenario or of its file")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "estimate",
         help="run a scenario's estimator over a recorded log",
         description="Runs a scenario's estimator over a recorded log; writes the log with the estimates, metrics and report.",
+        examples=(
+            "fbse estimate paper_walk_fbse out/paper_walk/log.npz",
+            "fbse estimate paper_walk_fbse --name paper_method out/paper_walk/log.npz",
+            "fbse estimate my_robot.yaml recording.mcap",
+        ),
     )
     _add_scenario(run)
     _add_log(run)
     _add_output(run, "as for simulate, with _estimate at its end")
 
-    for name, short, description in (
+    for name, file, short, description, examples in (
         (
+            "compare",
             "compare",
             "where a scenario's model fails on a log",
             "Says where a scenario's model fails on a log.",
+            (
+                "fbse compare paper_walk out/paper_walk/log.npz",
+                "fbse compare my_robot.yaml recording.csv --map my_map.yaml",
+            ),
         ),
         (
             "diagnose",
+            "diagnosis",
             "which physical effect a model lacks",
             "Finds the physical effects that a scenario's model lacks, on a log.",
+            (
+                "fbse diagnose paper_walk out/paper_walk/log.npz",
+                "fbse diagnose my_robot.yaml monday.npz --test tuesday.npz --time-limit 300",
+            ),
         ),
         (
             "identify",
+            "identify",
             "inertial parameters and plain friction",
             "Identifies the inertial parameters that a scenario does not trust (identify.inertia), with plain friction.",
+            ("fbse identify real/ur10 ur10_exciting_trajectory.db3",),
         ),
         (
             "study",
+            "study",
             "diagnose, add, and again",
             "Adds what a scenario's model lacks until a log shows nothing more.",
+            (
+                "fbse study paper_walk out/paper_walk/log.npz",
+                "fbse study my_robot.yaml monday.npz --test tuesday.npz --jobs 2",
+            ),
         ),
     ):
-        run = commands.add_parser(
-            name, help=short, description=f"{description} Writes {name}.json and a report."
+        run = _add_command(
+            commands,
+            name,
+            help=short,
+            description=f"{description} Writes {file}.json and a report.",
+            examples=examples,
         )
         _add_scenario(run)
         _add_log(run)
@@ -129,10 +222,16 @@ def _parser() -> argparse.ArgumentParser:
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "convert",
         help="make a log of a recording, or a bag of a log",
         description="Makes a log of recordings (ROS bags, CSV, JSON, MATLAB, npz), or of a log a file for other programs (mcap, csv).",
+        examples=(
+            "fbse convert recording.mcap recording.npz",
+            "fbse convert run1.csv run2.csv recording.npz --map my_map.yaml",
+            "fbse convert out/paper_walk/log.npz walk.mcap",
+        ),
     )
     run.add_argument(
         "inputs",
@@ -153,10 +252,15 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--force", action="store_true", help="replace OUT if it exists")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "add",
         help="add what a diagnosis found to a scenario's model",
         description="Writes a scenario whose model has what a diagnosis found.",
+        examples=(
+            "fbse add paper_walk out/paper_walk_diagnose --out completed.yaml",
+            "fbse add paper_walk out/paper_walk_diagnose --effect StribeckFriction --out completed.yaml",
+        ),
     )
     _add_scenario(run)
     run.add_argument(
@@ -178,10 +282,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "hide",
         help="make an exercise: a log with a hidden effect",
         description="Hides an effect in a scenario's robot and writes the log without it in the model, and the answer sealed (see reveal).",
+        examples=(
+            "fbse hide paper_walk --seed 7 --out out/mystery",
+            "fbse hide paper_walk --seed 7 --what decoy --out out/decoy",
+        ),
     )
     _add_scenario(run)
     run.add_argument(
@@ -205,18 +314,25 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_output(run, "as for simulate, with _hidden at its end")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "reveal",
         help="open the answer of an exercise",
         description="Opens the answer of an exercise, and scores what was found in its folder.",
+        examples=("fbse reveal out/mystery",),
     )
     run.add_argument("folder", metavar="DIR", type=Path, help="what hide wrote")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "campaign",
         help="many runs at once, on this machine or a Dask cluster",
         description="Does the runs of a campaign that are not done, each of which becomes a row of a table; the same command goes on.",
+        examples=(
+            "fbse campaign friction.yaml --out out/friction",
+            "fbse campaign friction.yaml --out s3://lab/friction --scheduler tcp://host:8786",
+        ),
     )
     run.add_argument("campaign", metavar="CAMPAIGN", type=Path, help="a YAML file")
     run.add_argument(
@@ -238,10 +354,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
-    run = commands.add_parser(
+    run = _add_command(
+        commands,
         "table",
         help="what the rows of a campaign say",
         description="Prints medians (of truth values: shares) with 95 %% intervals, by group; writes table.csv (all rows) and groups.csv.",
+        examples=(
+            "fbse table out/friction --value walk.com_rse_mean",
+            "fbse table out/friction --by reference.step_length --plot walk.com_rse_mean.x reference.step_length",
+        ),
     )
     run.add_argument("folder", metavar="DIR", help="what campaign wrote")
     run.add_argument(
@@ -261,6 +382,17 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", metavar=("Y", "X"), nargs=2, help="writes a picture of one column over another"
     )
     run.add_argument("--out", metavar="DIR", type=Path, help="where files go (default: DIR)")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = _add_command(
+        commands,
+        "list",
+        help="what there is: scenarios, effects, estimators, sensors",
+        description="Lists what a scenario can be made of, a line for each.",
+        examples=("fbse list", "fbse list effects", "fbse list scenarios --json"),
+    )
+    run.add_argument("what", choices=LISTED, nargs="?", help="list these alone")
+    run.add_argument("--json", action="store_true", help="print JSON: a text by name, by kind")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
@@ -288,9 +420,10 @@ def _positive_number(text: str) -> float:
 
 
 def _add_scenario(run: argparse.ArgumentParser) -> None:
-    run.add_argument(
-        "scenario", metavar="SCENARIO", help="a YAML file, or the name of one in scenarios/"
+    scenario = run.add_argument(
+        "scenario", metavar="SCENARIO", help="a YAML file, or a name of `fbse list scenarios`"
     )
+    scenario.completer = _scenario_names  # type: ignore[attr-defined]
     run.add_argument(
         "--name",
         help="which scenario of the file (default: its only one, or the one called like the file)",

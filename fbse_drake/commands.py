@@ -8,7 +8,7 @@ import sys
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,52 +21,31 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from fbse_drake.analysis import AnalysisResult, compare, diagnose, identify, reveal, study
+from fbse_drake.cli import LISTED
 from fbse_drake.discrepancy.diagnosis.add import add, read_findings
-from fbse_drake.discrepancy.diagnosis.compare import compare, comparison_json
-from fbse_drake.discrepancy.diagnosis.diagnose import Finding, diagnose, diagnosis_json
-from fbse_drake.discrepancy.diagnosis.identify import (
-    identifiability_text,
-    identification_json,
-    identify,
-)
-from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.diagnosis.study import study, study_json, train_and_rest
-from fbse_drake.discrepancy.diagnosis.validation import validated
-from fbse_drake.discrepancy.exercises.hidden import hide, reveal
-from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
-from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.diagnosis.diagnose import Finding
+from fbse_drake.discrepancy.diagnosis.identify import identifiability_text
+from fbse_drake.discrepancy.exercises.hidden import make_exercise, seal
+from fbse_drake.effects.effect import spaced
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimate import estimate
 from fbse_drake.files import write_atomically, write_text
 from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
+from fbse_drake.listing import listing
 from fbse_drake.log import Log
 from fbse_drake.progress import Progress, ProgressLines
-from fbse_drake.report.discrepancy import (
-    Inputs,
-    compare_outcome,
-    diagnosis_outcome,
-    parameter_text,
-    parameters_text,
-    study_outcome,
-    write_compare_report,
-    write_diagnosis_report,
-    write_study_report,
-)
-from fbse_drake.report.discrepancy_figures import by_effect, spaced, targets_text
+from fbse_drake.report.discrepancy import Inputs, findings_table, parameter_text
+from fbse_drake.report.discrepancy_figures import targets_text
+from fbse_drake.report.html import Table as ReportTable
 from fbse_drake.report.html import number, percent
-from fbse_drake.report.identification import (
-    BASE_HEADER,
-    ERROR_HEADER,
-    base_row,
-    error_rows,
-    identification_outcome,
-    write_identification_report,
-)
-from fbse_drake.report.metrics import run_metrics, worst_joint, write_json
-from fbse_drake.report.run import law_sentence, write_run_report
+from fbse_drake.report.identification import base_table
+from fbse_drake.report.metrics import worst_joint, write_json
+from fbse_drake.report.run import law_sentence
+from fbse_drake.results import RunResult
 from fbse_drake.scenario import Scenario, dump_scenario, read_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulate import SimulationResult, simulate
 
 # Failures and findings that are printed.
 _SHOWN = 8
@@ -86,9 +65,7 @@ def _simulate(options: argparse.Namespace) -> bool:
         _progress(console, f"simulating {name}", scenario.duration) as progress,
     ):
         result = simulate(scenario, name=name, meshcat=meshcat, progress=progress)
-    _write_results(
-        console, out, name, scenario, result.log, run_metrics(result.log, result.wall_time)
-    )
+    _write_run(console, out, result)
     if meshcat is not None:
         write_text(out / "meshcat.html", meshcat.StaticHtml())
     if result.failure is not None:
@@ -112,153 +89,72 @@ def _estimate(options: argparse.Namespace) -> bool:
         located(f"{options.scenario} over {options.log}: "),
         _progress(console, f"estimating with {name}", end - start) as progress,
     ):
-        result = estimate(scenario, log, progress=lambda time: progress(time - start))
-    estimated = replace(
-        result.log, meta=result.log.meta | {"estimator_scenario": dump_scenario(scenario, name)}
-    )
-    metrics = run_metrics(estimated, float(result.tick_time.sum()), result.tick_time)
-    _write_results(console, out, name, scenario, estimated, metrics)
+        result = estimate(scenario, log, name=name, progress=lambda time: progress(time - start))
+    _write_run(console, out, result)
     for remark in result.remarks:
         console.print(remark, highlight=False, markup=False, soft_wrap=True)
     return True
 
 
 def _compare(options: argparse.Namespace) -> bool:
-    console, scenario, inputs, log, out = _scenario_and_log(options, "_compare")
-    with _errors_located(options), console.status("comparing the model with the log"):
-        # Nothing is fitted, so nothing is set aside.
-        predictor = _checked(scenario, log)
-        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
-        comparison = compare(predictor)
-    _write_findings(out, "compare", comparison_json(comparison), scenario, inputs)
-    with console.status("writing the report"):
-        write_compare_report(out / "report.html", comparison, predictor, inputs)
-    table = Table("failure, worst first", title=inputs.name, title_justify="left")
-    for failure in comparison.failures[:_SHOWN]:
-        table.add_row(failure.text)
-    _conclude(console, out, inputs.hygiene, compare_outcome(comparison), table)
+    given = _scenario_and_log(options, "_compare")
+    with (
+        _errors_located(options),
+        given.console.status("comparing the model with the log"),
+    ):
+        result = compare(given.scenario, given.log, name=given.inputs.name)
+    _conclude(given, result)
     return True
 
 
 def _diagnose(options: argparse.Namespace) -> bool:
-    console, scenario, inputs, log, out = _scenario_and_log(options, "_diagnose")
-    train, tests = _train_and_tests(scenario, log, options)
-    with _errors_located(options), _told(console, options.time_limit) as progress:
-        predictor = _checked(scenario, train)
-        inputs = replace(
-            inputs,
-            hygiene=inspect(predictor.motion, predictor.noise),
-            tests=tuple(map(str, options.test)),
+    given = _scenario_and_log(options, "_diagnose")
+    with _errors_located(options), _told(given.console, options.time_limit) as progress:
+        result = diagnose(
+            given.scenario,
+            given.log,
+            tests=_tests(options),
+            name=given.inputs.name,
+            progress=progress,
         )
-        comparison = compare(predictor)
-        trusted = inputs.hygiene.trusted(scenario, predictor.robot)
-        diagnosis = diagnose(Predictor(trusted, train), progress=progress)
-        if diagnosis.chosen:
-            completed = add(trusted, diagnosis.chosen)
-            set_aside = {
-                name: validated(Predictor(trusted, test), Predictor(completed, test))
-                for name, test in tests.items()
-            }
-            diagnosis = replace(diagnosis, set_aside=set_aside)
-    _write_findings(out, "diagnosis", diagnosis_json(diagnosis), scenario, inputs)
-    with console.status("writing the report"):
-        write_diagnosis_report(out / "report.html", diagnosis, comparison, predictor, inputs)
-    _conclude(
-        console,
-        out,
-        inputs.hygiene,
-        diagnosis_outcome(diagnosis),
-        _findings_table(inputs.name, diagnosis.ranking[:_SHOWN]),
-    )
-    return diagnosis.partial is None
+    _conclude(given, result)
+    return result.partial is None
 
 
 def _study(options: argparse.Namespace) -> bool:
-    console, scenario, inputs, log, out = _scenario_and_log(options, "_study")
-    train, tests = _train_and_tests(scenario, log, options)
-    with _errors_located(options), _told(console, options.time_limit) as progress:
-        predictor = _checked(scenario, train)
-        inputs = replace(
-            inputs,
-            hygiene=inspect(predictor.motion, predictor.noise),
-            tests=tuple(map(str, options.test)),
+    given = _scenario_and_log(options, "_study")
+    with _errors_located(options), _told(given.console, options.time_limit) as progress:
+        result = study(
+            given.scenario,
+            given.log,
+            tests=_tests(options),
+            name=given.inputs.name,
+            progress=progress,
+            jobs=options.jobs,
         )
-        comparison = compare(predictor)
-        scenario = inputs.hygiene.trusted(scenario, predictor.robot)
-        result = study(scenario, train, tests=tests, progress=progress, jobs=options.jobs)
-        after = Predictor(result.scenario, train) if result.found else predictor
-        completed = (after, compare(after) if result.found else comparison)
-    _write_findings(out, "study", study_json(result), scenario, inputs)
-    if result.found:
-        write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
-    with console.status("writing the report"):
-        write_study_report(
-            out / "report.html", result, (predictor, comparison), completed, inputs, tests
-        )
-    relative = (
-        [name for name, error in result.steps[0].errors.items() if np.isfinite(error.relative)]
-        if tests
-        else []
-    )
-    columns = [f"relative error, {name}" for name in relative]
-    table = Table(
-        "added",
-        "held-out error / noise",
-        "fitted error / noise",
-        *columns,
-        title=inputs.name,
-        title_justify="left",
-    )
-    for step in result.steps:
-        effects = [
-            f"{spaced(effect)} ({targets_text(targets)})"
-            for effect, targets in by_effect(step.added).items()
-        ]
-        added = ", ".join(effects) or "the model as given"
-        shares = (f"{100 * step.errors[name].relative:.2f} %" for name in relative)
-        table.add_row(added, number(step.held_out_rmse), number(step.train_rmse), *shares)
-    _conclude(
-        console,
-        out,
-        inputs.hygiene,
-        f"{study_outcome(result)} Stopped because {result.stopped_because}.",
-        table,
-    )
+    _conclude(given, result)
     return not result.partial
 
 
 def _identify(options: argparse.Namespace) -> bool:
-    console, scenario, inputs, log, out = _scenario_and_log(options, "_identify")
-    train, tests = _train_and_tests(scenario, log, options)
-    with _errors_located(options), _told(console) as progress:
-        predictor = _checked(scenario, train)
-        inputs = replace(inputs, hygiene=inspect(predictor.motion, predictor.noise))
-        result = identify(scenario, train, tests, progress=progress)
-    _write_findings(out, "identify", identification_json(result), scenario, inputs)
-    write_text(out / "completed.yaml", dump_scenario(result.scenario, inputs.name))
-    write_identification_report(out / "report.html", result, inputs.name)
-    console.print(identifiability_text(result.inertia), highlight=False)
-    table = Table(*BASE_HEADER, title=inputs.name, title_justify="left")
-    for base in result.inertia.base_parameters:
-        table.add_row(
-            f"{base.body} {base.parameter}{', with others' if base.others else ''}",
-            *base_row(base)[1:],
+    given = _scenario_and_log(options, "_identify")
+    with _errors_located(options), _told(given.console) as progress:
+        result = identify(
+            given.scenario,
+            given.log,
+            tests=_tests(options),
+            name=given.inputs.name,
+            progress=progress,
         )
-    console.print(table)
-    errors = Table(*ERROR_HEADER)
-    for row in error_rows(result):
-        errors.add_row(*row)
-    _conclude(console, out, inputs.hygiene, identification_outcome(result), errors)
+    given.console.print(identifiability_text(result.inertia), highlight=False)
+    given.console.print(_printed(base_table(result), given.inputs.name))
+    _conclude(given, result)
     return True
 
 
-def _train_and_tests(
-    scenario: Scenario, log: Log, options: argparse.Namespace
-) -> tuple[Log, dict[str, Log]]:
-    """What models are fitted to, and logs to test them on, by name."""
-    train, rest = train_and_rest(scenario, log)
-    tests = {"rest of the log": rest} if rest is not None else {}
-    return train, tests | {path.stem: read_log(path, options.map) for path in options.test}
+def _tests(options: argparse.Namespace) -> dict[str, Log]:
+    """Logs to test models on, by name."""
+    return {path.stem: read_log(path, options.map) for path in options.test}
 
 
 def _convert(options: argparse.Namespace) -> bool:
@@ -296,19 +192,29 @@ def _convert(options: argparse.Namespace) -> bool:
     return True
 
 
-def _scenario_and_log(
-    options: argparse.Namespace, suffix: str
-) -> tuple[Console, Scenario, Inputs, Log, Path]:
+@dataclass(frozen=True)
+class _Given:
+    """What the discrepancy commands are given."""
+
+    console: Console
+    scenario: Scenario
+    log: Log
+    inputs: Inputs
+    out: Path
+
+
+def _scenario_and_log(options: argparse.Namespace, suffix: str) -> _Given:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
     log = read_log(options.log, options.map)
     out = _output_folder(options, suffix)
-    return (
-        Console(quiet=options.quiet),
-        scenario,
-        Inputs(name, options.scenario, str(options.log), str(out)),
-        log,
-        out,
+    inputs = Inputs(
+        name,
+        options.scenario,
+        str(options.log),
+        str(out),
+        tuple(map(str, getattr(options, "test", ()))),
     )
+    return _Given(Console(quiet=options.quiet), scenario, log, inputs, out)
 
 
 def _errors_located(options: argparse.Namespace) -> AbstractContextManager[None]:
@@ -343,52 +249,28 @@ def _told(
         yield lines
 
 
-def _checked(scenario: Scenario, log: Log) -> Predictor:
-    """The scenario's model over a log whose sensors are what they are said to be."""
-    predictor = Predictor(scenario, log)
-    check_sensors(predictor.motion)
-    return predictor
-
-
-def _write_findings(
-    out: Path, kind: str, content: dict[str, Any], scenario: Scenario, inputs: Inputs
-) -> None:
-    """Writes what was found, under its own name and as metrics.json, and the scenario."""
-    content = {**content, "hygiene": hygiene_json(inputs.hygiene)}
-    write_json(out / f"{kind}.json", content)
-    write_json(out / "metrics.json", content)
-    write_text(out / "scenario.yaml", dump_scenario(scenario, inputs.name))
-
-
-def _conclude(console: Console, out: Path, hygiene: Hygiene, outcome: str, table: Table) -> None:
-    """Prints the result, after what is remarkable about the log."""
-    if hygiene.findings:
+def _conclude(given: _Given, result: AnalysisResult) -> None:
+    """Writes a result, and prints it after what is remarkable about the log."""
+    console = given.console
+    with console.status("writing the report"):
+        result.save(given.out, given.inputs)
+    if result.hygiene.findings:
         remarks = Table("data hygiene", "", title_justify="left")
-        for finding in hygiene.findings[:_SHOWN]:
+        for finding in result.hygiene.findings[:_SHOWN]:
             remarks.add_row(finding.severity, finding.text)
         console.print(remarks)
-    if table.row_count:
-        console.print(table)
-    console.print(hygiene.before(outcome), highlight=False)
-    console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+    if (table := result.table()).rows:
+        console.print(_printed(table, given.inputs.name))
+    console.print(result.outcome, highlight=False)
+    console.print(f"Report: {given.out / 'report.html'}", highlight=False, soft_wrap=True)
 
 
-def _findings_table(title: str, findings: Sequence[Finding]) -> Table:
-    table = Table(
-        "effect",
-        "in",
-        "held-out error before",
-        "after",
-        "values (95 % interval)",
-        title=title,
-        title_justify="left",
-    )
-    for finding in findings:
-        name = spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})"
-        errors = (number(error) for error in (finding.held_out_before, finding.held_out_after))
-        cells = (name, targets_text(finding.targets), *errors, parameters_text(finding))
-        table.add_row(*map(Text, cells))
-    return table
+def _printed(table: ReportTable, title: str) -> Table:
+    """A table of a report for the terminal; names and texts as they are."""
+    shown = Table(*table.header, title=title, title_justify="left")
+    for row in table.rows:
+        shown.add_row(*(Text(str(cell)) for cell in row))
+    return shown
 
 
 def _add(options: argparse.Namespace) -> bool:
@@ -420,7 +302,7 @@ def _add(options: argparse.Namespace) -> bool:
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
     console = Console(quiet=options.quiet)
-    console.print(_findings_table(name, findings))
+    console.print(_printed(findings_table(findings), name))
     console.print(f"Scenario: {out}", highlight=False, soft_wrap=True)
     return True
 
@@ -445,23 +327,23 @@ def _hide(options: argparse.Namespace) -> bool:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
     out = _output_folder(options, "_hidden")
     console = Console(quiet=options.quiet)
-    start = clock.perf_counter()
     with (
         located(f"{options.scenario}: "),
         _progress(console, f"simulating {name}", scenario.duration) as progress,
     ):
-        hide(
+        start = clock.perf_counter()
+        exercise = make_exercise(
             scenario,
             name,
             options.seed,
-            out,
             what=options.what,
             size=options.size,
             count=options.count,
             progress=progress,
         )
-    log, (_, public) = Log.load(out / "log.npz"), read_scenario(str(out / "scenario.yaml"))
-    _write_results(console, out, name, public, log, run_metrics(log, clock.perf_counter() - start))
+    took = clock.perf_counter() - start
+    _write_run(console, out, SimulationResult(exercise.log, None, took, exercise.scenario, name))
+    write_text(out / "answer.sealed", seal(exercise.answer))
     console.print(
         f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}",
         highlight=False,
@@ -472,31 +354,25 @@ def _hide(options: argparse.Namespace) -> bool:
 
 def _reveal(options: argparse.Namespace) -> bool:
     revealed = reveal(options.folder)
-    answer, score = revealed["answer"], revealed["score"]
-    write_json(options.folder / "answer.json", revealed)
+    answer = revealed.answer
+    write_json(options.folder / "answer.json", revealed.json())
     console = Console(quiet=options.quiet)
     table = Table(
-        "hidden", "in", "values", title=f"{options.folder}: {answer['kind']}", title_justify="left"
+        "hidden", "in", "values", title=f"{options.folder}: {answer.kind}", title_justify="left"
     )
-    for effect in answer["effects"]:
+    for effect in answer.effects:
         values = (
             f"{key} {number(float(next(iter(by_target.values()))))}"
-            for key, by_target in effect["parameters"].items()
+            for key, by_target in effect.parameters.items()
         )
-        table.add_row(spaced(effect["effect"]), targets_text(effect["targets"]), ", ".join(values))
-    console.print(table if answer["effects"] else "Nothing was hidden.")
-    if score is None:
+        table.add_row(spaced(effect.effect), targets_text(effect.targets), ", ".join(values))
+    console.print(table if answer.effects else "Nothing was hidden.")
+    if revealed.score is None:
         console.print(
             f"No diagnosis.json or study.json in {options.folder} to score.", highlight=False
         )
-        return True
-    verdict = "right" if score["verdict"] else "wrong"
-    found = ", ".join(
-        f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in score["found"].items()
-    )
-    console.print(
-        "; ".join(part for part in (f"Verdict: {verdict}", found) if part) + ".", highlight=False
-    )
+    else:
+        console.print(revealed.score.text, highlight=False)
     return True
 
 
@@ -579,6 +455,21 @@ def _write_lines(path: Path, lines: Sequence[Sequence[object]]) -> None:
         csv.writer(file).writerows(lines)
 
 
+def _list(options: argparse.Namespace) -> bool:
+    kinds = [options.what] if options.what else LISTED
+    found = {kind: listing(kind) for kind in kinds}
+    if options.json:
+        print(json.dumps(found, indent=2))
+        return True
+    console = Console(quiet=options.quiet)
+    for kind, lines in found.items():
+        table = Table(title=kind, show_header=False, title_justify="left", box=None)
+        for name, text in lines.items():
+            table.add_row(Text(name), Text(text))
+        console.print(table)
+    return True
+
+
 @contextmanager
 def _extra_installed(what: str) -> Iterator[None]:
     """Says what to install if an import inside fails."""
@@ -591,17 +482,12 @@ def _extra_installed(what: str) -> Iterator[None]:
         raise InputError(f"{what} need {error.name}: {needed}") from None
 
 
-def _write_results(
-    console: Console, out: Path, name: str, scenario: Scenario, log: Log, metrics: dict[str, Any]
-) -> None:
+def _write_run(console: Console, out: Path, result: RunResult) -> None:
     """Writes log, metrics, scenario and report, and says what came out."""
     with console.status("writing the report"):
-        log.save(out / "log.npz")
-        write_json(out / "metrics.json", metrics)
-        write_text(out / "scenario.yaml", dump_scenario(scenario, name))
-        write_run_report(out / "report.html", log, metrics, name=name)
-    console.print(_summary(name, metrics))
-    if sentence := law_sentence(metrics["friction_law_error"]):
+        result.save(out)
+    console.print(_summary(result.name, result.metrics))
+    if sentence := law_sentence(result.metrics["friction_law_error"]):
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
 
@@ -719,4 +605,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "reveal": _reveal,
     "campaign": _campaign,
     "table": _table,
+    "list": _list,
 }

@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import make_estimator
 from fbse_drake.estimators.recursive import start_share
 from fbse_drake.log import Log
+from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
-from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.scenario import Scenario, build_robot, dump_scenario, planned_reference
 from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
 from fbse_drake.walking.plan import TaskPlan
@@ -21,18 +23,29 @@ from fbse_drake.walking.reference import Recorded
 from fbse_drake.wiring import release
 
 
-@dataclass(frozen=True)
-class EstimationResult:
+@dataclass(frozen=True, eq=False)
+class EstimationResult(RunResult):
     """A log with the estimates in its `estimate/...` channels, and the time that each tick took [s], shape (N,)."""
 
     log: Log
     tick_time: np.ndarray
     # For the reader: what the sensors are believed to be, and what could not be estimated.
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...]
+    scenario: Scenario
+    name: str
+
+    def _metrics(self) -> dict[str, Any]:
+        from fbse_drake.report.metrics import run_metrics
+
+        return run_metrics(self.log, float(self.tick_time.sum()), self.tick_time)
 
 
 def estimate(
-    scenario: Scenario, log: Log, *, progress: Callable[[float], None] | None = None
+    scenario: Scenario,
+    log: Log,
+    *,
+    name: str = "scenario",
+    progress: Callable[[float], None] | None = None,
 ) -> EstimationResult:
     """Runs the scenario's estimator over a log, sample by sample, with the very LeafSystems that run in the station.
 
@@ -41,6 +54,7 @@ def estimate(
     `joint/torque_command` an `Fbse` estimates all but the friction.
 
     Args:
+        name: what the scenario is called in the log.
         progress: called with the log's time [s] as the work goes on.
 
     Raises:
@@ -52,7 +66,9 @@ def estimate(
     kept = {
         name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")
     }
-    return EstimationResult(replace(log, channels=kept | values), tick_time, replay.remarks)
+    meta = log.meta | {"estimator_scenario": dump_scenario(scenario, name)}
+    estimated = Log(kept | values, meta)
+    return EstimationResult(estimated, tick_time, replay.remarks, scenario, name)
 
 
 def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:

@@ -11,13 +11,17 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.files import write_atomically
 from fbse_drake.signals import channel_kind
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 FORMAT_VERSION = 1
 
@@ -109,6 +113,26 @@ class Log(Mapping[str, np.ndarray]):
     def part(self, rows: slice) -> "Log":
         """Some of its samples."""
         return Log({name: values[rows] for name, values in self.channels.items()}, self.meta)
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """As a data frame, see `fbse_drake.interop.frames`.
+
+        Raises:
+            InputError: pandas is not installed (`fbse_drake[data]`).
+        """
+        from fbse_drake.interop.frames import to_pandas
+
+        return to_pandas(self)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """As a data set, see `fbse_drake.interop.frames`.
+
+        Raises:
+            InputError: xarray is not installed (`fbse_drake[data]`).
+        """
+        from fbse_drake.interop.frames import to_xarray
+
+        return to_xarray(self)
 
     def save(self, path: str | Path) -> None:
         """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""

@@ -22,11 +22,15 @@ def find(name_or_path: str | Path, *, kind: str) -> Path:
     path = Path(name_or_path)
     if path.is_file():
         return path
-    shipped = folder(kind) / f"{name_or_path}.yaml"
-    if path.suffix == "" and shipped.is_file():
-        return shipped
-    files = (p.relative_to(folder(kind)).with_suffix("") for p in folder(kind).rglob("*.yaml"))
-    names = ", ".join(sorted(p.as_posix() for p in files if p.suffix not in (".dmd", ".map")))
+    named = folder(kind) / f"{name_or_path}.yaml"
+    if path.suffix == "" and named.is_file():
+        return named
     raise InputError(
-        f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {names})"
+        f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {', '.join(shipped(kind))})"
     )
+
+
+def shipped(kind: str) -> list[str]:
+    """Names of the files in the folder `models` or `scenarios`, in order."""
+    files = (p.relative_to(folder(kind)).with_suffix("") for p in folder(kind).rglob("*.yaml"))
+    return sorted(p.as_posix() for p in files if p.suffix not in (".dmd", ".map"))

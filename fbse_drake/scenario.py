@@ -322,6 +322,10 @@ class Scenario:
                     f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}"
                 )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As its YAML text, for Drake's settings cannot be pickled."""
+        return _from_text, (dump_scenario(self, "scenario"),)
+
     @property
     def usual_period(self) -> float:
         """The fewest whole steps of the plant that last a millisecond [s]."""
@@ -512,6 +516,13 @@ def check_joints(scenario: Scenario) -> None:
 def dump_scenario(scenario: Scenario, name: str) -> str:
     """YAML text that `load_scenario` reads back to an equal scenario."""
     return schema.dump(scenario, child_name=name)
+
+
+def _from_text(text: str) -> Scenario:
+    """Reads what `dump_scenario` wrote, with the modules that it names."""
+    tree = yaml_load(data=text)["scenario"]
+    import_effect_modules(tree.get("effect_modules", []), Path())
+    return schema.build(Scenario, tree, file="pickled scenario")
 
 
 def _override(text: str) -> tuple[str, Any]:

@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -20,6 +21,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_
 from fbse_drake.effects.system import loss_over_time
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
+from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
@@ -33,8 +35,8 @@ INTERRUPTED = "interrupted"
 _LOOK_PERIOD = 0.01
 
 
-@dataclass(frozen=True)
-class SimulationResult:
+@dataclass(frozen=True, eq=False)
+class SimulationResult(RunResult):
     """A finished run."""
 
     log: Log
@@ -42,6 +44,13 @@ class SimulationResult:
     failure: str | None
     # Time the loop took, without building and recording [s].
     wall_time: float
+    scenario: Scenario
+    name: str
+
+    def _metrics(self) -> dict[str, Any]:
+        from fbse_drake.report.metrics import run_metrics
+
+        return run_metrics(self.log, self.wall_time)
 
 
 def simulate(
@@ -138,7 +147,7 @@ def _simulate(
         failure = f"t = {end:.3f} s: {failure}"
     log = _make_log(scenario, name, station, sink.FindLog(context), failure, fell)
     release(diagram)
-    return SimulationResult(log, failure, wall_time)
+    return SimulationResult(log, failure, wall_time, scenario, name)
 
 
 def fall_reason(

@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fbse_drake import Log, load_scenario, simulate
+from fbse_drake import Log, diagnose, load_scenario, simulate, study
 from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
-from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
-from fbse_drake.discrepancy.diagnosis.study import study
 from fbse_drake.effects.effect import library
 from fbse_drake.schema import load_tree
 from fbse_drake.simulate import fall_reason
@@ -237,7 +235,7 @@ def test_a_copied_scenario_does_not_overwrite_the_original(
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports are empty, which saves the time to draw them."""
     monkeypatch.setattr(
-        "fbse_drake.commands.write_run_report", lambda path, *_, **__: path.write_text("report")
+        "fbse_drake.report.run.write_run_report", lambda path, *_, **__: path.write_text("report")
     )
 
 
@@ -247,7 +245,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "fbse_drake.commands.write_run_report", lambda path, *_, **__: path.write_text("report")
+            "fbse_drake.report.run.write_run_report",
+            lambda path, *_, **__: path.write_text("report"),
         )
         assert main(["simulate", *WALK, "--out", str(folder), "--quiet"]) == DONE
     return folder
@@ -511,7 +510,7 @@ def undrawn_findings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of compare, diagnose and study are empty."""
     for kind in ("compare", "diagnosis", "study"):
         monkeypatch.setattr(
-            f"fbse_drake.commands.write_{kind}_report",
+            f"fbse_drake.analysis.write_{kind}_report",
             lambda path, *_, **__: path.write_text("report"),
         )
 

@@ -3,7 +3,7 @@
 import base64
 import itertools
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from fbse_drake.discrepancy.exercises.hidden import (
     Answer,
     HiddenEffect,
     draw,
-    hide,
     make_exercise,
     record,
     reveal,
@@ -246,7 +245,7 @@ def test_a_gantry_hides_only_what_acts_on_joints():
 
 
 def test_exercise_tells_nothing_but_what_a_robot_would(walk: Scenario, tmp_path: Path):
-    hide(walk, "paper_walk", 2, tmp_path, what="StribeckFriction")
+    make_exercise(walk, "paper_walk", 2, what="StribeckFriction").save(tmp_path)
     log, scenario = Log.load(tmp_path / "log.npz"), load_scenario(tmp_path / "scenario.yaml")
     assert not [name for name in log if name.startswith(("truth/", "estimate/"))]
     # The model has what the robot was known to have, and the robot in the file no more.
@@ -258,8 +257,8 @@ def test_exercise_tells_nothing_but_what_a_robot_would(walk: Scenario, tmp_path:
     assert "Stribeck" not in sealed
     assert b"Stribeck" not in base64.b64decode(sealed.split()[1])
     revealed = reveal(tmp_path)
-    assert revealed["answer"]["effects"][0]["effect"] == "StribeckFriction"
-    assert revealed["score"] is None
+    assert revealed.answer.effects[0].effect == "StribeckFriction"
+    assert revealed.score is None
     again = make_exercise(walk, "paper_walk", 2, what="StribeckFriction")
     assert np.array_equal(again.log["joint/torque_command"], log["joint/torque_command"])
 
@@ -412,12 +411,12 @@ def test_reveal_scores_what_is_in_the_folder(tmp_path: Path):
     hidden = answer("TorqueBias", JOINT, bias=2.0)
     (tmp_path / "answer.sealed").write_text(seal(hidden))
     (tmp_path / "diagnosis.json").write_text(json.dumps(diagnosis(("JointSpring", (JOINT,), {}))))
-    assert reveal(tmp_path)["score"]["wrong"] == ("JointSpring",)
-    assert reveal(tmp_path)["answer"] == asdict(hidden)
+    assert reveal(tmp_path).score.wrong == ("JointSpring",)
+    assert reveal(tmp_path).answer == hidden
     # A study knows more than a diagnosis.
     right = diagnosis(("TorqueBias", (JOINT,), {}))
     (tmp_path / "study.json").write_text(json.dumps({"diagnoses": [right]}))
-    assert reveal(tmp_path)["score"]["first"]
+    assert reveal(tmp_path).score.first
     (tmp_path / "study.json").write_text("{}")
     with pytest.raises(
         InputError, match=r"study.json: not the contents of a study.json \(at 'diagnoses'\)"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import fbse_drake
 from fbse_drake import Log, Scenario, load_scenario
 from fbse_drake.cli import DONE, main
 from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding, diagnose
@@ -148,10 +149,13 @@ def test_terminal_json_and_report_are_headed_by_what_was_set_aside(
     """The rest of the log gets worse, another log better."""
     if command == "diagnose":
         monkeypatch.setattr(
-            "fbse_drake.commands.write_diagnosis_report",
+            "fbse_drake.analysis.write_diagnosis_report",
             lambda path, diagnosis, *_: path.write_text(diagnosis_outcome(diagnosis)),
         )
-    function = {"diagnose": diagnose, "study": functools.partial(study, rollouts=False)}[command]
+    function = {
+        "diagnose": fbse_drake.diagnose,
+        "study": functools.partial(fbse_drake.study, rollouts=False),
+    }[command]
     monkeypatch.setattr(f"fbse_drake.commands.{command}", functools.partial(function, effects=FEW))
     scenario, log = swing
     write_text(tmp_path / "legs.yaml", dump_scenario(scenario, "legs"))

@@ -246,3 +246,9 @@ def in_library(effect: T) -> T:
 def library() -> dict[str, type[Effect]]:
     """All effects by class name."""
     return dict(_LIBRARY)
+
+
+def spaced(name: str) -> str:
+    """An effect's class name for reading: `CoulombFriction` -> `Coulomb friction`."""
+    first, *rest = "".join(f" {letter}" if letter.isupper() else letter for letter in name).split()
+    return " ".join(["IMU" if first == "Imu" else first, *(part.lower() for part in rest)])

@@ -232,6 +232,49 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     return _headline(" ".join(parts), diagnosis.set_aside)
 
 
+def failures_table(comparison: Comparison) -> Table:
+    """Where the model fails, in words."""
+    shown = comparison.failures[:_FAILURES]
+    return Table(("failure, worst first",), tuple((failure.text,) for failure in shown))
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    """Findings with their values; what was not chosen stands in brackets."""
+    header = ("effect", "in", "held-out error before", "after", "values (95 % interval)")
+    rows = (
+        (
+            spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})",
+            targets_text(finding.targets),
+            number(finding.held_out_before),
+            number(finding.held_out_after),
+            parameters_text(finding),
+        )
+        for finding in findings[:_FAILURES]
+    )
+    return Table(header, tuple(rows))
+
+
+def steps_table(study: Study, *, tested: bool) -> Table:
+    """What was added, step by step, and the errors that were left.
+
+    Args:
+        tested: also says the relative errors on the logs that the model was tested on.
+    """
+    first = study.steps[0].errors
+    logs = [name for name in first if np.isfinite(first[name].relative)] if tested else []
+    header = ("added", "held-out error / noise", "fitted error / noise")
+    rows = []
+    for step in study.steps:
+        effects = (
+            f"{spaced(effect)} ({targets_text(targets)})"
+            for effect, targets in by_effect(step.added).items()
+        )
+        shares = (f"{100 * step.errors[name].relative:.2f} %" for name in logs)
+        added = ", ".join(effects) or "the model as given"
+        rows.append((added, number(step.held_out_rmse), number(step.train_rmse), *shares))
+    return Table((*header, *(f"relative error, {name}" for name in logs)), tuple(rows))
+
+
 def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
     """A result with what it is worth on data that was set aside; if that is nothing, it comes first."""
     refuted = {name: one for name, one in set_aside.items() if one.course != "falls"}

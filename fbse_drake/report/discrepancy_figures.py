@@ -22,7 +22,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus, Estimate, Fi
 from fbse_drake.discrepancy.diagnosis.study import StudyStep
 from fbse_drake.discrepancy.residual.residual import Residual, Row
 from fbse_drake.discrepancy.residual.rollout import RolloutError
-from fbse_drake.effects.effect import library
+from fbse_drake.effects.effect import library, spaced
 from fbse_drake.report.figures import (
     ESTIMATE,
     PLANNED,
@@ -546,12 +546,6 @@ def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
     )
     add_legend(figure)
     return figure
-
-
-def spaced(name: str) -> str:
-    """An effect's class name for reading: `CoulombFriction` -> `Coulomb friction`."""
-    first, *rest = "".join(f" {letter}" if letter.isupper() else letter for letter in name).split()
-    return " ".join(["IMU" if first == "Imu" else first, *(part.lower() for part in rest)])
 
 
 def finding_name(finding: Finding) -> str:

@@ -101,6 +101,15 @@ def numeric_table(
 
 def render_report(report: Report) -> str:
     """The report as HTML text that refers to nothing outside itself."""
+    return _environment().get_template("report.html.j2").render(report=report)
+
+
+def render_fragment(outcome: str, tables: Sequence[Table]) -> str:
+    """A result and tables as HTML without styles, to be shown inside another page."""
+    return _environment().get_template("fragment.html.j2").render(outcome=outcome, tables=tables)
+
+
+def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("fbse_drake.report"),
         autoescape=True,
@@ -110,7 +119,7 @@ def render_report(report: Report) -> str:
     )
     environment.filters["number"] = number
     environment.filters["png"] = _png_uri
-    return environment.get_template("report.html.j2").render(report=report)
+    return environment
 
 
 def write_report(path: str | Path, report: Report) -> None:

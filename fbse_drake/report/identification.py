@@ -37,8 +37,20 @@ def base_row(base: BaseParameter) -> tuple[str, ...]:
     )
 
 
-def error_rows(result: Identification) -> list[tuple[str, ...]]:
-    """Relative errors of all joints together under `ERROR_HEADER`, then of each joint."""
+def base_table(result: Identification) -> Table:
+    """Combinations of inertial parameters that a log tells apart, with the first of each alone."""
+    rows = (
+        (
+            f"{base.body} {base.parameter}{', with others' if base.others else ''}",
+            *base_row(base)[1:],
+        )
+        for base in result.inertia.base_parameters
+    )
+    return Table(BASE_HEADER, tuple(rows))
+
+
+def errors_table(result: Identification) -> Table:
+    """Relative errors of all joints together, then of each joint, by log."""
     rows = []
     for name, after in result.after.items():
         before = result.before[name]
@@ -51,7 +63,7 @@ def error_rows(result: Identification) -> list[tuple[str, ...]]:
                     f"{100 * share:.2f} %",
                 )
             )
-    return rows
+    return Table(ERROR_HEADER, tuple(rows))
 
 
 def identification_outcome(result: Identification) -> str:
@@ -99,7 +111,7 @@ def write_identification_report(path: str | Path, result: Identification, name: 
         Section(
             "Errors",
             "|residual| / |torque|, 2-norms.",
-            (Table(ERROR_HEADER, tuple(error_rows(result))),),
+            (errors_table(result),),
         ),
         Section("Bodies", _BODIES_TEXT, (Table(("parameter", *BASE_HEADER[1:]), tuple(bodies)),)),
         Section(

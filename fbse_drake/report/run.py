@@ -45,7 +45,7 @@ def write_run_report(
         for topic, blocks in run_figures(log, outlines=outlines or None, pads=pads or None).items()
     }
     sections = [
-        Section("Summary", log.meta.get("title", ""), tables=_key_figures(metrics)),
+        Section("Summary", log.meta.get("title", ""), tables=(key_figures(metrics),)),
         Section("Motion", figures=figures["walk"]),
         Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
         Section("Foot forces", figures=figures["forces"]),
@@ -72,7 +72,7 @@ def write_run_report(
     shown = tuple(
         section for section in sections if section.tables or section.figures or section.details
     )
-    write_report(path, Report(name, not metrics["fell"], _outcome(metrics), shown))
+    write_report(path, Report(name, not metrics["fell"], run_outcome(metrics), shown))
 
 
 def law_sentence(law_error: Mapping[str, float]) -> str:
@@ -98,7 +98,8 @@ _CONSISTENCY = (
 )
 
 
-def _outcome(metrics: Mapping[str, Any]) -> str:
+def run_outcome(metrics: Mapping[str, Any]) -> str:
+    """How a run ended, in one sentence."""
     if metrics["outcome"] == "recorded":
         return f"A recording of {number(metrics['simulated_time'])} s."
     if metrics["outcome"] != "finished":
@@ -106,7 +107,8 @@ def _outcome(metrics: Mapping[str, Any]) -> str:
     return f"The run finished after {number(metrics['simulated_time'])} s."
 
 
-def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
+def key_figures(metrics: Mapping[str, Any]) -> Table:
+    """The figures of a run that are known."""
     tracking, law = metrics["joint_tracking_rms"], metrics["friction_law_error"]
     worst, farthest = worst_joint(tracking), worst_joint(law)
     rows = [
@@ -149,7 +151,8 @@ def _key_figures(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
             for statistic, value in metrics["tick_us"].items()
         ),
     ]
-    return numeric_table(("", "Value", "Unit"), rows)
+    (table,) = numeric_table(("", "Value", "Unit"), rows)
+    return table
 
 
 def _tracking_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:

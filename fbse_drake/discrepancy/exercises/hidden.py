@@ -12,12 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnosis_json
 from fbse_drake.discrepancy.exercises.sizes import SIZES, Size
 from fbse_drake.discrepancy.exercises.strangers import STRANGERS
-from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.effect import Effect, library, spaced
 from fbse_drake.errors import InputError
 from fbse_drake.files import write_text
 from fbse_drake.log import Log
+from fbse_drake.results import made_folder
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, dump_scenario
 from fbse_drake.simulate import simulate
@@ -244,6 +246,18 @@ class Exercise:
     log: Log
     answer: Answer
 
+    def save(self, folder: str | Path) -> None:
+        """Writes log.npz, scenario.yaml, and the answer sealed (answer.sealed) to a folder."""
+        out = made_folder(folder)
+        self.log.save(out / "log.npz")
+        write_text(out / "scenario.yaml", self.log.meta["scenario"])
+        write_text(out / "answer.sealed", seal(self.answer))
+
+    def reveal(self, *diagnoses: Diagnosis) -> "Revealed":
+        """The answer, with a score for what was found; of a study its `diagnoses`, in order."""
+        found = [diagnosis_json(diagnosis) for diagnosis in diagnoses]
+        return Revealed(self.answer, score(self.answer, found) if found else None)
+
 
 def draw(
     scenario: Scenario,
@@ -450,26 +464,6 @@ def record(
     )
 
 
-def hide(
-    scenario: Scenario,
-    name: str,
-    seed: int,
-    out: Path,
-    *,
-    what: str = "any",
-    size: Size | None = None,
-    count: int = 1,
-    progress: Callable[[float], None] | None = None,
-) -> None:
-    """Writes an exercise to a folder: `log.npz`, `scenario.yaml` and `answer.sealed`. Arguments: see `make_exercise`."""
-    exercise = make_exercise(
-        scenario, name, seed, what=what, size=size, count=count, progress=progress
-    )
-    exercise.log.save(out / "log.npz")
-    write_text(out / "scenario.yaml", dump_scenario(exercise.scenario, name))
-    write_text(out / "answer.sealed", seal(exercise.answer))
-
-
 def seal(answer: Answer) -> str:
     """Text of an answer that nobody reads by accident: a checksum, then the answer."""
     content = zlib.compress(json.dumps(asdict(answer)).encode())
@@ -497,11 +491,8 @@ def unseal(text: str) -> Answer:
     return Answer(**(tree | {"effects": effects}))
 
 
-def reveal(folder: Path) -> dict[str, Any]:
+def reveal(folder: Path) -> "Revealed":
     """Opens the answer of an exercise; scores the diagnosis or study in the same folder, if there is one.
-
-    Returns:
-        `answer` as in `Answer`, and `score` as in `Score` or None.
 
     Raises:
         InputError: no exercise, a damaged answer or diagnosis.
@@ -518,12 +509,12 @@ def reveal(folder: Path) -> dict[str, Any]:
             try:
                 found = json.loads(file.read_text())
                 diagnoses = found["diagnoses"] if file.stem == "study" else [found]
-                return {"answer": asdict(answer), "score": asdict(score(answer, diagnoses))}
+                return Revealed(answer, score(answer, diagnoses))
             except (ValueError, KeyError, TypeError) as error:
                 raise InputError(
                     f"{file}: not the contents of a {file.name} (at {error})"
                 ) from None
-    return {"answer": asdict(answer), "score": None}
+    return Revealed(answer, None)
 
 
 @dataclass(frozen=True)
@@ -544,6 +535,42 @@ class Score:
     covered: dict[str, bool]
     # For a stranger: are exactly its joints said to have something unexplained?
     joints: bool
+
+    @property
+    def text(self) -> str:
+        """As `Verdict: right; Coulomb friction found.`"""
+        parts = [f"Verdict: {'right' if self.verdict else 'wrong'}"]
+        parts += [
+            f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in self.found.items()
+        ]
+        return f"{'; '.join(parts)}."
+
+
+@dataclass(frozen=True)
+class Revealed:
+    """The answer of an exercise, and how good a diagnosis of it is, if there is one."""
+
+    answer: Answer
+    score: Score | None
+
+    @property
+    def outcome(self) -> str:
+        """What was hidden, and whether it was found."""
+        hidden = "; ".join(
+            f"{spaced(effect.effect)} in {', '.join(effect.targets)}"
+            for effect in self.answer.effects
+        )
+        lines = [f"Hidden: {hidden}." if hidden else "Nothing was hidden."]
+        return " ".join([*lines, *([self.score.text] if self.score else [])])
+
+    def json(self) -> dict[str, Any]:
+        """Contents of answer.json."""
+        return asdict(self)
+
+    def _repr_html_(self) -> str:
+        from fbse_drake.report.html import render_fragment
+
+        return render_fragment(self.outcome, ())
 
 
 def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:

@@ -1,0 +1,479 @@
+"""What a model lacks, of a scenario and a log: the functions behind the commands of their names.
+
+    result = diagnose(scenario, log)
+    result.verdict, result.chosen      # what was found
+    result                             # in a notebook: the verdict and what speaks for it
+    result.save("out/diagnosis")       # what `fbse diagnose` writes
+    completed = add(scenario, result)  # a scenario whose model has it
+
+Recordings are inspected before anything is fitted to them (`result.hygiene`), and joints whose
+torque cannot be trusted are left out. Models are fitted to the first share of a log
+(`RecordingConfig.train_share`), and tested on the rest and on further logs, `tests`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+from fbse_drake.discrepancy.diagnosis import add as addition
+from fbse_drake.discrepancy.diagnosis import compare as comparing
+from fbse_drake.discrepancy.diagnosis import diagnose as diagnosing
+from fbse_drake.discrepancy.diagnosis import identify as identifying
+from fbse_drake.discrepancy.diagnosis import study as studying
+from fbse_drake.discrepancy.diagnosis.compare import Comparison
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding
+from fbse_drake.discrepancy.diagnosis.identify import Identification
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.study import Study, train_and_rest
+from fbse_drake.discrepancy.diagnosis.validation import validated
+from fbse_drake.discrepancy.exercises import hidden
+from fbse_drake.discrepancy.exercises.hidden import Exercise, Revealed, Size
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
+from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.residual.residual import Residual
+from fbse_drake.effects.effect import Effect
+from fbse_drake.errors import InputError
+from fbse_drake.files import write_text
+from fbse_drake.interop.convert import read_logs
+from fbse_drake.interop.export import writer_for
+from fbse_drake.log import Log
+from fbse_drake.progress import Progress, silent
+from fbse_drake.report.discrepancy import (
+    Inputs,
+    compare_outcome,
+    diagnosis_outcome,
+    failures_table,
+    findings_table,
+    steps_table,
+    study_outcome,
+    write_compare_report,
+    write_diagnosis_report,
+    write_study_report,
+)
+from fbse_drake.report.html import Table
+from fbse_drake.report.identification import (
+    errors_table,
+    identification_outcome,
+    write_identification_report,
+)
+from fbse_drake.report.metrics import write_json
+from fbse_drake.results import Result, made_folder
+from fbse_drake.robot.plant import Robot
+from fbse_drake.scenario import Scenario, dump_scenario
+
+# What the part of a log that nothing is fitted to is called.
+_REST = "rest of the log"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scenario's model over a log."""
+
+    name: str
+    scenario: Scenario
+    # As it was given; the part of it that models are fitted to; and logs that they are not fitted
+    # to, by name, the rest of the first among them.
+    log: Log
+    train: Log
+    tests: dict[str, Log] = field(default_factory=dict)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The model over the part that models are fitted to.
+
+        Raises:
+            InputError: a log that does not fit the model, or whose sensors cannot be what they are
+                said to be.
+        """
+        predictor = Predictor(self.scenario, self.train)
+        check_sensors(predictor.motion)
+        return predictor
+
+    @cached_property
+    def hygiene(self) -> Hygiene:
+        return inspect(self.predictor.motion, self.predictor.noise)
+
+    @cached_property
+    def comparison(self) -> Comparison:
+        return comparing.compare(self.predictor)
+
+    @cached_property
+    def trusted(self) -> Scenario:
+        """The scenario with nothing fitted to joints whose torque is not to be trusted."""
+        return self.hygiene.trusted(self.scenario, self.predictor.robot)
+
+    @classmethod
+    def divided(
+        cls, scenario: Scenario, log: Log, tests: Mapping[str, Log] | None, name: str
+    ) -> "Case":
+        """With the rest of the log set aside."""
+        train, rest = train_and_rest(scenario, log)
+        aside = {} if rest is None else {_REST: rest}
+        return cls(name, scenario, log, train, aside | dict(tests or {}))
+
+
+class AnalysisResult(Result):
+    """Base of what was found out of a scenario and a log."""
+
+    case: Case
+    # What its JSON file is called.
+    file: ClassVar[str]
+
+    @property
+    def hygiene(self) -> Hygiene:
+        """What is remarkable about the log."""
+        return self.case.hygiene
+
+    @property
+    def residual(self) -> Residual:
+        """What the model as given leaves over of the part of the log that it is fitted to."""
+        return self.case.predictor.residual
+
+    @property
+    def robot(self) -> Robot:
+        """The model's plant."""
+        return self.case.predictor.robot
+
+    def json(self) -> dict[str, Any]:
+        """Contents of its JSON file, see the contracts."""
+        return self._json() | {"hygiene": hygiene_json(self.hygiene)}
+
+    def report(self, path: str | Path) -> None:
+        self._report(Path(path), self._inputs_in(Path(path).parent))
+
+    def save(self, folder: str | Path, inputs: Inputs | None = None) -> None:
+        """Writes the JSON file (also as metrics.json), scenario.yaml, the completed scenario where
+        there is one, and report.html.
+
+        Args:
+            inputs: where scenario and logs lie, for the commands that the report proposes; by
+                default the logs are written to the folder as well.
+
+        Raises:
+            InputError: the folder cannot be made.
+        """
+        out = made_folder(folder)
+        if inputs is None:
+            inputs = self._inputs_in(out)
+            self.case.log.save(inputs.log)
+            for path, (_, log) in zip(inputs.tests, self._further_tests, strict=True):
+                log.save(path)
+        content = self.json()
+        write_json(out / f"{self.file}.json", content)
+        write_json(out / "metrics.json", content)
+        write_text(out / "scenario.yaml", dump_scenario(self.case.scenario, self.case.name))
+        if (completed := self._completed) is not None:
+            write_text(out / "completed.yaml", dump_scenario(completed, self.case.name))
+        self._report(out / "report.html", replace(inputs, hygiene=self.hygiene))
+
+    def _inputs_in(self, folder: Path) -> Inputs:
+        tests = tuple(str(folder / f"{name}.npz") for name, _ in self._further_tests)
+        scenario, log = folder / "scenario.yaml", folder / "log.npz"
+        return Inputs(
+            self.case.name, str(scenario), str(log), str(folder), tests, hygiene=self.hygiene
+        )
+
+    @property
+    def _further_tests(self) -> list[tuple[str, Log]]:
+        return [(name, log) for name, log in self.case.tests.items() if name != _REST]
+
+    @property
+    def _completed(self) -> Scenario | None:
+        """The scenario with what was found, if that is written beside."""
+        return None
+
+    def _json(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def _report(self, path: Path, inputs: Inputs) -> None:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class ComparisonResult(Comparison, AnalysisResult):
+    """Where a model fails on a log, see `Comparison`."""
+
+    case: Case = field(kw_only=True, repr=False)
+    file: ClassVar[str] = "compare"
+
+    @property
+    def outcome(self) -> str:
+        return self.hygiene.before(compare_outcome(self))
+
+    def table(self) -> Table:
+        return failures_table(self)
+
+    def _json(self) -> dict[str, Any]:
+        return comparing.comparison_json(self)
+
+    def _report(self, path: Path, inputs: Inputs) -> None:
+        write_compare_report(path, self, self.case.predictor, inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisResult(Diagnosis, AnalysisResult):
+    """Which effects a model lacks, see `Diagnosis`."""
+
+    case: Case = field(kw_only=True, repr=False)
+    file: ClassVar[str] = "diagnosis"
+
+    @property
+    def outcome(self) -> str:
+        return self.hygiene.before(diagnosis_outcome(self))
+
+    def table(self) -> Table:
+        return findings_table(self.ranking)
+
+    def _json(self) -> dict[str, Any]:
+        return diagnosing.diagnosis_json(self)
+
+    def _report(self, path: Path, inputs: Inputs) -> None:
+        write_diagnosis_report(path, self, self.case.comparison, self.case.predictor, inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult(Study, AnalysisResult):
+    """What was added to a model and what it brought, see `Study`; its `scenario` has it all."""
+
+    case: Case = field(kw_only=True, repr=False)
+    # With what was found in the model; None where that is nothing.
+    after: Case | None = field(kw_only=True, repr=False)
+    file: ClassVar[str] = "study"
+
+    @property
+    def outcome(self) -> str:
+        return self.hygiene.before(f"{study_outcome(self)} Stopped because {self.stopped_because}.")
+
+    def table(self) -> Table:
+        return steps_table(self, tested=bool(self.case.tests))
+
+    def _json(self) -> dict[str, Any]:
+        return studying.study_json(self)
+
+    @property
+    def _completed(self) -> Scenario | None:
+        return self.scenario if self.found else None
+
+    def _report(self, path: Path, inputs: Inputs) -> None:
+        given, completed = (
+            (case.predictor, case.comparison) for case in (self.case, self.after or self.case)
+        )
+        write_study_report(path, self, given, completed, inputs, self.case.tests)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationResult(Identification, AnalysisResult):
+    """Inertial parameters and plain friction, see `Identification`; its `scenario` has them."""
+
+    case: Case = field(kw_only=True, repr=False)
+    file: ClassVar[str] = "identify"
+
+    @property
+    def outcome(self) -> str:
+        return self.hygiene.before(identification_outcome(self))
+
+    def table(self) -> Table:
+        return errors_table(self)
+
+    def _json(self) -> dict[str, Any]:
+        return identifying.identification_json(self)
+
+    @property
+    def _completed(self) -> Scenario | None:
+        return self.scenario
+
+    def _report(self, path: Path, inputs: Inputs) -> None:
+        write_identification_report(path, self, inputs.name)
+
+
+def compare(scenario: Scenario, log: Log, *, name: str = "scenario") -> ComparisonResult:
+    """Says where a scenario's model fails on a log. Nothing is fitted.
+
+    Args:
+        scenario: whose `model` is compared.
+        log: of a robot, real or simulated; truth channels are not looked at.
+        name: what the scenario is called in reports.
+
+    Raises:
+        InputError: a log that does not fit the model, or whose signs, units or frames are wrong.
+    """
+    case = Case(name, scenario, log, log)
+    return _with_case(ComparisonResult, case.comparison, case=case)
+
+
+def diagnose(
+    scenario: Scenario,
+    log: Log,
+    effects: Iterable[type[Effect]] | None = None,
+    *,
+    tests: Mapping[str, Log] | None = None,
+    name: str = "scenario",
+    progress: Progress = silent,
+) -> DiagnosisResult:
+    """Finds the physical effects that a scenario's model lacks.
+
+    Args:
+        scenario: whose `model` is looked at.
+        log: of a robot, real or simulated; truth channels are not looked at.
+        effects: what is tried; by default the library but for what `identify.ruled_out` names.
+        tests: further logs to test on, by name; nothing is fitted to them.
+        name: what the scenario is called in reports.
+        progress: is told what is being done, and may end the work with what is known then
+            (`ProgressLines(print, limit=60)`).
+
+    Raises:
+        InputError: see `compare`; or no joint is left whose torque can be trusted.
+    """
+    case = Case.divided(scenario, log, tests, name)
+    diagnosis = diagnosing.diagnose(Predictor(case.trusted, case.train), effects, progress=progress)
+    if diagnosis.chosen:
+        completed = addition.add(case.trusted, diagnosis.chosen)
+        set_aside = {
+            test: validated(Predictor(case.trusted, other), Predictor(completed, other))
+            for test, other in case.tests.items()
+        }
+        diagnosis = replace(diagnosis, set_aside=set_aside)
+    return _with_case(DiagnosisResult, diagnosis, case=case)
+
+
+def study(
+    scenario: Scenario,
+    log: Log,
+    effects: Iterable[type[Effect]] | None = None,
+    *,
+    rollouts: bool = True,
+    tests: Mapping[str, Log] | None = None,
+    name: str = "scenario",
+    progress: Progress = silent,
+    jobs: int = 1,
+) -> StudyResult:
+    """Adds what a scenario's model lacks until a log shows nothing more.
+
+    Args:
+        scenario, log, effects, tests, name, progress: see `diagnose`.
+        rollouts: also simulates the model in the robot's place after every round.
+        jobs: how many simulations run side by side.
+
+    Raises:
+        InputError: see `diagnose`.
+    """
+    case = Case.divided(scenario, log, tests, name)
+    found = studying.study(
+        case.trusted,
+        case.train,
+        effects,
+        rollouts=rollouts,
+        tests=case.tests,
+        progress=progress,
+        jobs=jobs,
+    )
+    after = replace(case, scenario=found.scenario) if found.found else None
+    return _with_case(StudyResult, found, case=case, after=after)
+
+
+def identify(
+    scenario: Scenario,
+    log: Log,
+    *,
+    tests: Mapping[str, Log] | None = None,
+    name: str = "scenario",
+    progress: Progress = silent,
+) -> IdentificationResult:
+    """Identifies the inertial parameters that a scenario does not trust (`identify.inertia`), with
+    friction and bias of every joint.
+
+    Args:
+        scenario, log, tests, name, progress: see `diagnose`.
+
+    Raises:
+        InputError: see `compare`; or the scenario trusts all inertia.
+    """
+    case = Case.divided(scenario, log, tests, name)
+    case.hygiene  # noqa: B018 - a log that cannot be what it is said to be is refused first.
+    found = identifying.identify(scenario, case.train, case.tests, progress=progress)
+    return _with_case(IdentificationResult, found, case=case)
+
+
+def add(scenario: Scenario, found: Diagnosis | Iterable[Finding]) -> Scenario:
+    """The scenario with what was found in its model.
+
+    Args:
+        found: a diagnosis, of which everything that it chose is added; or findings, as some of its
+            `ranking`.
+
+    Raises:
+        InputError: an effect that the library does not have.
+    """
+    return addition.add(scenario, found.chosen if isinstance(found, Diagnosis) else list(found))
+
+
+def hide(
+    scenario: Scenario,
+    seed: int,
+    *,
+    what: str = "any",
+    size: Size | None = None,
+    count: int = 1,
+    name: str = "exercise",
+) -> Exercise:
+    """Makes an exercise: a log of the scenario's robot with a physical effect that its model lacks.
+
+    Args:
+        seed: decides on everything, sensor noise included.
+        what: `any`, `library`, `decoy` (nothing), `stranger` (none of the library), or the name of
+            an effect.
+        size: small, medium or large; by default drawn as well.
+        count: how many effects are hidden.
+        name: what the scenario is called in the log.
+
+    Raises:
+        InputError: an unknown effect or size, or nothing is small enough for the robot.
+    """
+    return hidden.make_exercise(scenario, name, seed, what=what, size=size, count=count)
+
+
+def reveal(folder: str | Path) -> Revealed:
+    """Opens the answer of an exercise that lies in a folder, with a score for the diagnosis or
+    study beside it.
+
+    Raises:
+        InputError: no exercise, a damaged answer or diagnosis.
+    """
+    return hidden.reveal(Path(folder))
+
+
+def convert(
+    recordings: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    log_map: str | Path | None = None,
+) -> Log:
+    """Makes one log of recordings: ROS bags, CSV, JSON, MATLAB, npz files and logs.
+
+    Args:
+        recordings: one or several files, one after the other in time.
+        out: also writes it to this file, as its name ends: .npz (a log), .mcap or .csv.
+        log_map: what columns and topics mean (yaml); standard messages need none.
+
+    Raises:
+        InputError: a file is damaged, does not fit the map, or cannot be written.
+    """
+    several = [recordings] if isinstance(recordings, (str, Path)) else recordings
+    write = None if out is None else writer_for(Path(out))
+    log = read_logs([Path(recording) for recording in several], log_map)
+    if out is not None and write is not None:
+        try:
+            write(log, Path(out))
+        except OSError as error:
+            raise InputError(f"{out}: {error.strerror or error}") from None
+    return log
+
+
+T = TypeVar("T")
+
+
+def _with_case(kind: type[T], found: Any, **more: Any) -> T:
+    """What was found, as a result that knows its case."""
+    return kind(**{item.name: getattr(found, item.name) for item in fields(found)}, **more)
