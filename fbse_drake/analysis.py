@@ -29,7 +29,8 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import Study, train_and_rest
 from fbse_drake.discrepancy.diagnosis.validation import validated
 from fbse_drake.discrepancy.exercises import hidden
-from fbse_drake.discrepancy.exercises.hidden import Exercise, Revealed, Size
+from fbse_drake.discrepancy.exercises.hidden import Exercise, Revealed
+from fbse_drake.discrepancy.exercises.sizes import Size
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.residual.residual import Residual

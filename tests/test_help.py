@@ -42,7 +42,9 @@ def test_everything_that_is_listed_has_a_line_and_exists(capsys: pytest.CaptureF
     assert main(["list", "--json"]) == DONE
     listed = json.loads(capsys.readouterr().out)
     assert tuple(listed) == LISTED
-    assert [f"{kind}: {n}" for kind, lines in listed.items() for n, t in lines.items() if not t] == []
+    assert [
+        f"{kind}: {n}" for kind, lines in listed.items() for n, t in lines.items() if not t
+    ] == []
     for kind in ("effects", "estimators", "sensors", "compensations"):
         assert set(listed[kind]) >= set(getattr(libraries, f"{kind}_by_name")())
     for command in listed["scenarios"]:
