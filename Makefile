@@ -1,5 +1,5 @@
 # make walk   installs into .venv, simulates the paper's walk and says where its report is
-# make test   installs into .venv, checks the style and runs the tests
+# make test   installs into .venv, checks style and types and runs the tests
 # make fbse   prints how good the friction estimate is, and writes out/fbse/report.html
 # make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
 # make bench  prints speeds, as ratios measured in one run
@@ -20,6 +20,7 @@ test: lint
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
 
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .

@@ -95,13 +95,14 @@ def _add_command(
     commands: Any, name: str, *, help: str, description: str, examples: Sequence[str]
 ) -> argparse.ArgumentParser:
     lines = "\n".join(f"  {example}" for example in examples)
-    return commands.add_parser(
+    command: argparse.ArgumentParser = commands.add_parser(
         name,
         help=help,
         description=textwrap.fill(description, 79),
         epilog=f"examples:\n{lines}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    return command
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,6 +1,7 @@
 """What there is: scenarios, robots, and the libraries of what a scenario can be made of."""
 
 import inspect
+from collections.abc import Callable
 
 from fbse_drake import resources
 from fbse_drake.libraries import (
@@ -50,7 +51,7 @@ def _described(kinds: dict[str, type]) -> dict[str, str]:
     }
 
 
-_LISTINGS = {
+_LISTINGS: dict[str, Callable[[], dict[str, str]]] = {
     "scenarios": _scenarios,
     "robots": _robots,
     "effects": lambda: _described(effects_by_name()),

@@ -32,7 +32,6 @@ def to_pandas(log: Log) -> "pandas.DataFrame":
 def to_xarray(log: Log) -> "xarray.Dataset":
     """One variable per channel with its unit in `attrs`; dimensions are `time` [s], `joint` (by
     name) and, for each channel with further ones, its own."""
-    xarray = _needed("xarray")
     variables = {}
     for name, values in log.items():
         if name == "time":
@@ -40,8 +39,11 @@ def to_xarray(log: Log) -> "xarray.Dataset":
         _, shape = channel_kind(name)
         sizes = (f"{name}_{axis}" for axis in range(len(shape)))
         dims = ["joint" if size == "n" else own for size, own in zip(shape, sizes, strict=True)]
-        variables[name] = xarray.Variable(("time", *dims), values, {"units": log.unit(name)})
-    return xarray.Dataset(variables, {"time": log.time, "joint": log.joints})
+        variables[name] = (("time", *dims), values, {"units": log.unit(name)})
+    data: xarray.Dataset = _needed("xarray").Dataset(
+        variables, {"time": log.time, "joint": log.joints}
+    )
+    return data
 
 
 def _columns(log: Log, name: str) -> list[str]:
