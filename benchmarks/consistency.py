@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from benchmarks.console import print_table
-from benchmarks.store import Runs, package_checksum
+from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.campaign.steps import Material
 from fbse_drake.files import write_text
@@ -35,6 +35,7 @@ from fbse_drake.report.metrics import (
     normalised_innovations,
     stance,
 )
+from fbse_drake.resources import package_checksum
 
 _DURATION = "duration=4.3"
 _STEPS = "reference.single_support={}", "reference.double_support={}"

@@ -20,7 +20,7 @@ import yaml
 from rich.console import Console
 
 from benchmarks.console import print_table
-from benchmarks.store import Runs, package_checksum
+from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, schema, simulate
 from fbse_drake.campaign.steps import Material
 from fbse_drake.effects.friction import CoulombViscousFriction
@@ -29,7 +29,7 @@ from fbse_drake.estimators.identification import identify
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
-from fbse_drake.resources import folder
+from fbse_drake.resources import folder, package_checksum
 
 # The seed of the walk from which the fixed friction model is identified; none of the others.
 _OFFLINE_SEED = 1000

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.console import print_table
-from benchmarks.store import Runs, package_checksum
+from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.campaign.steps import Material
 from fbse_drake.estimate import estimate
@@ -32,6 +32,7 @@ from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.files import write_text
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import friction_error, joint_sides, run_metrics, settled, stance
+from fbse_drake.resources import package_checksum
 
 _PAPER_WALK, _HRP2_WALK = "paper_walk_fbse", "hrp2_walk_fbse"
 _PHASES = ("stance", "swing")

@@ -1,7 +1,5 @@
 """Where benchmarks keep what their runs give: a benchmark is a campaign."""
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,31 +8,15 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.cases import Case, Result
-from fbse_drake import resources
-from fbse_drake.campaign.campaign import Campaign, Run
-from fbse_drake.campaign.cluster import run_campaign
-from fbse_drake.campaign.design import Listed
-from fbse_drake.campaign.rows import Folder
-from fbse_drake.campaign.steps import Call
+from fbse_drake.campaign.campaign import Run
+from fbse_drake.campaign.results import StoredRuns
 from fbse_drake.progress import ProgressLines
 
 # Lines of progress are so far apart [s].
 _EVERY = 10.0
 
 
-def package_checksum(*more: Path) -> str:
-    """Checksum of the package, its models and its scenarios.
-
-    Args:
-        more: further files.
-    """
-    folders = (Path(resources.__file__).parent, *map(resources.folder, ("models", "scenarios")))
-    files = {file for folder in folders for file in folder.rglob("*.*") if file.is_file()}
-    sources = sorted(file for file in files if file.suffix in (".py", ".yaml", ".urdf"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in (*sources, *more))).hexdigest()
-
-
-class Runs:
+class Runs(StoredRuns):
     """Runs of a benchmark, each with a result, and the folder that they are kept in."""
 
     def __init__(
@@ -44,38 +26,8 @@ class Runs:
         values: Sequence[Mapping[str, Any]],
         sources: str | None,
     ):
-        """Forgets what was made by other sources.
-
-        Args:
-            function: what does a run, as `!Call` takes it; it gives `sources`, the checksum of what
-                it was made by, and `result`, JSON text.
-            values: of each run.
-            sources: checksum of those whose results count; None for any.
-        """
-        self.campaign = Campaign(
-            {"benchmark": Call(function, gives={"sources": "text", "result": "text"})},
-            design=Listed(list(map(dict, values))),
-        )
-        self._folder = Folder(str(folder))
-        if sources is not None:
-            rows = self._rows()
-            old = [key for key, row in rows.items() if row["benchmark.sources"] != sources]
-            self._folder.forget(old)
-
-    def _rows(self) -> dict[str, dict[str, Any]]:
-        """Rows by run."""
-        if self._folder.known_schema() is None:
-            return {}
-        return {row["run"]: row for row in self._folder.table().to_pylist()}
-
-    def read(self) -> list[tuple[Run, Any, str | None]]:
-        """Run, result and failure of what has been run, in order."""
-        rows = self._rows()
-        return [
-            (run, json.loads(rows[run.key]["benchmark.result"] or "null"), rows[run.key]["failure"])
-            for run in self.campaign.runs
-            if run.key in rows
-        ]
+        """As `StoredRuns`."""
+        super().__init__(str(folder), function, values, sources)
 
     def results(self) -> list[Any]:
         """Results of what has been run, in order; ends the benchmark if a run failed."""
@@ -93,7 +45,7 @@ class Runs:
         workers: int | None,
         only: Callable[[Run], bool] = lambda _: True,
     ) -> None:
-        """Does what has not been done.
+        """Does what has not been done, and tells the console.
 
         Args:
             workers: how many at once; None for one on each core.
@@ -105,15 +57,7 @@ class Runs:
 
         lines = ProgressLines(tell, every=_EVERY)
         with lines.stopped_by_keyboard():
-            outcome = run_campaign(
-                self.campaign,
-                self._folder.place,
-                workers=workers,
-                only=only,
-                others=True,
-                progress=lines,
-                tell=tell,
-            )
+            outcome = self.do(workers=workers, only=only, progress=lines, tell=tell)
         if outcome.stopped is not None:
             raise SystemExit(f"{title}: {outcome.stopped}; the same command goes on")
 

@@ -1,5 +1,6 @@
 """Finds the models and scenarios that ship with the package."""
 
+import hashlib
 from pathlib import Path
 
 from fbse_drake.errors import InputError
@@ -34,3 +35,15 @@ def shipped(kind: str) -> list[str]:
     """Names of the files in the folder `models` or `scenarios`, in order."""
     files = (p.relative_to(folder(kind)).with_suffix("") for p in folder(kind).rglob("*.yaml"))
     return sorted(p.as_posix() for p in files if p.suffix not in (".dmd", ".map"))
+
+
+def package_checksum(*more: Path) -> str:
+    """Checksum of the package, its models and its scenarios.
+
+    Args:
+        more: further files.
+    """
+    folders = (_PACKAGE, *map(folder, ("models", "scenarios")))
+    files = {file for folder in folders for file in folder.rglob("*.*") if file.is_file()}
+    sources = sorted(file for file in files if file.suffix in (".py", ".yaml", ".urdf"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in (*sources, *more))).hexdigest()
