@@ -1,6 +1,7 @@
 # make walk   installs into .venv, simulates the paper's walk and says where its report is
 # make test   installs into .venv, checks style and types and runs the tests
 # make fbse   prints how good the friction estimate is, and writes out/fbse/report.html
+# make rivals compares all methods of estimating friction, and writes out/rivals/*/report.html
 # make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
 # make bench  prints speeds, as ratios measured in one run
 PYTHON ?= python3
@@ -9,7 +10,7 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test lint format bench fbse hidden clean
+.PHONY: walk test lint format bench fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -42,6 +43,11 @@ fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.faults
 	$(VENV)/bin/python -m benchmarks.limit --seeds 10
 	$(VENV)/bin/python -m benchmarks.consistency --seeds 10
+
+# All methods of estimating friction against each other, ten seeds of every case, some hours on two cores; goes on where it was stopped.
+rivals: $(INSTALLED)
+	$(VENV)/bin/fbse rivals paper_walk --set duration=4.3 --seeds 10 --out out/rivals/paper_walk
+	$(VENV)/bin/fbse rivals hrp2_walk_fbse --set duration=4.3 --seeds 10 --out out/rivals/hrp2_walk_fbse
 
 # How well missing physics is found: some 430 logs, an hour and a half on two cores; goes on where it was stopped. By hand: --quick, --only NAME.
 # Then in another simulator, if the extra `mujoco` is installed: some 70 logs, a quarter of an hour.

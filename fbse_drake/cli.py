@@ -327,6 +327,46 @@ def _parser() -> argparse.ArgumentParser:
 
     run = _add_command(
         commands,
+        "rivals",
+        help="every method of estimating the friction against each other",
+        description="Tunes every estimator that fits a scenario on another walk, each in as many trials, and compares them on the "
+        "same walks and sensors; writes rivals.json and a report. The same command goes on where it was stopped.",
+        examples=(
+            "fbse rivals paper_walk --seeds 1 --set duration=4",
+            "fbse rivals hrp2_walk_fbse --case 'a push' --case 'biased IMU' --out out/rivals",
+            "fbse rivals my_scenario.yaml --seeds 10 --trials 12 --workers 2",
+        ),
+    )
+    _add_scenario(run)
+    run.add_argument(
+        "--seeds",
+        metavar="N",
+        type=_positive_whole_number,
+        default=3,
+        help="walks of every case (default: 3)",
+    )
+    run.add_argument(
+        "--trials",
+        metavar="N",
+        type=_positive_whole_number,
+        default=8,
+        help="settings that are tried of each estimator (default: 8)",
+    )
+    run.add_argument(
+        "--case",
+        action="append",
+        help="only this case beside the walk as believed, as in 'a push'; repeatable (default: all)",
+    )
+    run.add_argument(
+        "--workers",
+        metavar="N",
+        type=_positive_whole_number,
+        help="processes (default: one for each core)",
+    )
+    _add_output(run, "as for simulate, with _rivals at its end")
+
+    run = _add_command(
+        commands,
         "campaign",
         help="many runs at once, on this machine or a Dask cluster",
         description="Does the runs of a campaign that are not done, each of which becomes a row of a table; the same command goes on.",

@@ -35,7 +35,7 @@ from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
 from fbse_drake.log import Log
-from fbse_drake.progress import Progress, ProgressLines
+from fbse_drake.progress import Interrupted, Progress, ProgressLines
 from fbse_drake.report.discrepancy import Inputs, findings_table, parameter_text
 from fbse_drake.report.discrepancy_figures import targets_text
 from fbse_drake.report.html import Table as ReportTable
@@ -450,6 +450,55 @@ def _table(options: argparse.Namespace) -> bool:
     return True
 
 
+def _rivals(options: argparse.Namespace) -> bool:
+    with _extra_installed("comparisons of methods"):
+        from fbse_drake.report import rivals as report
+        from fbse_drake.rivals.campaign import Campaigns, Plan, compare_methods
+        from fbse_drake.rivals.cases import CASES, NOMINAL
+        from fbse_drake.rivals.comparison import comparison_json
+    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    cases = [case for case in CASES if case in (NOMINAL, *(options.case or CASES))]
+    for case in options.case or ():
+        if case not in CASES:
+            raise InputError(f"--case {case}: expected one of {', '.join(CASES)}")
+    out, console = _output_folder(options, "_rivals"), Console(quiet=options.quiet)
+    plan = Plan(scenario, name, cases, options.seeds, options.trials)
+
+    def tell(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    try:
+        with (
+            located(f"{options.scenario}: "),
+            _told(console, first="simulating the walk to tune on") as progress,
+        ):
+            campaigns = Campaigns(out, workers=options.workers, progress=progress, tell=tell)
+            comparison = compare_methods(plan, campaigns, out)
+    except Interrupted as stop:
+        print(f"fbse: {stop}; the same command goes on", file=sys.stderr)
+        return False
+    text = dump_scenario(scenario, name)
+    content = {"seeds": options.seeds, "trials": options.trials, **comparison_json(comparison)}
+    for file in ("rivals", "metrics"):
+        write_json(out / f"{file}.json", content)
+    write_text(out / "scenario.yaml", text)
+    with console.status("writing the report"):
+        report.write_rivals_report(
+            out / "report.html", comparison, name=name, seeds=options.seeds, scenario=text
+        )
+    tables = (report.error_table, report.loop_table, report.needs_table)
+    for table in (make(comparison) for make in tables):
+        shown = Table(*table.header, title_justify="left")
+        for row in table.rows:
+            shown.add_row(*map(str, row))
+        console.print(shown)
+        tell(table.caption)
+    tell(report.ahead_text(comparison))
+    tell(report.outcome_text(comparison, options.seeds))
+    tell(f"Report: {out / 'report.html'}")
+    return not comparison.broken
+
+
 def _write_lines(path: Path, lines: Sequence[Sequence[object]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows(lines)
@@ -606,4 +655,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "campaign": _campaign,
     "table": _table,
     "list": _list,
+    "rivals": _rivals,
 }

@@ -32,6 +32,7 @@ from fbse_drake.estimators.estimator import Estimator, NoEstimator
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.implicit import ImplicitTorque
 from fbse_drake.robot.plant import Ground, Robot, make_robot
+from fbse_drake.robot.push import Push
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
@@ -53,6 +54,8 @@ class RobotConfig:
     rotor_inertia: dict[str, float] = field(default_factory=dict)
     # Physical effects, each under a name of your choice.
     effects: dict[str, Effect] = field(default_factory=dict)
+    # Forces from outside that nobody measures, each under a name of your choice.
+    pushes: dict[str, Push] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for joint, value in self.rotor_inertia.items():
@@ -262,10 +265,12 @@ class Scenario:
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
     # Who estimates the friction: !NoEstimator, !Fbse, a reference (!TrueFriction, !TorqueSensor), or
-    # a rival: !DisturbanceObserver, !FixedFriction, !AdaptiveFriction, !LuGreFriction,
-    # !RadialBasisFriction or !FuzzyFriction.
+    # a rival: !DisturbanceObserver, !FilteredDisturbance, !ExtendedState, !ActuatorFault,
+    # !FixedFriction, !FilteredModel, !AdaptiveFriction, !LuGreFriction, !RadialBasisFriction or
+    # !FuzzyFriction.
     estimator: Estimator = field(default_factory=NoEstimator)
-    # What the controller makes of it: !NoCompensation, !IntegralCompensation or !FeedforwardCompensation.
+    # What the controller makes of it: !NoCompensation, !IntegralCompensation,
+    # !FeedforwardCompensation or !FaultReconfiguration.
     compensation: Compensation = field(default_factory=NoCompensation)
     fall: FallConfig = field(default_factory=FallConfig)
     log: LogConfig = field(default_factory=LogConfig)

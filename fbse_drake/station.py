@@ -32,6 +32,7 @@ from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.robot.description import RobotDescription, load_description
 from fbse_drake.robot.plant import Robot
+from fbse_drake.robot.push import Push, PushSource
 from fbse_drake.scenario import Scenario, build_robot, planned_reference
 from fbse_drake.sensors.sensor import Run
 from fbse_drake.walking.reference import RecordedReference, Reference
@@ -169,6 +170,7 @@ def add_robot(
         ground, settings = contact_with_effects(config.effects.values(), *contact)
         simulated = {"builder": builder, "plant": settings, "ground": ground}
         robot = build_robot(config, **simulated, implicit=law.torque)
+        add_pushes(builder, config.pushes, robot)
     reference.set_start(robot, ground)
     plant = robot.plant
     joint_state = builder.AddNamedSystem("joint_state", MatrixGain(robot.joint_state_selector))
@@ -186,6 +188,18 @@ def add_robot(
         ports[name] = plant.GetOutputPort(name)
     ports |= add_joint_torques(builder, robot, law, time_step, ports)
     return SimulatedRobot(robot, command.get_input_port(), ports)
+
+
+def add_pushes(builder: DiagramBuilder, pushes: Mapping[str, Push], robot: Robot) -> None:
+    """Adds what pushes a robot, where something does.
+
+    Raises:
+        InputError: a body that the robot has not.
+    """
+    if pushes:
+        source = builder.AddNamedSystem("pushes", PushSource(pushes, robot))
+        port = robot.plant.get_applied_spatial_force_input_port()
+        builder.Connect(source.get_output_port(), port)
 
 
 def _planned_motion(reference: Reference | RecordedReference, time_step: float) -> JointMotion:

@@ -151,6 +151,16 @@ class FeedforwardCompensation(LowPassCompensation):
         return LowPass(rate, self.share, self.limit)
 
 
+@in_library
+@dataclass(frozen=True)
+class FaultReconfiguration(FeedforwardCompensation):
+    """The control is reconfigured where an actuator is called faulty: only there the estimate is
+    added to the command. Needs an estimator that isolates faults (`!ActuatorFault`)."""
+
+    def system(self, names: RobotDescription, clock: Clock) -> "FaultCompensation":
+        return FaultCompensation(self, names, clock)
+
+
 class FrictionCompensation(RecursiveEstimator):
     """Torque that compensates an estimated friction.
 
@@ -187,7 +197,37 @@ class FrictionCompensation(RecursiveEstimator):
         if math.isnan(elapsed):
             posterior[...] = last
             return
-        wanted = np.maximum(self._share * self._estimate.Eval(context), -self._limit)
+        wanted = np.maximum(self._share * self._lost(context), -self._limit)
         wanted = np.minimum(wanted, self._limit)
         keep = np.exp(-self._rate * elapsed)
         posterior["torque"] = keep * last["torque"] + (1 - keep) * wanted
+
+    def _lost(self, context: Context) -> np.ndarray:
+        """What is to be compensated, (n,) [Nm]."""
+        return self._estimate.Eval(context)
+
+
+class FaultCompensation(FrictionCompensation):
+    """Torque that compensates what faulty actuators lose.
+
+    .. pydrake_system::
+
+        name: FaultCompensation
+        input_ports:
+        - friction_estimate
+        - estimate/joint/fault
+        output_ports:
+        - posterior
+        - (one for each field)
+
+    As `FrictionCompensation`; `estimate/joint/fault` (n,) is 1 where a joint is called faulty.
+    """
+
+    def __init__(self, config: LowPassCompensation, names: RobotDescription, clock: Clock):
+        """See `FrictionCompensation`."""
+        super().__init__(config, names, clock)
+        size = len(names.joint_names)
+        self._fault = self.DeclareVectorInputPort("estimate/joint/fault", size)
+
+    def _lost(self, context: Context) -> np.ndarray:
+        return self._estimate.Eval(context) * self._fault.Eval(context)

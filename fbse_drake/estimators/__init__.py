@@ -1,9 +1,12 @@
 """Estimators; importing the package fills their library."""
 
 from fbse_drake.estimators import (
+    actuator_fault,
     adaptive_friction,
     disturbance_observer,
+    disturbance_observers,
     fbse,
+    filtered_model,
     fixed_friction,
     fuzzy,
     lugre,
@@ -13,9 +16,12 @@ from fbse_drake.estimators import (
 )
 
 __all__ = [
+    "actuator_fault",
     "adaptive_friction",
     "disturbance_observer",
+    "disturbance_observers",
     "fbse",
+    "filtered_model",
     "fixed_friction",
     "fuzzy",
     "lugre",

@@ -1,6 +1,7 @@
 """Friction by an adaptive model of its known shape, to be compared with FBSE."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ class AdaptiveFriction(LearnedFriction):
     s = tanh(w / transition); none of the three is negative. Where the shape is right it learns the
     friction itself; of a joint at rest it knows nothing, for there the friction takes any value.
     """
+
+    knows: ClassVar[str] = "inertia of all links, shape of the friction law"
 
     # Velocity at which the smoothed sign has grown to tanh(1) [rad/s].
     transition: float = 0.01

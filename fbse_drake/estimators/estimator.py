@@ -11,7 +11,7 @@ An estimator of a user's own is such a class in a module that the scenario names
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
@@ -22,6 +22,7 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.library import require_new
+from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.signals import Signal, register
@@ -37,11 +38,27 @@ class Estimator(ABC):
     signals: ClassVar[tuple[Signal, ...]] = ()
     # Does it estimate the friction, which can then be compensated?
     gives_friction: ClassVar[bool] = True
+    # For the reader of a comparison: what it must know of the robot, and what must be measured
+    # beside the joints' motion and their commanded torques.
+    knows: ClassVar[str] = ""
+    measures: ClassVar[str] = ""
+    # Settings that are tuned for a robot before methods are compared: the range of each, which is
+    # searched evenly on a logarithmic scale.
+    tunable: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     @staticmethod
     def alternatives() -> tuple[type["Estimator"], ...]:
         """What can stand for an estimator in a scenario file (see `fbse_drake.schema`)."""
         return tuple(_LIBRARY.values())
+
+    @classmethod
+    def variants(cls) -> dict[str, "Estimator"]:
+        """What of it is compared with others, by a word for it; by default itself."""
+        return {"": cls()} if cls.gives_friction else {}
+
+    def identified(self, log: Log) -> "Estimator":  # noqa: ARG002
+        """Itself, with what it learns beforehand from a log that has FBSE's estimates."""
+        return self
 
     @abstractmethod
     def add(self, chain: Chain) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,14 +14,14 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.floating_base import FloatingBaseModel
-from fbse_drake.estimators.friction import FrictionConfig, ModelAided
+from fbse_drake.estimators.friction import FrictionConfig, ModelAided, RecursiveLeastSquares
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
-from fbse_drake.estimators.support import MeasuredSupport, SupportConfig
+from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
 from fbse_drake.robot.description import RobotDescription
 
 BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
@@ -36,6 +37,9 @@ class Fbse(Estimator):
     paper's.
     """
 
+    knows: ClassVar[str] = "inertia of all links"
+    measures: ClassVar[str] = "IMU, foot forces"
+
     sensor_monitor: SensorMonitorConfig = field(default_factory=SensorMonitorConfig)
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
     # !ContactAided or the paper's !AdaptiveLipm.
@@ -47,6 +51,22 @@ class Fbse(Estimator):
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
     # !ModelAided or the paper's !RecursiveLeastSquares.
     friction: FrictionConfig = field(default_factory=ModelAided)
+
+    @staticmethod
+    def paper() -> "Fbse":
+        """The paper's own method, stage by stage."""
+        return Fbse(
+            attitude=AttitudeConfig(level_feet=0.0),
+            base_state=AdaptiveLipm(),
+            sensors=SensorBeliefs(learns_force_noise=False),
+            support=PlannedSupport(),
+            joint_acceleration=JointAccelerationConfig(method="minimum_norm"),
+            friction=RecursiveLeastSquares(),
+        )
+
+    @classmethod
+    def variants(cls) -> dict[str, Estimator]:
+        return {"": cls(), "the paper's": cls.paper()}
 
     def believed_sensors(self, usual: SensorBeliefs) -> SensorBeliefs:
         return self.sensors.completed(usual)

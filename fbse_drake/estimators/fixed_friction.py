@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -10,19 +11,41 @@ from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
+from fbse_drake.estimators.identification import identify
 from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
+from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
+
+# Beginning of a log that is not identified from [s].
+_SETTLING_TIME = 0.5
 
 
 @in_library
 @dataclass(frozen=True)
 class FixedFriction(Estimator):
-    """A friction model with known parameters, evaluated at the measured velocity."""
+    """A friction model with known parameters, evaluated at the measured velocity.
+
+    They are had from another walk beforehand, as `identified` does with the measured friction.
+    """
+
+    knows: ClassVar[str] = "the friction law, identified beforehand"
+    measures: ClassVar[str] = "nothing, once it is identified"
 
     model: FrictionModel = field(default_factory=CoulombViscousFriction)
+
+    def identified(self, log: Log) -> "FixedFriction":
+        """The Coulomb and viscous friction of a log, behind the filters' settling."""
+        rows = log.time > log.time[0] + _SETTLING_TIME
+        found = identify(
+            CoulombViscousFriction,
+            log.joints,
+            log["joint/velocity"][rows],
+            log["estimate/joint/residual_torque"][rows],
+        )
+        return FixedFriction(found.config())
 
     def check(self, names: RobotDescription) -> None:
         self.model.resolve(names, key="model")

@@ -9,8 +9,10 @@ delay, is the estimate.
 """
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -30,6 +32,13 @@ class LearnedFriction(Estimator):
 
     Regressors are without unit, so that all parameters are torques.
     """
+
+    knows: ClassVar[str] = "inertia of all links"
+    measures: ClassVar[str] = "IMU, foot forces"
+    tunable: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "bandwidth": (2.0, 100.0),
+        "rate": (1.0, 1000.0),
+    }
 
     # Bandwidth of the low-pass that the equation of motion goes through [Hz].
     bandwidth: float = 20.0
@@ -75,10 +84,14 @@ class LearnedFriction(Estimator):
         DisturbanceObserver(self.bandwidth).add_observer(chain, "momentum_observer")
         chain.add(
             "friction",
-            partial(FrictionLearner, self, chain.robot),
+            partial(self.learner, chain.robot),
             measurements="sensor_monitor",
             disturbance="momentum_observer",
         )
+
+    def learner(self, robot: Robot, **arguments: Any) -> "FrictionLearner":
+        """What learns its parameters; arguments as of its class."""
+        return FrictionLearner(self, robot, **arguments)
 
 
 class FrictionLearner(RecursiveEstimator):
@@ -112,11 +125,13 @@ class FrictionLearner(RecursiveEstimator):
         measurements: np.dtype,
         disturbance: np.dtype,
         clock: Clock,
+        **fields: tuple[int, ...],
     ):
         """Declares ports and state.
 
         Args:
             measurements, disturbance: types of the inputs.
+            fields: of a learner with more than these, their shapes.
         """
         n, k = len(robot.joint_names), config.parameters
         kind = record_type(
@@ -126,6 +141,7 @@ class FrictionLearner(RecursiveEstimator):
             parameters=(n, k),
             regressor=(n, k),
             memory=(n, config.memory),
+            **fields,
         )
         super().__init__(kind, clock)
         self._law = config
@@ -157,13 +173,24 @@ class FrictionLearner(RecursiveEstimator):
         phi, memory = self._law.regressor(measured["joint_velocity"], last["memory"], elapsed)
         keep = np.exp(-self._pole * elapsed)
         filtered = keep * last["regressor"] + (1 - keep) * phi
-        theta = last["parameters"]
-        if not disturbance["status"]:
-            theta = learned(
-                theta, filtered, disturbance["friction"], self._law.rate * elapsed
-            ).clip(self._law.smallest, self._law.largest)
         posterior["regressor"], posterior["memory"] = filtered, memory
-        posterior["parameters"], posterior["friction"] = theta, (phi * theta).sum(axis=1)
+        if not disturbance["status"]:
+            self._learn(last, disturbance["friction"], elapsed, posterior)
+        posterior["friction"] = (phi * posterior["parameters"]).sum(axis=1)
+
+    def _learn(
+        self, last: np.ndarray, torque: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
+        """Fills the parameters of a tick, and what else there is to learn.
+
+        Args:
+            last: posterior of the tick before, of which the present one is a copy but for its
+                regressor.
+            torque: the friction behind the low-pass, (n,) [Nm].
+        """
+        law, phi = self._law, posterior["regressor"]
+        theta = learned(last["parameters"], phi, torque, law.rate * elapsed)
+        posterior["parameters"] = theta.clip(law.smallest, law.largest)
 
 
 def learned(

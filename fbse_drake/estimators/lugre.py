@@ -1,6 +1,7 @@
 """Friction by an observer of the bristles' deflection, to be compared with FBSE."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ class LuGreFriction(LearnedFriction):
     u = coulomb z + viscous w / (1 rad/s). Below the breakaway the joint is a spring, which is what
     it knows of friction at rest; there the encoder must resolve the deflection.
     """
+
+    knows: ClassVar[str] = "inertia of all links, shape of the friction law and its bristles"
 
     # Deflection that carries the Coulomb torque [rad].
     breakaway: float = 1e-4

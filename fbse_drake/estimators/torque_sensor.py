@@ -1,9 +1,10 @@
 """Friction from joint torque sensors, to be compared with estimates that go without."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -22,6 +23,10 @@ class TorqueSensor(Estimator):
 
     It is the command minus the measured link torque, low-passed.
     """
+
+    knows: ClassVar[str] = "nothing"
+    measures: ClassVar[str] = "torque behind each joint"
+    tunable: ClassVar[Mapping[str, tuple[float, float]]] = {"cutoff": (2.0, 200.0)}
 
     # Cut-off of the low-pass of first order [Hz].
     cutoff: float = 20.0

@@ -17,6 +17,10 @@ from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 class TrueFriction(Estimator):
     """The friction that acted in the last tick, as only a simulation can tell (oracle)."""
 
+    @classmethod
+    def variants(cls) -> dict[str, Estimator]:
+        return {}
+
     def add(self, chain: Chain) -> None:
         chain.add("friction", partial(TrueFrictionSource, len(chain.robot.joint_names)))
 

@@ -1,0 +1,80 @@
+"""Pushes: forces on bodies from outside, for a while, that no sensor measures."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import Context, LeafSystem
+
+from fbse_drake.errors import InputError, located, require_not_negative, require_positive
+from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
+
+_Forces = Value[list[ExternallyAppliedSpatialForce]]
+# Times are compared give or take this [s].
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Push:
+    """A constant force at a body's centre of mass."""
+
+    body: str
+    # In the world's axes [N].
+    force: list[float]
+    # When it begins, and how long it lasts [s].
+    start: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        if len(self.force) != 3:
+            raise InputError(f"force: expected three numbers, found {self.force}")
+        require_not_negative(self, "start")
+        require_positive(self, "duration")
+
+    def acts_at(self, time: float) -> bool:
+        """Does it act in a step that begins at this time [s]?"""
+        return self.start - _ROUNDING <= time < self.start + self.duration - _ROUNDING
+
+
+class PushSource(LeafSystem):
+    """Pushes a robot.
+
+    .. pydrake_system::
+
+        name: PushSource
+        output_ports:
+        - spatial_forces
+
+    `spatial_forces` is a list of `ExternallyAppliedSpatialForce`, for the plant's port.
+    """
+
+    def __init__(self, pushes: Mapping[str, Push], robot: Robot):
+        """Finds the bodies.
+
+        Raises:
+            InputError: a body that the robot has not.
+        """
+        super().__init__()
+        self._pushes: list[tuple[Push, RigidBody]] = []
+        for name, push in pushes.items():
+            with located(f"pushes.{name}.body: "):
+                self._pushes.append((push, robot.body(push.body)))
+        self.DeclareAbstractOutputPort(
+            "spatial_forces", _Forces, weakly(self._calc), {self.time_ticket()}
+        )
+
+    def _calc(self, context: Context, output: Value) -> None:
+        forces = []
+        for push, body in self._pushes:
+            if push.acts_at(context.get_time()):
+                force = ExternallyAppliedSpatialForce()
+                force.body_index = body.index()
+                force.p_BoBq_B = body.default_com()
+                force.F_Bq_W = SpatialForce(tau=np.zeros(3), f=np.array(push.force))
+                forces.append(force)
+        output.set_value(forces)
