@@ -486,12 +486,13 @@ def _rivals(options: argparse.Namespace) -> bool:
         report.write_rivals_report(
             out / "report.html", comparison, name=name, seeds=options.seeds, scenario=text
         )
-    tables = (report.error_table, report.loop_table, report.needs_table)
-    for table in (make(comparison) for make in tables):
-        shown = Table(*table.header, title_justify="left")
-        for row in table.rows:
-            shown.add_row(*map(str, row))
-        console.print(shown)
+    for title, make in (
+        ("Friction", report.error_table),
+        ("In the loop", report.loop_table),
+        ("What each needs", report.needs_table),
+    ):
+        table = make(comparison)
+        console.print(_printed(table, title))
         tell(table.caption)
     tell(report.ahead_text(comparison))
     tell(report.outcome_text(comparison, options.seeds))
