@@ -35,12 +35,14 @@ def outputs_by_name(system: System) -> dict[str, OutputPort]:
     return {port.get_name(): port for port in ports}
 
 
-def weakly(method: MethodType) -> Callable[..., Any]:
+def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
     """A method of a system as the callback of one of its ports, events or cache entries.
 
     Drake keeps callbacks where Python's collector does not see them. The bound method itself would
     keep the system alive for ever, and with it all that its cache and its ports hold.
     """
+    if not isinstance(method, MethodType):
+        raise TypeError(f"expected a method of a system, found {method}")
     system, function = weakref.ref(method.__self__), method.__func__
     return lambda *arguments: function(system(), *arguments)
 

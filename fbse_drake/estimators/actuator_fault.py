@@ -79,19 +79,22 @@ class ActuatorFaultObserver(MomentumBalance):
     ):
         """Declares ports and state; arguments as of `MomentumBalance`."""
         n = len(robot.joint_names)
-        fields = {
-            "fault": (n,),
-            "friction_std": (n,),
-            "augmented": (4, n),
-            "healthy": (2, n),
-            "evidence": (n,),
-            "runs": (),
-        }
-        super().__init__(robot, **arguments, **fields)
-        self._config, self._sensors = config, sensors
+        super().__init__(
+            robot,
+            **arguments,
+            fault=(n,),
+            friction_std=(n,),
+            augmented=(4, n),
+            healthy=(2, n),
+            evidence=(n,),
+            runs=(),
+        )
+        self._config = config
+        self._velocity_variance = _square(sensors.joint_velocity_noise)
+        self._rate_variance = _square(sensors.angular_velocity_noise)
         self._threshold = float(chi2.isf(config.false_alarms, 1))
         legs = robot.description.legs
-        moment, force = sensors.moment_noise**2, sensors.force_noise**2
+        moment, force = _square(sensors.moment_noise), _square(sensors.force_noise)
         self._wrench_variance = np.concatenate(
             [
                 np.repeat([moment, force], 3) if leg.corners else force * (grasp**2).sum(axis=1)
@@ -106,11 +109,11 @@ class ActuatorFaultObserver(MomentumBalance):
     def _observe(
         self, balance: Balance, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
-        config, sensors, T = self._config, self._sensors, elapsed
+        config, T = self._config, elapsed
         momentum = posterior["momentum"]
         squares = balance.inertia**2
-        noise = sensors.joint_velocity_noise**2 * squares[:, 6:].sum(axis=1)
-        noise += sensors.angular_velocity_noise**2 * squares[:, :3].sum(axis=1)
+        noise = self._velocity_variance * squares[:, 6:].sum(axis=1)
+        noise += self._rate_variance * squares[:, :3].sum(axis=1)
         disturbance = T**2 * (self._wrench_variance @ balance.foot_jacobian**2)
         impulse = T * balance.remainder + balance.momentum_change
         augmented, healthy, fault = last["augmented"], last["healthy"], last["friction"]
@@ -131,6 +134,11 @@ class ActuatorFaultObserver(MomentumBalance):
         posterior["friction"], posterior["friction_std"] = fault, np.sqrt(augmented[3])
         posterior["evidence"], posterior["runs"] = evidence, 1.0
         posterior["fault"] = told & (np.abs(fault) > config.smallest)
+
+
+def _square(noise: float | None) -> float:
+    """Variance of a noise that is believed; none of what nobody believes anything of."""
+    return (noise or 0.0) ** 2
 
 
 def is_fault(evidence: np.ndarray, keep: float, threshold: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -45,7 +45,7 @@ class FixedFriction(Estimator):
             log["joint/velocity"][rows],
             log["estimate/joint/residual_torque"][rows],
         )
-        return FixedFriction(found.config())
+        return FixedFriction(cast(CoulombViscousFriction, found.config()))
 
     def check(self, names: RobotDescription) -> None:
         self.model.resolve(names, key="model")

@@ -78,14 +78,15 @@ def loop_table(comparison: Comparison) -> Table:
 
 def needs_table(comparison: Comparison) -> Table:
     """What each method must know and measure, how it was tuned, and what a tick costs."""
-    ours, rows = comparison.tick(OURS), []
+    ours, rows = comparison.tick(OURS), list[tuple[str, ...]]()
     for tuned in comparison.tuned:
         estimator, name = tuned.method.estimator, tuned.method.name
         settings = ", ".join(f"{key} {getattr(estimator, key):g}" for key in estimator.tunable)
         tuning = f"{number(tuned.before)} to {number(tuned.after)}" if tuned.trials > 1 else "-"
         tick = comparison.tick(name)
         cost = (number(tick), number(tick / ours))
-        rows.append((name, estimator.knows, estimator.measures, settings or "-", tuning, *cost))
+        needs = (estimator.knows, estimator.measures)
+        rows.append((name, *needs, settings or "-", tuning, *cost))
     header = ("Method", "knows", "measures beside joints", "tuned", "score", "tick [us]", "of FBSE")
     caption = (
         "Each method with settings to tune had as many trials on another walk; score is the NRMSE "
@@ -97,7 +98,7 @@ def needs_table(comparison: Comparison) -> Table:
 def joint_table(comparison: Comparison) -> Table:
     """Errors by joint and phase, as believed."""
     joints = comparison.joints
-    rows = [
+    rows: list[tuple[str | float, ...]] = [
         (
             name,
             phase,

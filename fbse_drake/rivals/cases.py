@@ -24,14 +24,14 @@ _PUSH, _PUSH_TIME = 0.03, 0.1
 # Friction grows by this share of what it is at this velocity [rad/s].
 _GROWTH, _TYPICAL_SPEED = 0.5, 0.1
 # Velocity over which it changes its sign [rad/s].
-_TRANSITION = 0.01
+_TRANSITION = np.array(0.01)
 # The ground is tilted by this about the sideways axis [rad]: 2 deg.
 _SLOPE = 0.0349
 
 
 @dataclass(frozen=True)
 class SuddenFriction(JointTorqueEffect):
-    """Coulomb friction from some time on: u = coulomb tanh(w / 0.01 rad/s) for t >= start.
+    """Coulomb friction from some time on: u = coulomb tanh(w / 0.01 rad/s) for t >= begin.
 
     It is none of the library, for a diagnosis has no use for it.
     """
@@ -41,11 +41,11 @@ class SuddenFriction(JointTorqueEffect):
     experiment: ClassVar[str] = "Walk for long."
     parameters: ClassVar[dict[str, Parameter]] = {
         "coulomb": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
-        "start": Parameter("s", linear=False, plausible=(0.1, 1000.0)),
+        "begin": Parameter("s", linear=False, plausible=(0.1, 1000.0)),
     }
 
     coulomb: dict[str, float] = field(default_factory=dict)
-    start: dict[str, float] = field(default_factory=dict)
+    begin: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
     def basis(
@@ -57,7 +57,7 @@ class SuddenFriction(JointTorqueEffect):
 
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
-        return Rise(speeds=(np.array(_TRANSITION),))
+        return Rise(speeds=(_TRANSITION,))
 
 
 def _as_told(scenario: Scenario) -> Scenario:
@@ -93,8 +93,8 @@ def _growing(scenario: Scenario) -> Scenario:
     speed = np.full((1, len(names.joint_names)), _TYPICAL_SPEED)
     (friction,) = law_over_time(effects, JointMotion(speed, np.zeros_like(speed)))
     sizes = dict(zip(names.joint_names, (_GROWTH * np.abs(friction)).tolist(), strict=True))
-    start = {"all": scenario.duration / 2}
-    return _with_effect(scenario, SuddenFriction(sizes, start))
+    middle = {"all": scenario.duration / 2}
+    return _with_effect(scenario, SuddenFriction(sizes, middle))
 
 
 def _sloped(scenario: Scenario) -> Scenario:

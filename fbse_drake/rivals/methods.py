@@ -70,7 +70,8 @@ def methods(scenario: Scenario) -> tuple[list[Method], dict[str, str]]:
         InputError: FBSE is none of them.
     """
     scenario = measured(scenario)
-    robot, period = build_robot(scenario.believed), scenario.control.period
+    robot = build_robot(scenario.believed)
+    period = scenario.control.period or scenario.usual_period
     plan = planned_reference(replace(scenario, duration=2 * period), robot).plan
     sensors = scenario.sensors.by_name.values()
     ports = [port for sensor in sensors for port in sensor.ports()]
@@ -78,11 +79,13 @@ def methods(scenario: Scenario) -> tuple[list[Method], dict[str, str]]:
     for method in candidates():
         try:
             method.estimator.check_sensors(ports)
-            release(make_estimator(method.estimator, robot, period=period, plan=plan))
+            made = make_estimator(method.estimator, robot, period=period, plan=plan)
         except InputError as error:
             unfit[method.name] = str(error)
         else:
             found.append(method)
+            if made is not None:
+                release(made)
     if OURS in unfit:
         raise InputError(f"nothing to compare: {OURS}: {unfit[OURS]}")
     return found, unfit

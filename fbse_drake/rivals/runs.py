@@ -85,7 +85,8 @@ def feeding_back(material: Material, scenario: str) -> dict[str, str]:
         estimator = TrueFriction() if who == ORACLE else Method.read(who).estimator
         walk = replace(walk, estimator=estimator, compensation=compensation(walk))
     simulated = simulate(walk)
-    log, stride = simulated.log, max(1, round(_COM_PERIOD / walk.log.period))
+    log = simulated.log
+    stride = max(1, round(_COM_PERIOD / float(log.meta["period"])))
     return _result(
         {
             "failure": simulated.failure,

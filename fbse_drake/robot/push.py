@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -75,6 +76,7 @@ class PushSource(LeafSystem):
                 force = ExternallyAppliedSpatialForce()
                 force.body_index = body.index()
                 force.p_BoBq_B = body.default_com()
-                force.F_Bq_W = SpatialForce(tau=np.zeros(3), f=np.array(push.force))
+                F: Any = np.array([0.0, 0.0, 0.0, *push.force])
+                force.F_Bq_W = SpatialForce(F=F)
                 forces.append(force)
         output.set_value(forces)
