@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 from fbse_drake.discrepancy.diagnosis import add as addition
 from fbse_drake.discrepancy.diagnosis import compare as comparing
@@ -39,7 +39,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.files import write_text
 from fbse_drake.interop.convert import read_logs
 from fbse_drake.interop.export import writer_for
-from fbse_drake.log import Log
+from fbse_drake.log import Log, joined
 from fbse_drake.progress import Progress, silent
 from fbse_drake.report.discrepancy import (
     Inputs,
@@ -47,6 +47,7 @@ from fbse_drake.report.discrepancy import (
     diagnosis_outcome,
     failures_table,
     findings_table,
+    spread_tables,
     steps_table,
     study_outcome,
     write_compare_report,
@@ -64,8 +65,8 @@ from fbse_drake.results import Result, made_folder
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, dump_scenario
 
-# What the part of a log that nothing is fitted to is called.
-_REST = "rest of the log"
+# A log, or several by name, which are fitted together.
+Recordings: TypeAlias = Log | Mapping[str, Log]
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ class Case:
     log: Log
     train: Log
     tests: dict[str, Log] = field(default_factory=dict)
+    # Which of the tests are rests; and, if several were given that `log` and `train` are of, each.
+    rests: tuple[str, ...] = ()
+    recordings: dict[str, Log] = field(default_factory=dict)
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -107,12 +111,23 @@ class Case:
 
     @classmethod
     def divided(
-        cls, scenario: Scenario, log: Log, tests: Mapping[str, Log] | None, name: str
+        cls, scenario: Scenario, log: Recordings, tests: Mapping[str, Log] | None, name: str
     ) -> "Case":
-        """With the rest of the log set aside."""
-        train, rest = train_and_rest(scenario, log)
-        aside = {} if rest is None else {_REST: rest}
-        return cls(name, scenario, log, train, aside | dict(tests or {}))
+        """With the rest of each log set aside."""
+        given = {"the log": log} if isinstance(log, Log) else dict(log)
+        if not given:
+            raise InputError("no log is given")
+        parts = {one: train_and_rest(scenario, of) for one, of in given.items()}
+        rests = {f"rest of {one}": rest for one, (_, rest) in parts.items() if rest is not None}
+        return cls(
+            name,
+            scenario,
+            joined(given),
+            joined({one: train for one, (train, _) in parts.items()}),
+            rests | dict(tests or {}),
+            tuple(rests),
+            given if len(given) > 1 else {},
+        )
 
 
 class AnalysisResult(Result):
@@ -137,6 +152,10 @@ class AnalysisResult(Result):
         """The model's plant."""
         return self.case.predictor.robot
 
+    def further_tables(self) -> list[Table]:
+        """What is shown beside its table."""
+        return []
+
     def json(self) -> dict[str, Any]:
         """Contents of its JSON file, see the contracts."""
         return self._json() | {"hygiene": hygiene_json(self.hygiene)}
@@ -158,7 +177,9 @@ class AnalysisResult(Result):
         out = made_folder(folder)
         if inputs is None:
             inputs = self._inputs_in(out)
-            self.case.log.save(inputs.log)
+            logs = self.case.recordings.values() or [self.case.log]
+            for path, log in zip(inputs.logs, logs, strict=True):
+                log.save(path)
             for path, (_, log) in zip(inputs.tests, self._further_tests, strict=True):
                 log.save(path)
         content = self.json()
@@ -171,14 +192,14 @@ class AnalysisResult(Result):
 
     def _inputs_in(self, folder: Path) -> Inputs:
         tests = tuple(str(folder / f"{name}.npz") for name, _ in self._further_tests)
-        scenario, log = folder / "scenario.yaml", folder / "log.npz"
-        return Inputs(
-            self.case.name, str(scenario), str(log), str(folder), tests, hygiene=self.hygiene
-        )
+        logs = tuple(str(folder / f"{name}.npz") for name in self.case.recordings or ["log"])
+        scenario = str(folder / "scenario.yaml")
+        return Inputs(self.case.name, scenario, logs, str(folder), tests, hygiene=self.hygiene)
 
     @property
     def _further_tests(self) -> list[tuple[str, Log]]:
-        return [(name, log) for name, log in self.case.tests.items() if name != _REST]
+        tests = self.case.tests.items()
+        return [(name, log) for name, log in tests if name not in self.case.rests]
 
     @property
     def _completed(self) -> Scenario | None:
@@ -226,6 +247,9 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
 
     def table(self) -> Table:
         return findings_table(self.ranking)
+
+    def further_tables(self) -> list[Table]:
+        return spread_tables(self.chosen)
 
     def _json(self) -> dict[str, Any]:
         return diagnosing.diagnosis_json(self)
@@ -278,6 +302,9 @@ class IdentificationResult(Identification, AnalysisResult):
     def table(self) -> Table:
         return errors_table(self)
 
+    def further_tables(self) -> list[Table]:
+        return spread_tables(self.findings)
+
     def _json(self) -> dict[str, Any]:
         return identifying.identification_json(self)
 
@@ -306,7 +333,7 @@ def compare(scenario: Scenario, log: Log, *, name: str = "scenario") -> Comparis
 
 def diagnose(
     scenario: Scenario,
-    log: Log,
+    log: Recordings,
     effects: Iterable[type[Effect]] | None = None,
     *,
     tests: Mapping[str, Log] | None = None,
@@ -317,7 +344,8 @@ def diagnose(
 
     Args:
         scenario: whose `model` is looked at.
-        log: of a robot, real or simulated; truth channels are not looked at.
+        log: of a robot, real or simulated, or several by name, which are fitted together
+            (`Finding.spread` says how far they agree); truth channels are not looked at.
         effects: what is tried; by default the library but for what `identify.ruled_out` names.
         tests: further logs to test on, by name; nothing is fitted to them.
         name: what the scenario is called in reports.
@@ -353,7 +381,8 @@ def study(
     """Adds what a scenario's model lacks until a log shows nothing more.
 
     Args:
-        scenario, log, effects, tests, name, progress: see `diagnose`.
+        scenario, effects, tests, name, progress: see `diagnose`.
+        log: one; models are simulated against it.
         rollouts: also simulates the model in the robot's place after every round.
         jobs: how many simulations run side by side.
 
@@ -376,7 +405,7 @@ def study(
 
 def identify(
     scenario: Scenario,
-    log: Log,
+    log: Recordings,
     *,
     tests: Mapping[str, Log] | None = None,
     name: str = "scenario",

@@ -196,7 +196,17 @@ def _parser() -> argparse.ArgumentParser:
             examples=examples,
         )
         _add_scenario(run)
-        _add_log(run)
+        if name in ("diagnose", "identify"):
+            run.add_argument(
+                "logs",
+                metavar="LOG",
+                type=Path,
+                nargs="+",
+                help="a log file (npz), or a recording (see convert); several are fitted together",
+            )
+            _add_map(run)
+        else:
+            _add_log(run)
         if name != "compare":
             run.add_argument(
                 "--test",

@@ -97,9 +97,9 @@ def _estimate(options: argparse.Namespace) -> bool:
 
 
 def _compare(options: argparse.Namespace) -> bool:
-    given = _scenario_and_log(options, "_compare")
+    given = _scenario_and_logs(options, [options.log], "_compare")
     with (
-        _errors_located(options),
+        _errors_located(given.inputs),
         given.console.status("comparing the model with the log"),
     ):
         result = compare(given.scenario, given.log, name=given.inputs.name)
@@ -108,11 +108,11 @@ def _compare(options: argparse.Namespace) -> bool:
 
 
 def _diagnose(options: argparse.Namespace) -> bool:
-    given = _scenario_and_log(options, "_diagnose")
-    with _errors_located(options), _told(given.console, options.time_limit) as progress:
+    given = _scenario_and_logs(options, options.logs, "_diagnose")
+    with _errors_located(given.inputs), _told(given.console, options.time_limit) as progress:
         result = diagnose(
             given.scenario,
-            given.log,
+            given.recordings,
             tests=_tests(options),
             name=given.inputs.name,
             progress=progress,
@@ -122,8 +122,8 @@ def _diagnose(options: argparse.Namespace) -> bool:
 
 
 def _study(options: argparse.Namespace) -> bool:
-    given = _scenario_and_log(options, "_study")
-    with _errors_located(options), _told(given.console, options.time_limit) as progress:
+    given = _scenario_and_logs(options, [options.log], "_study")
+    with _errors_located(given.inputs), _told(given.console, options.time_limit) as progress:
         result = study(
             given.scenario,
             given.log,
@@ -137,11 +137,11 @@ def _study(options: argparse.Namespace) -> bool:
 
 
 def _identify(options: argparse.Namespace) -> bool:
-    given = _scenario_and_log(options, "_identify")
-    with _errors_located(options), _told(given.console) as progress:
+    given = _scenario_and_logs(options, options.logs, "_identify")
+    with _errors_located(given.inputs), _told(given.console) as progress:
         result = identify(
             given.scenario,
-            given.log,
+            given.recordings,
             tests=_tests(options),
             name=given.inputs.name,
             progress=progress,
@@ -198,27 +198,42 @@ class _Given:
 
     console: Console
     scenario: Scenario
-    log: Log
+    # By name.
+    logs: dict[str, Log]
     inputs: Inputs
     out: Path
 
+    @property
+    def log(self) -> Log:
+        """The only one."""
+        (log,) = self.logs.values()
+        return log
 
-def _scenario_and_log(options: argparse.Namespace, suffix: str) -> _Given:
+    @property
+    def recordings(self) -> Log | dict[str, Log]:
+        """One log as it is, several by name."""
+        return self.logs if len(self.logs) > 1 else self.log
+
+
+def _scenario_and_logs(options: argparse.Namespace, paths: Sequence[Path], suffix: str) -> _Given:
     name, scenario = read_scenario(options.scenario, options.name, options.overrides)
-    log = read_log(options.log, options.map)
+    if len(set(paths)) < len(paths):
+        raise InputError(f"{paths[0]}: a log is given twice")
+    alike = len({path.stem for path in paths}) < len(paths)
+    logs = {str(path) if alike else path.stem: read_log(path, options.map) for path in paths}
     out = _output_folder(options, suffix)
     inputs = Inputs(
         name,
         options.scenario,
-        str(options.log),
+        tuple(map(str, paths)),
         str(out),
         tuple(map(str, getattr(options, "test", ()))),
     )
-    return _Given(Console(quiet=options.quiet), scenario, log, inputs, out)
+    return _Given(Console(quiet=options.quiet), scenario, logs, inputs, out)
 
 
-def _errors_located(options: argparse.Namespace) -> AbstractContextManager[None]:
-    return located(f"{options.scenario} over {options.log}: ")
+def _errors_located(inputs: Inputs) -> AbstractContextManager[None]:
+    return located(f"{inputs.scenario} over {', '.join(inputs.logs)}: ")
 
 
 @contextmanager
@@ -261,6 +276,8 @@ def _conclude(given: _Given, result: AnalysisResult) -> None:
         console.print(remarks)
     if (table := result.table()).rows:
         console.print(_printed(table, given.inputs.name))
+    for further in result.further_tables():
+        console.print(_printed(further, given.inputs.name))
     console.print(result.outcome, highlight=False)
     console.print(f"Report: {given.out / 'report.html'}", highlight=False, soft_wrap=True)
 

@@ -181,5 +181,51 @@ class Log(Mapping[str, np.ndarray]):
             return cls(content, meta)
 
 
+def joined(logs: Mapping[str, "Log"], gap: float = 1.0) -> Log:
+    """Recordings of one robot as one log, one after the other.
+
+    Channels that not all of them have are left out.
+
+    Args:
+        logs: by the names that they have in meta["segments"].
+        gap: time between them [s].
+
+    Raises:
+        InputError: they have other joints or another period.
+    """
+    (name, first), *others = logs.items()
+    if not others:
+        return first
+    for other_name, other in others:
+        for what, ours, theirs in (
+            ("joints", first.joints, other.joints),
+            ("period", first.meta["period"], other.meta["period"]),
+        ):
+            if ours != theirs:
+                raise InputError(
+                    f"{other_name}: cannot be one log with {name}: its {what} is {theirs}, not {ours}"
+                )
+    segments: list[dict[str, Any]] = []
+    times, begin = [], float(first.time[0])
+    for name, log in logs.items():
+        shift = begin - float(log.time[0])
+        times.append(log.time + shift)
+        whole = {"start": float(log.time[0]), "end": float(log.time[-1]), "source": name}
+        for part in log.meta.get("segments", [whole]):
+            # Part of a log has the segments of all of it.
+            start = max(part["start"], whole["start"])
+            end = min(part["end"], whole["end"])
+            if start < end:
+                segments.append(part | {"start": start + shift, "end": end + shift})
+        begin = float(times[-1][-1]) + gap
+    shared = [channel for channel in first if all(channel in log for log in logs.values())]
+    channels = {
+        channel: np.concatenate([log[channel] for log in logs.values()])
+        for channel in shared
+        if channel != "time"
+    }
+    return Log({"time": np.concatenate(times)} | channels, first.meta | {"segments": segments})
+
+
 def _shape_text(shape: tuple[Any, ...]) -> str:
     return " x ".join(map(str, shape))

@@ -18,7 +18,7 @@ from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
 
-INPUTS = reports.Inputs("a_walk", "paper_walk", "walk.npz", "out/a_walk")
+INPUTS = reports.Inputs("a_walk", "paper_walk", ("walk.npz",), "out/a_walk")
 KNEES = ("left_knee_pitch", "right_knee_pitch")
 FRICTION = Finding(
     "CoulombFriction",

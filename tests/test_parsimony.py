@@ -12,9 +12,13 @@ from scipy.optimize import minimize
 
 from fbse_drake import Log, Scenario, load_scenario
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
-from fbse_drake.discrepancy.diagnosis.parsimony import blocks_per_sample
+from fbse_drake.discrepancy.diagnosis.explanation import Explanation
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.parsimony import Judge, blocks_per_sample, frugal
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.joint_torque import (
     JointMotion,
@@ -176,6 +180,41 @@ def test_slow_errors_of_the_model_are_no_findings(swing: tuple[Scenario, Log]):
     (coulomb_found,) = diagnosis.chosen
     low, high = coulomb_found.parameters["coulomb"].interval
     assert low < 3.0 < high
+
+
+def friction_in_all_joints(
+    swing: tuple[Scenario, Log], size: float
+) -> tuple[Proposals, Explanation]:
+    """Coulomb friction of many sizes beside slow random walks of all torques, and its fit."""
+    scenario, log = swing
+    random = np.random.default_rng(2)
+    torque = log["joint/torque_command"].copy()
+    walks = np.cumsum(random.standard_normal(torque.shape), axis=0)
+    torque += 0.5 * walks / walks.std(axis=0) + NOISE * random.standard_normal(torque.shape)
+    sizes = size * (1.0 + 0.1 * np.arange(torque.shape[1]))
+    torque += sizes * np.tanh(log["joint/velocity"] / 0.01)
+    log = Log(log.channels | {"joint/torque_command": torque}, log.meta)
+    laws = [library()[name] for name in FRICTION[:2]]
+    proposals = Proposals(Fits(Dictionary(Predictor(scenario, log), laws)))
+    explanation = proposals.fits.explain([])
+    for joint in log.joints:
+        explanation = proposals.beside(explanation, laws[0], (joint,))
+    return proposals, explanation
+
+
+def test_joints_prove_together_what_none_proves_alone(swing: tuple[Scenario, Log]):
+    proposals, explanation = friction_in_all_joints(swing, 0.4)
+    judge = Judge(proposals.fits, explanation)
+    for member in explanation.candidates:
+        rest = [c for c in explanation.candidates if c is not member]
+        assert not judge.pays(proposals.fits.explain(rest), explanation, member)
+    kept = frugal(proposals, explanation).candidates
+    assert {c.name for c in kept} == {"CoulombFriction"}
+    assert sum(len(c.targets) for c in kept) >= 6
+
+
+def test_slow_errors_of_all_joints_prove_nothing_together(swing: tuple[Scenario, Log]):
+    assert frugal(*friction_in_all_joints(swing, 0.0)).candidates == ()
 
 
 def test_nothing_is_found_in_noise(swing: tuple[Scenario, Log]):

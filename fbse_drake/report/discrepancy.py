@@ -11,6 +11,7 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.compare import Channel, Comparison, words
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import Study, StudyStep
 from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
@@ -40,6 +41,8 @@ _JOINTS = 6
 _SHOWN = 500
 # Tables show this many failures, others are folded away.
 _FAILURES = 8
+# So many rows of a disturbance are named.
+_DISTURBED = 3
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Inputs:
     # Of the scenario.
     name: str
     scenario: str
-    log: str
+    logs: tuple[str, ...]
     # Folder of the results.
     out: str
     # Further logs to test on.
@@ -72,7 +75,7 @@ def write_compare_report(
         ("Where it fails", _kinds(comparison)),
         (
             "What to do next",
-            f"fbse diagnose {inputs.scenario} {inputs.log}"
+            f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)}"
             if comparison.failures
             else "Nothing: there is nothing to explain.",
         ),
@@ -227,6 +230,9 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     if diagnosis.partial is not None:
         return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
     parts = [_verdict(diagnosis)]
+    parts += [_disturbed(one) for one in diagnosis.disturbances]
+    if _disagreement(diagnosis.chosen):
+        parts.append(_disagreement(diagnosis.chosen))
     if diagnosis.averaging is not None and diagnosis.averaging.text:
         parts.append(diagnosis.averaging.text)
     return _headline(" ".join(parts), diagnosis.set_aside)
@@ -327,6 +333,55 @@ def _on_set_aside(set_aside: Mapping[str, Validation]) -> list[tuple[str, str]]:
 
 def _is_confirmed(set_aside: Mapping[str, Validation]) -> bool:
     return all(one.course == "falls" for one in set_aside.values())
+
+
+_SPREAD_HEADER = ("Effect", "In", "Parameter", "By recording (95 % interval)", "Between", "Agree")
+
+
+def _spread_rows(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
+    """How far recordings that were fitted together agree in what was found; see `_SPREAD_HEADER`."""
+    rows = []
+    for finding in findings:
+        for name, spread in finding.spread.items():
+            unit = finding.parameters[name].unit
+            each = [
+                f"{log}: {parameter_text('', Estimate(own.value, own.interval, unit)).strip()}"
+                for log, own in spread.by_log.items()
+            ]
+            agree = f"no (p = {spread.probability:.1g})" if spread.differs else "yes"
+            place = targets_text(finding.targets, finding.effect)
+            between = f"{spread.between:.2g}{'' if unit == '1' else f' {unit}'}"
+            rows.append(
+                (spaced(finding.effect), place, words(name), "; ".join(each), between, agree)
+            )
+    return rows
+
+
+def spread_tables(findings: Sequence[Finding]) -> list[Table]:
+    """For a report; none if one recording was fitted."""
+    rows = _spread_rows(findings)
+    caption = (
+        "Each recording fitted alone. Between: standard deviation of the value from recording to "
+        "recording, beyond its own uncertainty (DerSimonian and Laird); they agree unless "
+        "Cochran's Q is as large as chance makes it once in a thousand times."
+    )
+    return [Table(_SPREAD_HEADER, tuple(rows), caption)] if rows else []
+
+
+def _disturbed(disturbance: Disturbance) -> str:
+    """As `Something acted on left knee pitch from 3.21 to 3.43 s, once; that was left out.`"""
+    rows = _enumerated([words(row) for row in disturbance.rows[:_DISTURBED]])
+    more = len(disturbance.rows) - _DISTURBED
+    return (
+        f"Something acted on {rows}{f' and {more} more rows' if more > 0 else ''} from "
+        f"{disturbance.start:.2f} to {disturbance.end:.2f} s and not again; that was left out of the fit."
+    )
+
+
+def _disagreement(findings: Sequence[Finding]) -> str:
+    """Says of which findings recordings do not agree; empty if they do."""
+    unlike = [f for f in findings if any(s.differs for s in f.spread.values())]
+    return f"The recordings do not agree in {_listed(unlike)}." if unlike else ""
 
 
 def _too_small(findings: Sequence[Finding]) -> list[tuple[str, str]]:
@@ -752,6 +807,7 @@ def _why(
                 "What explains the error", caption, figures.ranking([*chosen, *others], names)
             )
         )
+    tables += spread_tables(chosen)
     valued = [
         (finding, f"{targets_text(finding.targets, finding.effect)}{when}")
         for finding, when in zip(chosen, of_round, strict=True)
@@ -1104,7 +1160,7 @@ def _hygiene(predictor: Predictor, inputs: Inputs) -> Section:
     if recording.train_share < 1:
         length += f"; the first {number(100 * recording.train_share, 2)} % of the log, the rest is to test on"
     rows = [
-        ("Log", inputs.log),
+        ("Log", ", ".join(inputs.logs)),
         ("Length", length),
         (
             "Samples that are missing",
@@ -1159,15 +1215,16 @@ def _reproduce(
     command: str, predictor: Predictor, inputs: Inputs, completed: str | None = None
 ) -> Section:
     """The command that makes this report again, and what it ran on."""
-    log = Path(inputs.log)
     packages = ", ".join(
         f"{name} {version(name)}" for name in ("fbse_drake", "drake", "numpy", "scipy")
     )
     rows = [("Software", f"Python {python_version()}, {packages}")]
-    if log.is_file():
-        rows.append(("SHA-256 of the log", sha256(log.read_bytes()).hexdigest()))
+    for log in map(Path, inputs.logs):
+        if log.is_file():
+            of = "the log" if len(inputs.logs) == 1 else log.name
+            rows.append((f"SHA-256 of {of}", sha256(log.read_bytes()).hexdigest()))
     again = [
-        f"fbse {command} {inputs.out}/scenario.yaml {inputs.log}",
+        f"fbse {command} {inputs.out}/scenario.yaml {' '.join(inputs.logs)}",
         *(f"--test {test}" for test in inputs.tests),
         f"--out {inputs.out}_again",
     ]

@@ -5,7 +5,7 @@ from pathlib import Path
 from fbse_drake.discrepancy.diagnosis.identify import Identification, identifiability_text
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, BaseParameter
 from fbse_drake.effects.inertia import InertialParameters
-from fbse_drake.report.discrepancy import parameters_text
+from fbse_drake.report.discrepancy import parameters_text, spread_tables
 from fbse_drake.report.discrepancy_figures import spaced, targets_text
 from fbse_drake.report.html import Details, Report, Section, Table, number, write_report
 from fbse_drake.scenario import dump_scenario
@@ -107,7 +107,7 @@ def write_identification_report(path: str | Path, result: Identification, name: 
             _BASE_TEXT,
             (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),),
         ),
-        Section("Friction", tables=(friction,)),
+        Section("Friction", tables=(friction, *spread_tables(plain))),
         Section(
             "Errors",
             "|residual| / |torque|, 2-norms.",

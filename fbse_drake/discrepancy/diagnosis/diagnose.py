@@ -9,6 +9,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.bandwidth import Averaging, averaged_to_bandwidth
 from fbse_drake.discrepancy.diagnosis.detectability import smallest_detectable
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance, disturbances
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
@@ -24,6 +25,7 @@ from fbse_drake.discrepancy.diagnosis.rivals import (
 )
 from fbse_drake.discrepancy.diagnosis.selection import select
 from fbse_drake.discrepancy.diagnosis.significance import Significance
+from fbse_drake.discrepancy.diagnosis.spread import Spread, spreads, spreads_json
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
@@ -68,6 +70,8 @@ class Finding:
     # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is measured, NaN where it is not known.
     too_small: bool = False
     share: float = np.nan
+    # Of what is chosen, where several recordings were fitted together: how far they agree, by parameter.
+    spread: Mapping[str, Spread] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,8 @@ class Diagnosis:
     # By log that was set aside: is the model with what was chosen better there? See `study` for a
     # search that goes on.
     set_aside: Mapping[str, Validation] = field(default_factory=dict)
+    # In which something acted that no law explains; they were left out.
+    disturbances: tuple[Disturbance, ...] = ()
 
     @property
     def chosen(self) -> list[Finding]:
@@ -167,34 +173,17 @@ def diagnose(
         progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
     """
     predictor, averaging = averaged_to_bandwidth(predictor)
-    tried = plausible_effects(predictor) if effects is None else effects
-    dictionary = Dictionary(predictor, tried, progress)
-    first, partial = Fits(dictionary), None
-    before = first.white.sse
-    path, proposals = [first.explain([])], Proposals(first)
-    try:
-        for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
-            progress("looking for what explains more")
-        path[-1] = frugal(proposals, path[-1])
-    except Interrupted as stop:
-        partial = str(stop)
-    fits = proposals.fits
-    white = fits.white
-    alternatives: dict[int, list[Explanation]] = {}
-    try:
-        if partial is None and dictionary.inertia is None:
-            path[-1], alternatives = settled(proposals, path[-1])
-    except Interrupted as stop:
-        partial = str(stop)
-    final, inertia = consistent(fits, path[-1])
-    path[-1], remaining, left = added(fits, final)
-    final = path[-1]
+    tried = plausible_effects(predictor) if effects is None else list(effects)
+    search = _searched(predictor, tried, progress)
+    disturbed = search.disturbances
+    if disturbed:
+        predictor = predictor.without([(one.start, one.end) for one in disturbed])
+        search = _searched(predictor, tried, progress)
+    proposals, path, alternatives = search.proposals, search.path, search.alternatives
+    before, inertia, unexplained = search.before, search.inertia, search.unexplained
+    partial, final, fits = search.partial, path[-1], proposals.fits
+    white, dictionary = fits.white, fits.dictionary
     significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
-    unexplained = [
-        structure
-        for structure in leftover_structure(predictor.motion, remaining, left)
-        if not significance.left_share(structure, remaining) < tolerance
-    ]
     shares = {c: significance.share(final, c) for c in final.candidates}
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
@@ -233,6 +222,55 @@ def diagnose(
         inertia,
         averaging,
         partial,
+        disturbances=disturbed,
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What a search found."""
+
+    proposals: Proposals
+    # The last is what was found, when it is in the model.
+    path: list[Explanation]
+    # By member of the last, where they were looked for.
+    alternatives: dict[int, list[Explanation]]
+    # Sum of squares of each row before anything is explained, (R,).
+    before: np.ndarray
+    inertia: IdentifiedInertia | None
+    # What is left in rows, as far as it is large enough to matter, and in which stretches it stands out.
+    unexplained: list[Structure]
+    disturbances: tuple[Disturbance, ...]
+    partial: str | None
+
+
+def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: Progress) -> _Search:
+    dictionary = Dictionary(predictor, effects, progress)
+    first, partial = Fits(dictionary), None
+    path, proposals = [first.explain([])], Proposals(first)
+    try:
+        for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
+            progress("looking for what explains more")
+        path[-1] = frugal(proposals, path[-1])
+    except Interrupted as stop:
+        partial = str(stop)
+    alternatives: dict[int, list[Explanation]] = {}
+    try:
+        if partial is None and dictionary.inertia is None:
+            path[-1], alternatives = settled(proposals, path[-1])
+    except Interrupted as stop:
+        partial = str(stop)
+    final, inertia = consistent(proposals.fits, path[-1])
+    path[-1], remaining, left = added(proposals.fits, final)
+    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    unexplained = [
+        structure
+        for structure in leftover_structure(predictor.motion, remaining, left)
+        if not significance.left_share(structure, remaining) < tolerance
+    ]
+    disturbed = disturbances(remaining, left, [structure.index for structure in unexplained])
+    return _Search(
+        proposals, path, alternatives, first.white.sse, inertia, unexplained, disturbed, partial
     )
 
 
@@ -280,7 +318,7 @@ def _ranking(
     Args:
         alternatives, equal: by member, rivals and those that explain as much.
     """
-    white = fits.white
+    white, spread = fits.white, spreads(fits, final)
     without = [
         fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
@@ -290,7 +328,7 @@ def _ranking(
         member, rest = final.candidates[k], without[k]
         names = tuple(dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ())))
         finding = finding_of(white, rest, final, member, names, chosen=True)
-        findings.append(replace(finding, share=shares[member]))
+        findings.append(replace(finding, share=shares[member], spread=spread.get(member, {})))
     seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
         (e for of_member in alternatives.values() for e in of_member), key=lambda e: e.deviance
@@ -451,6 +489,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "chosen": f.chosen,
                 "too_small": f.too_small,
                 "share": f.share,
+                **spreads_json(f.spread),
             }
             for f in diagnosis.ranking
         ],
@@ -470,6 +509,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for name, s in diagnosis.effects.items()
         },
+        "left_out": [
+            {"start": d.start, "end": d.end, "rows": list(d.rows)} for d in diagnosis.disturbances
+        ],
         "unexplained": [
             {"row": u.row, "ratio": u.ratio, "variable": u.variable, "share": u.share}
             for u in diagnosis.unexplained

@@ -72,6 +72,16 @@ class Explanation:
             for c in itertools.takewhile(lambda c: c is not candidate, self.candidates)
         )
 
+    def fitted(self, candidate: Candidate) -> tuple[list[str], np.ndarray, slice]:
+        """Names of a candidate's fitted parameters, their values (m,), and their places in the fit."""
+        names = list(candidate.linear_names)
+        if issubclass(candidate.effect, JointTorqueEffect):
+            names += candidate.nonlinear_names
+        offsets = np.concatenate([np.zeros(len(candidate.linear_names)), candidate.nonlinear])
+        start = self.start(candidate)
+        part = slice(start, start + len(names))
+        return names, self.fit.parameters[part] + offsets[: len(names)], part
+
     def values(
         self, candidate: Candidate
     ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
@@ -79,16 +89,8 @@ class Explanation:
 
         A nonlinear parameter that was not searched for has its plausible range as interval.
         """
-        start, names = self.start(candidate), candidate.linear_names
-        fitted = names + (
-            candidate.nonlinear_names if issubclass(candidate.effect, JointTorqueEffect) else []
-        )
-        offsets = np.concatenate([np.zeros(len(names)), candidate.nonlinear])[: len(fitted)]
-        part = slice(start, start + len(fitted))
-        values, intervals = (
-            self.fit.parameters[part] + offsets,
-            self.fit.interval()[part] + offsets[:, None],
-        )
+        fitted, values, part = self.fitted(candidate)
+        intervals = self.fit.interval()[part] + (values - self.fit.parameters[part])[:, None]
         found, between = {}, {}
         for name, value, interval in zip(fitted, values, intervals, strict=True):
             bounds = candidate.parameters[name].bounds

@@ -144,11 +144,20 @@ class Fits:
     @cached_property
     def threshold(self) -> np.ndarray:
         """Drop of the deviance that k parameters must bring before they count, by k."""
+        return np.array([np.inf, *map(self.needed_drop, range(1, 13))])
+
+    def needed_drop(self, parameters: int) -> float:
+        """Drop of the deviance that so many parameters must bring before they count."""
+        return float(chi2.isf(FALSE_ALARM / self._tests, parameters))
+
+    @cached_property
+    def _tests(self) -> int:
+        """How many additions a search tries."""
         tests = len(self.fixed_candidates)
         for effect in self.dictionary.joint_effects:
             sets = self.dictionary.points(effect).shape[1]
             tests += len(self.dictionary.groups) * max(1, sets // 4)
-        return np.array([np.inf, *(chi2.isf(FALSE_ALARM / tests, k) for k in range(1, 13))])
+        return tests
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:
         """Fits candidates together."""

@@ -1,7 +1,7 @@
 """Identifies inertial parameters together with plain friction: the textbook fit, without a search for what else may be missing."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import consistent, remeasured
+from fbse_drake.discrepancy.diagnosis.spread import spreads, spreads_json
 from fbse_drake.discrepancy.diagnosis.validation import ModelError, model_error
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.effects.inertia import InertialParameters
@@ -71,8 +72,12 @@ def identify(
     raw, alone = fits.white.sse, fits.explain([])
     progress("fitting plain friction")
     fitted, inertia = consistent(fits, Proposals(fits).plain_friction())
+    spread = spreads(fits, fitted)
     findings = [
-        finding_of(fits.white, alone, fitted, member, (), chosen=True)
+        replace(
+            finding_of(fits.white, alone, fitted, member, (), chosen=True),
+            spread=spread.get(member, {}),
+        )
         for member in fitted.candidates
     ]
     findings += inertia_findings(fits.white, raw, alone, inertia)
@@ -159,6 +164,7 @@ def identification_json(result: Identification) -> dict[str, Any]:
                     name: {"value": e.value, "interval": list(e.interval), "unit": e.unit}
                     for name, e in f.parameters.items()
                 },
+                **spreads_json(f.spread),
             }
             for f in result.findings
             if f.effect != InertialParameters.__name__

@@ -3,12 +3,14 @@
 A search adds what improves an explanation; what it added first may have become needless later, and
 chance and errors of the model make some of it look useful. So every member has to pay once more,
 beside all others; laws give way to simpler ones that they contain; and joints that agree share values.
+A law that no joint proves alone may be proven by several together.
 
 Held-out data are no independent samples where what is left is correlated in time: improvements are
 divided by the number of blocks that count as one, see `blocks_per_sample`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 
 import numpy as np
 from scipy.fft import next_fast_len
@@ -21,6 +23,7 @@ from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGI
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
 from fbse_drake.discrepancy.diagnosis.selection import is_significant
+from fbse_drake.discrepancy.diagnosis.spread import recordings
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -84,8 +87,11 @@ def _smaller(
         member: fits.explain([c for c in explanation.candidates if c is not member])
         for member in explanation.candidates
     }
-    for member in sorted(without, key=lambda c: judge.gain(without[c], explanation)):
-        if not judge.pays(without[member], explanation, member):
+    pays = cache(lambda member: judge.pays(without[member], explanation, member))
+    by_gain = sorted(without, key=lambda c: judge.gain(without[c], explanation))
+    for member in (c for c in by_gain if not pays(c)):
+        alike = [c for c in by_gain if _is_one_law(c, member) and not pays(c)]
+        if len(alike) < 2 or not judge.pay_together(explanation, alike, without):
             yield without[member]
     yield from _on_fewer_targets(proposals, judge, explanation)
     yield from _reduced(proposals, judge, explanation)
@@ -98,6 +104,8 @@ class Judge:
     def __init__(self, fits: Fits, explanation: Explanation):
         """Measures what the largest explanation leaves: what a smaller one leaves is no noise."""
         self._fits, self._left = fits, fits.leftover(explanation)
+        parts = list(recordings(fits.dictionary.predictor.motion).values())
+        self._recordings = parts if len(parts) > 1 else []
 
     def drop_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
         """Drop of the held-out deviance in each row, as if blocks were independent, (R,)."""
@@ -109,7 +117,13 @@ class Judge:
         explained = self._fits.leftover(base) - self._fits.leftover(wider)
         gain = self.drop_by_row(base, wider)
         changed = explained.any(axis=0)
-        gain[changed] /= blocks_per_sample(explained[:, changed] * self._left[:, changed])
+        scores = explained[:, changed] * self._left[:, changed]
+        # That recordings differ is their spread, and no correlation in time.
+        for inside in self._recordings:
+            known = scores[inside] != 0
+            mean = scores[inside].sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            scores[inside] -= np.where(known, mean, 0.0)
+        gain[changed] /= blocks_per_sample(scores)
         return gain
 
     def gain(self, base: Explanation, wider: Explanation) -> float:
@@ -124,22 +138,57 @@ class Judge:
 
     def pays(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
         """Is a member worth its parameters, is it more than nothing, and does it worsen no row?"""
-        fits, rows = self._fits, member.signature.rows
-        again = fits.explain([*rest.candidates, member])
+        fits = self._fits
         if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
             # Every joint has it: what identification begins with needs no proof against chance.
+            again = fits.explain([*rest.candidates, member])
             return is_significant(fits, rest, again, member)
-        gain, repeated = self.gain(rest, whole), _is_repeated(rest, member)
-        required = fits.threshold[min(12, member.signature.values.shape[2])]
+        return self._are_proven(rest, whole, [member]) and self._is_sound(rest, whole, member)
+
+    def pay_together(
+        self,
+        whole: Explanation,
+        members: Sequence[Candidate],
+        without: Mapping[Candidate, Explanation],
+    ) -> bool:
+        """Do members that are one law in several joints pay as one, where none does alone?
+
+        Drives of one kind have the same laws: that they have this one is one statement, with as
+        many parameters as there are values, and is judged by what all these rows gain. In each of
+        them it then has to earn what its parameters cost.
+
+        Args:
+            without: explanations without each member.
+        """
+        rest = self._fits.explain([c for c in whole.candidates if c not in members])
+        return self._are_proven(rest, whole, members) and all(
+            self.gain(without[member], whole) > 0 and self._is_sound(without[member], whole, member)
+            for member in members
+        )
+
+    def _are_proven(
+        self, rest: Explanation, whole: Explanation, members: Sequence[Candidate]
+    ) -> bool:
+        """Do members together bring more than chance, and are they more than nothing?
+
+        Args:
+            rest: the explanation without them.
+        """
+        gain = self.gain(rest, whole)
+        required = self._fits.needed_drop(sum(c.signature.values.shape[2] for c in members))
+        repeated = any(_is_repeated(rest, member) for member in members)
+        return gain >= required and (
+            (gain >= _PLAIN * required and not repeated) or are_more_than_nothing(whole, members)
+        )
+
+    def _is_sound(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
+        """Does a member worsen no row, stand out in one, and have values that can be?"""
+        fits, rows = self._fits, member.signature.rows
         return (
-            gain >= required
-            and self.gain_by_row(rest, whole)[rows].min() > -MARGIN
+            self.gain_by_row(rest, whole)[rows].min() > -MARGIN
             and self._stands_out(rest, whole, rows)
-            and (
-                (gain >= _PLAIN * required and not repeated) or is_more_than_nothing(whole, member)
-            )
             and not _is_beyond_its_range(member)
-            and is_significant(fits, rest, again, member)
+            and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
         )
 
     def _stands_out(self, rest: Explanation, whole: Explanation, rows: np.ndarray) -> bool:
@@ -163,32 +212,45 @@ def _size(explanation: Explanation) -> int:
     return sum(c.signature.values.shape[2] for c in explanation.candidates)
 
 
-def is_more_than_nothing(explanation: Explanation, member: Candidate) -> bool:
-    """Does the interval of one of a member's amounts not hold zero, or their joint region (Hotelling's T squared)?
+def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]) -> bool:
+    """Does the interval of one of the members' amounts not hold zero, or their joint region (Hotelling's T squared)?
 
-    Of an effect that has one parameter and no amount, the interval of that, if zero is neutral. (With
-    several, that they are not all neutral is not said by intervals of a law made linear.)
+    Intervals are simultaneous: of several members each is wider (Bonferroni). Of an effect that has
+    one parameter and no amount, the interval of that, if zero is neutral. (With several, that they
+    are not all neutral is not said by intervals of a law made linear.)
     """
-    start, names = explanation.start(member), member.linear_names
-    if names:
-        part = slice(start, start + len(names))
-        values = explanation.fit.parameters[part]
-    else:
-        if [member.parameters[name].neutral for name in member.nonlinear_names] != [0.0]:
-            return True
-        part = slice(start, start + 1)
-        values = explanation.fit.parameters[part] + member.nonlinear
-    spread = explanation.fit.spread
-    deviation, freedom = spread.deviation[part], np.minimum(spread.freedom[part], 1e6)
-    if np.any(np.abs(values) > student.ppf((1 + _CONFIDENCE) / 2, freedom) * deviation):
+    at, values = [], []
+    for member in members:
+        start, names = explanation.start(member), member.linear_names
+        offset = np.zeros(len(names))
+        if not names:
+            if [member.parameters[name].neutral for name in member.nonlinear_names] != [0.0]:
+                return True
+            offset = member.nonlinear
+        at += range(start, start + len(offset))
+        values += list(explanation.fit.parameters[start : start + len(offset)] + offset)
+    values, spread = np.array(values), explanation.fit.spread
+    deviation, freedom = spread.deviation[at], np.minimum(spread.freedom[at], 1e6)
+    level = 1 - (1 - _CONFIDENCE) / len(members)
+    if np.any(np.abs(values) > student.ppf((1 + level) / 2, freedom) * deviation):
         return True
     if not np.all(deviation > 0):
         return False
     # Units must not decide what counts as singular.
-    covariance = spread.covariance[part, part] / np.outer(deviation, deviation)
+    covariance = spread.covariance[np.ix_(at, at)] / np.outer(deviation, deviation)
     scaled = values / deviation
     square = scaled @ np.linalg.pinv(covariance, hermitian=True) @ scaled
     return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
+
+
+def _is_one_law(member: Candidate, other: Candidate) -> bool:
+    """Are two members one law, in joints whose drives are of one kind?"""
+    units = [{p.unit for p in c.parameters.values()} for c in (member, other)]
+    return (
+        issubclass(member.effect, JointTorqueEffect)
+        and member.effect is other.effect
+        and units[0] == units[1]
+    )
 
 
 def _is_repeated(rest: Explanation, member: Candidate) -> bool:

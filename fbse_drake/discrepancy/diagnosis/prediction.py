@@ -66,11 +66,18 @@ _CHUNK = 5_000_000
 class Predictor:
     """A scenario's model over one log: its residual, and what further effects would add to it."""
 
-    def __init__(self, scenario: Scenario, log: Log, noise: Noise | None = None):
+    def __init__(
+        self,
+        scenario: Scenario,
+        log: Log,
+        noise: Noise | None = None,
+        left_out: Sequence[tuple[float, float]] = (),
+    ):
         """Reads the log.
 
         Args:
             noise: of the rows, beyond what is believed; by default it is measured.
+            left_out: start and end [s] of stretches of which nothing is said.
 
         Raises:
             InputError: a log that does not fit the model.
@@ -87,13 +94,19 @@ class Predictor:
         sensors, self._noisier_channels = measured_sensors(
             scenario.sensors, scenario.recording, log
         )
-        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log)
+        self.left_out = tuple(left_out)
+        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
         for known in self._known:
             if issubclass(known.effect, SensorEffect):
                 self.motion.signals = self._undone(known, self._remembered(known))
         self._given_noise = noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
+
+    def without(self, stretches: Sequence[tuple[float, float]]) -> "Predictor":
+        """The same without some stretches [s] of the log."""
+        left_out = (*self.left_out, *stretches)
+        return Predictor(self.scenario, self.log, self._given_noise, left_out)
 
     @property
     def rows(self) -> int:

@@ -147,11 +147,14 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
         for c in explanation.candidates
     ):
         return explanation, fits.white, fits.leftover(explanation)
-    scenario = fits.dictionary.predictor.scenario
+    predictor = fits.dictionary.predictor
+    scenario = predictor.scenario
     found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
     believed = replace(scenario.believed, effects=scenario.believed.effects | found)
     white = WhitenedResidual(
-        Predictor(replace(scenario, model=believed), fits.dictionary.predictor.log).residual
+        Predictor(
+            replace(scenario, model=believed), predictor.log, left_out=predictor.left_out
+        ).residual
     )
     # As many squares as before; what is held out exceeds them by as much as it did.
     share = fits.white.count / np.maximum(white.count, 1)

@@ -13,7 +13,7 @@ average of order one, so that each row's covariance is tridiagonal.
 """
 
 import fnmatch
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -40,8 +40,8 @@ _ORDER, _PADDING = 4, 100
 # A sole stands still while it carries more than this share of the weight, and each of its pads this one.
 _STANDING = 0.15
 _STANDING_PAD = 0.01
-# Soles settle for this long at the start of a log [s]. A foot that has just touched down, or is about to lift, may still roll over an edge:
-# its sole is not at rest in this time [s].
+# Soles settle for this long at the start of a recording [s]. A foot that has just touched down, or is
+# about to lift, may still roll over an edge: its sole is not at rest in this time [s].
 _SETTLING, _ROLLING = 0.1, 0.03
 _AXES = ("x", "y", "z")
 # Results that the equation of motion keeps of each of its functions, and instants that are computed at once: Jacobians take room.
@@ -589,13 +589,21 @@ def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 class RecordedMotion:
     """A log seen by a model: makes residuals, and finds how they change with the signals or the model."""
 
-    def __init__(self, robot: Robot, sensors: SensorsConfig, recording: RecordingConfig, log: Log):
+    def __init__(
+        self,
+        robot: Robot,
+        sensors: SensorsConfig,
+        recording: RecordingConfig,
+        log: Log,
+        left_out: Sequence[tuple[float, float]] = (),
+    ):
         """Reads the log.
 
         Args:
             robot: the model.
             sensors: whose noise is believed.
             recording: how the log is read.
+            left_out: start and end [s] of stretches of which nothing is known.
 
         Raises:
             InputError: a log that does not fit the model, or one that is too short.
@@ -614,7 +622,7 @@ class RecordedMotion:
                 raise InputError(
                     f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})"
                 )
-        self.start = float(log.time[0])
+        self.start, self._left_out = float(log.time[0]), left_out
         self.equation = EquationOfMotion(robot)
         # Steps in which the motion was integrated [s]: 0 for continuous motion.
         self.integration_step = 0.0
@@ -690,6 +698,9 @@ class RecordedMotion:
             np.abs(self.signals.pad_force) < self.sensors.foot_force.range
         ).all(axis=(1, 2))
         in_gap = block_means(1.0 - (measured[:-1] & measured[1:]), self.length) > 0
+        half = 0.5 * self.length * self.period
+        for start, end in self._left_out:
+            in_gap |= (self.time + half > start) & (self.time - half < end)
         known = np.repeat(~in_gap[:, None], len(rows), axis=1)
         if "joint/torque_command" not in self.log:
             known[:, [row.kind == "joint" for row in rows]] = False
@@ -707,7 +718,10 @@ class RecordedMotion:
             block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
         )
         kinematic = np.array([row.kind == "kinematic" for row in rows])
-        known &= ~kinematic | (self.time > self.start + _SETTLING)[:, None]
+        starts = [self.start, *(part["start"] for part in self.log.meta.get("segments", ()))]
+        since = self.time[:, None] - np.array(starts)
+        settling = np.any((since >= 0) & (since <= _SETTLING), axis=1)
+        known &= ~kinematic | ~settling[:, None]
         around = 2 * round(_ROLLING / (self.length * self.period)) + 1
         at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
         for foot, side in enumerate(self.robot.description.sides):
