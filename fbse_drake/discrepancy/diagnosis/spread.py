@@ -89,6 +89,7 @@ def _fitted_to(fits: Fits, explanation: Explanation, inside: np.ndarray) -> Expl
 def _told(explanation: Explanation, member: Candidate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values of a member's parameters, their standard deviations and degrees of freedom, (m,) each."""
     _, values, part = explanation.fitted(member)
+    assert explanation.fit is not None
     spread = explanation.fit.spread
     # What does not move a row of these blocks is not told by them.
     seen = (member.signature.values**2).sum(axis=(0, 1))[: len(values)] > 0
@@ -112,7 +113,7 @@ def spread_of(
         names[k]: OwnValue(
             float(values[k]), (float(values[k] - half[k]), float(values[k] + half[k]))
         )
-        for k in np.flatnonzero(told)
+        for k in np.flatnonzero(told).tolist()
     }
     # The variance of Student's distribution; below three degrees of freedom it has next to none.
     variance = deviation[told] ** 2 * freedom[told] / np.maximum(freedom[told] - 2, 0.5)
