@@ -95,6 +95,7 @@ CASES = (
     _biases(0.05, 0.01),
     _biases(0.3, 0.05),
     Case("foot force noise x 3", untold=("sensors.foot_force.noise=1.5",)),
+    Case("foot forces 5 ms late", untold=("sensors.foot_force.delay=0.005",)),
     _foot_gain(1.02),
     _foot_gain(0.95),
     Case("HRP-2, nominal", ("compensation=!NoCompensation {}",), scenario=_HRP2_WALK),

@@ -537,6 +537,37 @@ def test_a_slipping_foot(other_stands: bool):
     assert doubt[-1] < 1.1 * doubt[790]
 
 
+@pytest.mark.parametrize("size", [0.3, 1.0])
+def test_what_a_standing_foot_does_is_learned(size: float):
+    """Both feet do this share of what is believed, for as long; innovations are as large as stated.
+
+    They were ten times smaller with a share of 0.3, if nothing were learned.
+    """
+    config, noise = InvariantFilter(), USUAL_SENSORS
+    generator, rig, squares = np.random.default_rng(11), Filter(config), []
+    keep = math.exp(-TICK / config.foot_time)
+    J, motion = LEVEL["foot_jacobian"][:, :, 6:], np.zeros((2, 6))
+    deviation = size * np.repeat([config.foot_rate, config.foot_velocity], 3)
+    for k in range(4000):
+        motion = keep * motion + math.sqrt(1 - keep**2) * deviation * generator.normal(size=(2, 6))
+        model = LEVEL.copy()
+        for foot, joints in enumerate((slice(0, 6), slice(6, 12))):
+            v = np.linalg.solve(J[foot][:, joints], motion[foot])
+            model["velocity"][6:][joints] = v
+        model["velocity"][6:] += generator.normal(scale=noise.joint_velocity_noise, size=12)
+        w = generator.normal(scale=noise.angular_velocity_noise, size=3)
+        f = generator.normal(scale=noise.acceleration_noise, size=3) - GRAVITY
+        x = rig.tick(
+            measurements=BASE.measurements(angular_velocity=w, specific_force=f), model=model
+        )
+        if k > 3000:
+            z, S = x["foot_innovation"][:, 2:], x["foot_innovation_variance"][:, 2:]
+            squares.append((z**2).mean(axis=(0, 2)) / S.mean(axis=0))
+    assert np.all(np.abs(np.log(np.mean(squares, axis=0))) < math.log(2.0))
+    # The one that the gyro shows as well.
+    assert x["foot_restlessness"][:, 3].mean() == pytest.approx(size**2, rel=0.6)
+
+
 def joints_but_yaws(log: Log) -> np.ndarray:
     """Hip yaws hardly move, and what their friction is hardly shows."""
     return np.array(["yaw" not in joint for joint in log.joints])

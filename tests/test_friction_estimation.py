@@ -105,6 +105,7 @@ class Friction(Rig):
         valid: float = 1,
         support: tuple[float, float] = (1, 1),
         inertia: float = 0.0,
+        late: int = 0,
     ):
         noise = {
             "torque_variance": np.full(12, torque),
@@ -112,7 +113,7 @@ class Friction(Rig):
             "own_inertia": np.full(12, inertia),
             "valid": np.full(12, valid),
         }
-        link = pack(self._link, residual=residual, **noise)
+        link = pack(self._link, residual=residual, late=late, **noise)
         return self.tick(
             measurements=BASE.measurements(joint_velocity=velocity, support=support),
             link_torque=link,

@@ -22,7 +22,12 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.cross_check import cross_check, cross_check_type, firm_foot_rate
 from fbse_drake.estimators.floating_base import ImuMount, model_type
-from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME
+from fbse_drake.estimators.force_delay import (
+    force_delay_type,
+    forget_force_delay,
+    watch_force_delay,
+)
+from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE
 from fbse_drake.estimators.records import as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
@@ -81,6 +86,9 @@ _FOOT_RATE_ERROR = 0.05
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
 _AT_REST, _WALKING_SPEED = 0.1, 0.03
+# How long it takes to learn what a standing foot does [s], and the least that it is taken to do, as a
+# share of the variance believed.
+_RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = 1.0, 0.01
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -308,6 +316,7 @@ def _update(
     keep: float,
     agreement: np.ndarray,
     innovation: np.ndarray,
+    once: float,
 ) -> float:
     """Kalman update with z = A error[first] + B error[second] + noise, in place.
 
@@ -320,9 +329,11 @@ def _update(
         noise: covariance of z's noise, (3, 3).
         keep: what a tick leaves of the running mean of innovations `agreement` (3,).
         innovation: filled, (3,).
+        once: variance of the noise in one tick, mean over the axes. That of noise which lasts is
+            smaller than `noise`, which is white and leaves as much over many ticks.
 
     Returns:
-        Variance of the innovation, mean over its axes; as widened.
+        Variance of the innovation, mean over its axes, as widened.
     """
     n = len(P)
     PH, S = np.zeros((3, n)), noise.copy()
@@ -348,6 +359,9 @@ def _update(
     widening = max(0.0, excess)
     if distance > _GATE:
         widening += (distance / _GATE - 1.0) * (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
+    stated = once + widening
+    for i in range(3):
+        stated += (S[i, i] - noise[i, i]) / 3.0
     if widening > 0.0:
         for i in range(3):
             S[i, i] += widening
@@ -363,7 +377,7 @@ def _update(
         correction[i] += a * e0 + b * e1 + c * e2
         for j in range(n):
             P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
-    return (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
+    return stated
 
 
 @njit(cache=True)
@@ -455,28 +469,34 @@ def _listen_to_foot(
     p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
     start, keep = _FEET + 6 * foot, math.exp(-elapsed / AGREEMENT_TIME)
     # Errors that last for some time, as white noise that leaves as much over many ticks.
-    lasting = max(1.0, 2.0 * config.foot_time / elapsed) * max(1.0, _FIRM_LOAD / share) ** 2
-    held = (_unrest(v) ** 2 - 1.0) * lasting
+    light = max(1.0, _FIRM_LOAD / share) ** 2
+    lasting = max(1.0, 2.0 * config.foot_time / elapsed)
+    held = _unrest(v) ** 2 - 1.0
     angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
+    gyro = sensors.angular_velocity_noise**2
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
-    variance = x.foot_innovation_variance[foot]
+    variance, restless = x.foot_innovation_variance[foot], x.foot_restlessness[foot]
 
+    own, sensed = light * config.foot_position**2, moving * angle
     z = subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p))
-    noise = _isotropic(config.foot_position**2 * lasting + moving * angle)
+    noise = _isotropic(own * lasting + sensed)
     variance[_FOOT_POSITION] = _update(
         P, correction, z, start, _IDENTITY, _POSITION, _OPPOSITE, noise, keep,
         agreement[_FOOT_POSITION], innovation[_FOOT_POSITION],
+        restless[_FOOT_POSITION] * own + sensed,
     )  # fmt: skip
 
+    own, sensed = light * config.foot_orientation**2, turning * angle
     q_BF = quaternion_of(R_BF)
     seen = quaternion_product(quaternion(x.orientation), q_BF)
     z = rotation_vector(quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot]))))
-    noise = _isotropic(config.foot_orientation**2 * lasting + turning * angle)
-    noise[2, 2] += config.foot_orientation**2 * held
+    noise = _isotropic(own * lasting + sensed)
+    noise[2, 2] += held * own * lasting
     variance[_FOOT_ORIENTATION] = _update(
         P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
         agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
+        restless[_FOOT_ORIENTATION] * own + sensed,
     )  # fmt: skip
 
     w_F, v_F = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -485,32 +505,59 @@ def _listen_to_foot(
         v_F = add(v_F, scale(model.velocity[j], (J[3, j], J[4, j], J[5, j])))
     w_BF, v_BF = rotate(R_BF, w_F), rotate(R_BF, v_F)
     w = subtract(w_raw, vector(x.gyro_bias_B))
+    own = light * config.foot_velocity**2
+    sensed = moving * rate + dot(p_IF, p_IF) * gyro
     z = subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v)
-    gyro = sensors.angular_velocity_noise**2
-    noise = _isotropic(config.foot_velocity**2 * lasting + moving * rate + dot(p_IF, p_IF) * gyro)
+    noise = _isotropic(own * lasting + sensed)
     variance[_FOOT_VELOCITY] = _update(
         P, correction, z, _VELOCITY, _IDENTITY, _GYRO_BIAS, matrix_product(R, skew(p_IF)), noise,
         keep, agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY],
+        restless[_FOOT_VELOCITY] * own + sensed,
     )  # fmt: skip
 
+    own, sensed = light * config.foot_rate**2, turning * rate + gyro
     z = add(w, w_BF)
-    noise = _isotropic(config.foot_rate**2 * lasting + turning * rate + gyro)
-    noise[2, 2] += config.foot_rate**2 * held
+    noise = _isotropic(own * lasting + sensed)
+    noise[2, 2] += held * own * lasting
     variance[_FOOT_RATE] = _update(
         P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
         agreement[_FOOT_RATE], innovation[_FOOT_RATE],
+        restless[_FOOT_RATE] * own + sensed,
     )  # fmt: skip
+    for told in range(_TOLD):
+        restless[told] = _learned_restlessness(
+            restless[told], vector(innovation[told]), variance[told], elapsed
+        )
 
     if config.level_ground > 0.0:
         # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
         n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
-        noise = _isotropic(config.level_ground**2 * lasting)
+        noise = _isotropic(config.level_ground**2 * lasting * light)
         noise[2, 2] += 1e6
         spare = np.zeros(3)
         z = cross(n, (0.0, 0.0, 1.0))
         _update(
-            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare, spare.copy(),
+            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare,
+            spare.copy(), 0.0,
         )  # fmt: skip
+
+
+@njit(cache=True)
+def _learned_restlessness(
+    restless: float, innovation: Vector, variance: float, elapsed: float
+) -> float:
+    """A standing foot may do less than is believed, or more, and its innovations show it.
+
+    They are stated as large as they are. It is trusted as before: what it did not do for some time
+    it does when it leaves the ground.
+
+    Args:
+        restless: the share of the variance believed that it showed until now.
+        variance: of each of the innovation's axes.
+    """
+    share = min(LARGEST_SHARE, dot(innovation, innovation) / (3.0 * variance))
+    learned = restless * (1.0 + (1.0 - math.exp(-elapsed / _RESTLESSNESS_TIME)) * (share - 1.0))
+    return max(_LEAST_RESTLESSNESS, learned)
 
 
 @njit(cache=True)
@@ -544,9 +591,10 @@ def _listen_to_forces(
     for i in range(3):
         for j in range(3):
             noise[i, j] += config.force_gain_error**2 * lasting * f_raw[i] * f_raw[j]
+    once = (noise[0, 0] + noise[1, 1] + noise[2, 2]) / (3.0 * lasting)
     x.force_innovation_variance = _update(
         P, correction, z, _ACCELEROMETER_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise,
-        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation,
+        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation, once,
     )  # fmt: skip
 
 
@@ -558,6 +606,7 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
+    x.foot_restlessness[:] = 1.0
     R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
     for foot in range(feet):
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
@@ -579,7 +628,7 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
     noise = _isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
     _update(
         P, correction, z, _ATTITUDE, skew(reading), _ACCELEROMETER_BIAS, R, noise, 0.0, spare,
-        spare.copy(),
+        spare.copy(), 0.0,
     )  # fmt: skip
     _correct(x, correction)
 
@@ -676,9 +725,13 @@ def _estimate_base(
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
         cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
-    elif not is_fresh or elapsed > LONGEST_COMPARED_TICK:
-        x.check.age = 0.0
-        x.check.doubt[:] = 0.0
+        shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
+        watch_force_delay(x.force_delay, shown, push, sensors.acceleration_noise, elapsed)
+    else:
+        forget_force_delay(x.force_delay)
+        if not is_fresh or elapsed > LONGEST_COMPARED_TICK:
+            x.check.age = 0.0
+            x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
         _listen_to_forces(x, P, correction, force, f_mean, w, away, before, elapsed, known)
@@ -833,6 +886,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance is the mean over the axes
         force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
         foot_agreement, force_agreement   running means of the innovations
+        foot_restlessness  (feet, 4)   of what a standing foot may do, in these four, how much it
+                                       does, as a share of the variance
         check                  what `cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
                                feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
                                50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
@@ -840,6 +895,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                the tick before; `stepped`, `age`, `habit_age` and `agreed`, for how
                                long the gyro is doubted for its step, all is watched, the habit is
                                learned, and nothing contradicts [s]
+        force_delay            what `watch_force_delay` remembers: `ticks` by which foot forces are
+                               late, and more, see `force_delay_type`
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
         leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
@@ -864,7 +921,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             measurements, model: types of the inputs' posteriors.
             origin: where the middle of the soles is at the start, (x, y) [m].
         """
-        super().__init__(base_filter_type(robot), clock)
+        super().__init__(base_filter_type(robot, clock), clock)
         pads, plant = FootPads(robot), robot.plant
         self._known = record(
             config=config,
@@ -906,7 +963,7 @@ class InvariantBaseFilter(RecursiveEstimator):
         _estimate_base(posterior, last, elapsed, measured, model, self._known)
 
 
-def base_filter_type(robot: Robot) -> np.dtype:
+def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
     """Type of the posterior of `InvariantBaseFilter`."""
     feet = len(robot.description.sides)
     n = _FEET + 6 * feet
@@ -944,6 +1001,7 @@ def base_filter_type(robot: Robot) -> np.dtype:
         foot_position=(feet, 3),
         foot_orientation=(feet, 4),
         foot_agreement=(feet, _TOLD, 3),
+        foot_restlessness=(feet, _TOLD),
         foot_innovation=(feet, _TOLD, 3),
         foot_innovation_variance=(feet, _TOLD),
         error_covariance=(n, n),
@@ -952,4 +1010,5 @@ def base_filter_type(robot: Robot) -> np.dtype:
         leash=(2, 4, 3),
         leashed_for=(),
         check=cross_check_type(feet),
+        force_delay=force_delay_type(clock),
     )

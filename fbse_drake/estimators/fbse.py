@@ -89,12 +89,14 @@ class Fbse(Estimator):
         )
         if not chain.knows_torque:
             return
+        asks_for_delay = self.base_state.feeds_back and self.friction.allows_for_delay
         chain.add(
             "link_torque",
             partial(LinkTorqueEstimator, sensors, robot),
             measurements="sensor_monitor",
             model_over_step="model.over_step",
             joint_acceleration="joint_acceleration",
+            **({"base_state": "base_state"} if asks_for_delay else {}),
         )
         chain.add(
             "friction",

@@ -8,7 +8,7 @@ times.
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,7 @@ from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.force_delay import delays_of
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
@@ -35,6 +36,8 @@ class RecursiveLeastSquares:
 
     The covariance of the paper's 12 parameters never couples joints.
     """
+
+    allows_for_delay: ClassVar[bool] = False
 
     # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are
     # identified, from their values here on; the others stay as they are.
@@ -79,6 +82,9 @@ class ModelAided:
     it. So sharp features come from the model without delay, and the measurement decides over
     everything slower.
     """
+
+    # Does it go back to the tick that late forces belong to?
+    allows_for_delay: ClassVar[bool] = True
 
     # Friction model, of which the linear parameters are identified, from their values here on; the
     # others stay as they are.
@@ -272,7 +278,7 @@ class FrictionEstimator(RecursiveEstimator):
             "measurements": record_type(
                 trust=(2 + feet,), support=(max(1, feet),), joint_velocity=(n,)
             ),
-            "link_torque": record_type(**dict.fromkeys(measured, (n,))),
+            "link_torque": record_type(**dict.fromkeys(measured, (n,)), late=()),
         }
 
 
@@ -395,6 +401,21 @@ def smooth_velocity(
 
 
 @njit(cache=True)
+def _put_regressor(
+    row: np.ndarray, basis: tuple[np.ndarray, ...], shaped: np.ndarray, joint: int, n: int
+) -> None:
+    """Fills the regressor of the weights of one of n joints, see `FrictionRegressor`."""
+    k, other = len(basis), n + joint
+    for parameter in range(k):
+        row[parameter] = basis[parameter][joint]
+    while k < len(row) - 1:
+        for parameter in shaped:
+            row[k] = basis[parameter][other] - basis[parameter][joint]
+            k += 1
+        other += n
+
+
+@njit(cache=True)
 def _estimate_friction(
     posterior: np.ndarray,
     last: np.ndarray,
@@ -403,6 +424,7 @@ def _estimate_friction(
     link_torque: np.ndarray,
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
+    phi_now: tuple[np.ndarray, ...],
     shaped: np.ndarray,
     seen: float,
     known: np.ndarray,
@@ -412,7 +434,8 @@ def _estimate_friction(
     Fills the posterior but for its `velocity`.
 
     Args:
-        phi, slopes, shaped: see `FrictionRegressor`.
+        phi, slopes, shaped: see `FrictionRegressor`; of the tick that the link torque is of.
+        phi_now: of the present tick.
         seen: share of the velocity that is measured now in that which the model sees.
         known: record with the numbers of `ModelAided` as `config`; `joint_leg` (n,), which leg each
             joint belongs to; `measures_swing`, whether the measurement counts while the leg swings;
@@ -423,7 +446,8 @@ def _estimate_friction(
     support, n, parameters = measured.support, len(known.joint_leg), len(phi)
     m = posterior.weights.shape[1]
     size = m + 2
-    regressor, x, column = np.ones(m + 1), np.empty(m + 1), np.empty(size)
+    # Of the weights and of the disturbance, whose regressor is one.
+    regressor, rise, x, column = np.ones(m + 1), np.zeros(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
     keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
@@ -433,19 +457,12 @@ def _estimate_friction(
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
         x[:m] = last.weights[joint]
         x[m] = last.disturbance[joint]
-        # Weights of the model and disturbance, whose regressor is one; and by how much the friction
-        # rises with the velocity.
+        # By how much the friction rises with the velocity.
+        _put_regressor(rise, slopes, shaped, joint, n)
+        _put_regressor(regressor, phi, shaped, joint, n)
         slope = 0.0
-        for k in range(parameters):
-            regressor[k] = phi[k][joint]
-            slope += x[k] * slopes[k][joint]
-        k, other = parameters, n + joint
-        while k < m:
-            for at in shaped:
-                regressor[k] = phi[at][other] - phi[at][joint]
-                slope += x[k] * (slopes[at][other] - slopes[at][joint])
-                k += 1
-            other += n
+        for k in range(m):
+            slope += x[k] * rise[k]
         slope = max(0.0, seen * slope)
         P, noise = posterior.covariance[joint], last.noise[joint]
         impulse_uncertainty = P[0, 0]
@@ -514,6 +531,10 @@ def _estimate_friction(
             x[m] = impulse = posterior.agreement[joint] = 0.0
             P[0, :] = 0.0
             P[:, 0] = 0.0
+        if link.late > 0:
+            # What was measured is of some ticks ago, the estimate of now.
+            _put_regressor(regressor, phi_now, shaped, joint, n)
+            velocity_error, velocity_variance = 0.0, noise * known.velocity_variance
         total = -slope * velocity_error
         variance = slope**2 * max(0.0, velocity_variance)
         for i in range(m + 1):
@@ -554,8 +575,9 @@ class ModelAidedEstimator(FrictionEstimator):
         - (one for each field)
 
     Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
-    [Nm s], after the update; `velocity` that the model sees and `joint_velocity`, that measured
-    less what is known of its noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
+    [Nm s], after the update; `velocity` that the model sees, `past_velocity` (delays, n), that
+    one now and in the ticks before, and `joint_velocity`, that measured less what is known of its
+    noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
     [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
     shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
     the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
@@ -578,6 +600,7 @@ class ModelAidedEstimator(FrictionEstimator):
         further += ("noise", "agreement", "doubt")
         shapes = dict.fromkeys(further, (n,))
         shapes["weights"] = shapes["settled"] = (n, regressor.weights)
+        shapes["past_velocity"] = (delays_of(clock), n)
         super().__init__(
             regressor, robot, measurements, link_torque, clock, regressor.weights + 2, **shapes
         )
@@ -602,10 +625,23 @@ class ModelAidedEstimator(FrictionEstimator):
             return
         share = start_share(elapsed, self._reading)
         seen = smooth_velocity(posterior, last, measured, elapsed, share, self._smoothing)
-        phi, slopes = self._regressor(posterior["velocity"])
-        shaped = self._regressor.shaped
+        past, late = posterior["past_velocity"], int(link_torque["late"])
+        past[1:] = last["past_velocity"][:-1]
+        past[0] = posterior["velocity"]
+        phi_now, slopes = self._regressor(past[0])
+        phi, slopes = self._regressor(past[late]) if late else (phi_now, slopes)
         _estimate_friction(
-            posterior, last, elapsed, measured, link_torque, phi, slopes, shaped, seen, self._known
+            posterior,
+            last,
+            elapsed,
+            measured,
+            link_torque,
+            phi,
+            slopes,
+            phi_now,
+            self._regressor.shaped,
+            seen,
+            self._known,
         )
 
     def _start(self, posterior: np.ndarray, measured: np.ndarray) -> None:
@@ -619,3 +655,4 @@ class ModelAidedEstimator(FrictionEstimator):
         posterior["noise"] = 1.0
         posterior["covariance"] = np.diag([0.0, *uncertainty, config.disturbance_uncertainty**2])
         posterior["velocity"] = posterior["joint_velocity"] = measured["joint_velocity"]
+        posterior["past_velocity"] = posterior["velocity"]

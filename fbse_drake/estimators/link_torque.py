@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import model_type
+from fbse_drake.estimators.force_delay import delays_of
 from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -31,6 +32,21 @@ def _clear(posterior: np.ndarray, status: float) -> None:
     posterior.impulse_variance[:] = 0.0
     posterior.own_inertia[:] = 0.0
     posterior.valid[:] = 0.0
+    past = posterior.past
+    past.valid[:] = 0.0
+    past.torque_command[:] = 0.0
+    past.inertial_torque[:] = 0.0
+    past.torque_variance[:] = 0.0
+    past.impulse_variance[:] = 0.0
+    past.own_inertia[:] = 0.0
+    past.lever[:] = 0.0
+
+
+@njit(cache=True)
+def _shift(now: np.ndarray, before: np.ndarray) -> None:
+    """Moves what was known a tick ago on by one."""
+    for age in range(len(now) - 1, 0, -1):
+        now[age] = before[age - 1]
 
 
 @njit(cache=True)
@@ -67,11 +83,13 @@ def _estimate_link_torque(
     model: np.ndarray,
     acceleration: np.ndarray,
     torque_command: np.ndarray,
+    late: float,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
     Args:
+        late: by how many ticks the forces are late.
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
@@ -81,6 +99,7 @@ def _estimate_link_torque(
     model, acceleration, known = model[()], acceleration[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
+    posterior.late = late
     _watch_forces(posterior, last, elapsed, wrench, known)
     if not np.isfinite(torque_command).all():
         _clear(posterior, _NOT_FINITE)
@@ -95,15 +114,27 @@ def _estimate_link_torque(
     a, to_sensors = np.empty(v), np.empty(v)
     a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
     a[6:] = acceleration.joint_acceleration
+    # What is known now, forces apart, belongs to the forces that are read so much later.
+    past, before, late = posterior.past, last.past, posterior.late
+    _shift(past.valid, before.valid)
+    _shift(past.torque_command, before.torque_command)
+    _shift(past.inertial_torque, before.inertial_torque)
+    _shift(past.torque_variance, before.torque_variance)
+    _shift(past.impulse_variance, before.impulse_variance)
+    _shift(past.own_inertia, before.own_inertia)
+    _shift(past.lever, before.lever)
+    past.torque_command[0] = torque_command
+    for foot in range(feet):
+        past.lever[0, foot] = model.foot_jacobian[foot, :, 6:]
     for i in range(n):
         # Inertia and bias forces, (35) without the wrenches; and what the sensors' noise makes of
         # them.
-        link_torque = model.bias[i]
+        inertial_torque = model.bias[i]
         to_sensors[:] = 0.0
         for k in range(v):
             inertia = model.mass_matrix[i, k]
             if inertia != 0.0:  # A joint of another leg.
-                link_torque += inertia * a[k]
+                inertial_torque += inertia * a[k]
                 for j in range(v):
                     to_sensors[j] += inertia * sensitivity[k, j]
         torque_variance, impulse_variance = 0.0, 0.0
@@ -114,20 +145,27 @@ def _estimate_link_torque(
                 torque_variance += (to_sensors[j] * noise.acceleration_noise) ** 2
             else:
                 impulse_variance += (to_sensors[j] * noise.joint_velocity_noise) ** 2
+        past.inertial_torque[0, i], past.torque_variance[0, i] = inertial_torque, torque_variance
+        past.impulse_variance[0, i], past.own_inertia[0, i] = impulse_variance, to_sensors[6 + i]
+        is_known = trust[0] == 0 and trust[1] == 0
+        past.valid[0, i] = acceleration.known[i] if is_known else 0.0
+    then = int(late)
+    for i in range(n):
+        link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
         for foot in range(feet):
             variance = posterior.force_noise[foot] * known.wrench_variance[foot]
             if wrench[foot, 5] > math.sqrt(variance[5]):
                 for k in range(6):
-                    lever = model.foot_jacobian[foot, k, 6 + i]
+                    lever = past.lever[then, foot, k, i]
                     link_torque -= wrench[foot, k] * lever
                     torque_variance += variance[k] * lever * lever
-        trusted = trust[0] == 0 and trust[1] == 0 and trust[2 + known.joint_leg[i]] == 0
         posterior.link_torque[i] = link_torque
-        posterior.residual[i] = torque_command[i] - link_torque
+        posterior.residual[i] = past.torque_command[then, i] - link_torque
         posterior.torque_variance[i] = torque_variance
-        posterior.impulse_variance[i] = impulse_variance
-        posterior.own_inertia[i] = to_sensors[6 + i]
-        posterior.valid[i] = acceleration.known[i] if trusted else 0.0
+        posterior.impulse_variance[i] = past.impulse_variance[then, i]
+        posterior.own_inertia[i] = past.own_inertia[then, i]
+        is_trusted = trust[2 + known.joint_leg[i]] == 0
+        posterior.valid[i] = past.valid[then, i] if is_trusted else 0.0
 
 
 def _wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
@@ -149,6 +187,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         - measurements
         - model_over_step
         - joint_acceleration
+        - base_state
         - torque_command
         output_ports:
         - posterior
@@ -169,6 +208,11 @@ class LinkTorqueEstimator(RecursiveEstimator):
         own_inertia        by which noise of the joint's own velocity is in that integral [kg m^2]
         valid              1 where all that the residual needs was known
 
+    `base_state` is there where somebody knows that foot forces come late: then all this is of the
+    tick in which they were what is read now. Further `late`, by how many ticks that is; `past`,
+    what is known of these ticks but for the forces: `valid`, `torque_command`, `inertial_torque`
+    and the noise's `torque_variance`, `impulse_variance` and `own_inertia`, (delays, n), and the
+    `lever` of the wrenches, (delays, feet, 6, n);
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
     believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
@@ -183,13 +227,19 @@ class LinkTorqueEstimator(RecursiveEstimator):
         model_over_step: np.dtype,
         joint_acceleration: np.dtype,
         clock: Clock,
+        base_state: np.dtype | None = None,
     ):
         """Declares ports and state.
 
         Args:
             measurements, model_over_step, joint_acceleration: types of the inputs.
+            base_state: of that of `InvariantBaseFilter`, where somebody asks how late forces are.
         """
         n, legs = len(robot.joint_names), robot.description.legs
+        delays = delays_of(clock) if base_state is not None else 1
+        kept = ("valid", "torque_command", "inertial_torque")
+        kept += ("torque_variance", "impulse_variance", "own_inertia")
+        past = dict.fromkeys(kept, (delays, n))
         posterior_type = record_type(
             time=(),
             status=(),
@@ -202,6 +252,8 @@ class LinkTorqueEstimator(RecursiveEstimator):
             force_noise=(len(legs),),
             wrench=(len(legs), 6),
             wrench_change=(len(legs), 6),
+            late=(),
+            past=record_type(**past, lever=(delays, len(legs), 6, n)),
         )
         super().__init__(posterior_type, clock)
         pads = FootPads(robot)
@@ -216,6 +268,9 @@ class LinkTorqueEstimator(RecursiveEstimator):
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model_over_step", model_over_step)
         self._acceleration = self._declare_record_input("joint_acceleration", joint_acceleration)
+        self._base_state = None
+        if base_state is not None:
+            self._base_state = self._declare_record_input("base_state", base_state)
         self._torque_command = self._declare_remembered_input("torque_command", n)
         self._declare_posterior()
 
@@ -238,6 +293,9 @@ class LinkTorqueEstimator(RecursiveEstimator):
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
+        late = 0.0
+        if self._base_state is not None:
+            late = float(self._base_state.Eval(context)["force_delay"]["ticks"])
         _estimate_link_torque(
             posterior,
             last,
@@ -246,5 +304,6 @@ class LinkTorqueEstimator(RecursiveEstimator):
             self._model.Eval(context),
             self._acceleration.Eval(context),
             self._torque_command.Eval(context),
+            late,
             self._known,
         )

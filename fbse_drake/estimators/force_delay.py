@@ -1,0 +1,79 @@
+"""How late foot forces come: the acceleration that they make shows in the other sensors as well."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.recursive import Clock
+from fbse_drake.estimators.spatial import Vector, dot, put, vector
+
+# The longest delay that is looked for, and for how long what it was found by counts [s]: no longer
+# than a step, so that sensors which are in time again are soon seen to be.
+_LONGEST, _MEMORY = 0.01, 0.3
+# How much of that time it takes to know the noise.
+_LEAST = 0.5
+# By how much more likely another delay must be, as the logarithm of the ratio, before it counts.
+_EVIDENCE = 30.0
+
+
+def force_delay_type(clock: Clock) -> np.dtype:
+    """What `watch_force_delay` remembers, of delays of 0, 1, ... ticks.
+
+    `shown` (delays, 3), how the centre of mass accelerated so many ticks ago [m/s^2]; `filled`, how
+    many of these are known; sums over the last time, of their `square` and of their product
+    `cross` with the forces, (delays,), and of the forces' `push_square` [m^2/s^4]; `count`, over how
+    many ticks; and `ticks`, the delay.
+    """
+    delays = delays_of(clock)
+    shapes = {"shown": (delays, 3), "square": (delays,), "cross": (delays,)}
+    return record_type(**shapes, push_square=(), filled=(), count=(), ticks=())
+
+
+def delays_of(clock: Clock) -> int:
+    """How many delays there are, from none to the longest."""
+    return 1 + math.floor(_LONGEST / clock.period + 1e-6)
+
+
+@njit(cache=True)
+def watch_force_delay(
+    x: np.ndarray, acceleration: Vector, push: Vector, noise: float, elapsed: float
+) -> None:
+    """One tick: the delay is that with which forces and other sensors agree best.
+
+    A gain that is wrong, or the robot's mass, does not count. Where forces hardly change all delays are alike, and it stays what it is.
+
+    Args:
+        x: record of `force_delay_type`, of the tick before; filled.
+        acceleration, push: specific force of the centre of mass by IMU and joints, and by the
+            forces [m/s^2].
+        noise: of the accelerometer, that no difference is below [m/s^2].
+    """
+    for age in range(len(x.shown) - 1, 0, -1):
+        x.shown[age] = x.shown[age - 1]
+    put(x.shown[0], acceleration)
+    x.filled = min(x.filled + 1.0, float(len(x.shown)))
+    if x.filled < len(x.shown):
+        return
+    keep = math.exp(-elapsed / _MEMORY)
+    x.count = keep * x.count + 1.0
+    x.push_square = keep * x.push_square + dot(push, push)
+    best, mismatch = 0, np.empty(len(x.shown))
+    for late in range(len(mismatch)):
+        shown = vector(x.shown[late])
+        x.square[late] = keep * x.square[late] + dot(shown, shown)
+        x.cross[late] = keep * x.cross[late] + dot(shown, push)
+        mismatch[late] = x.square[late] - x.cross[late] ** 2 / max(x.push_square, 1e-9)
+        if mismatch[late] < mismatch[best]:
+            best = late
+    variance = max(noise**2, mismatch[best] / (3.0 * x.count))
+    is_known = x.count * elapsed > _LEAST * _MEMORY
+    if is_known and mismatch[int(x.ticks)] - mismatch[best] > 2.0 * _EVIDENCE * variance:
+        x.ticks = best
+
+
+@njit(cache=True)
+def forget_force_delay(x: np.ndarray) -> None:
+    """A tick in which a sensor is not trusted; what has been found out stays."""
+    x.filled = 0.0

@@ -1,0 +1,155 @@
+"""Foot forces that come late: by how much, and what the link torque and the friction make of it."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+from rig import CLOCK, Base, Rig, pack
+from test_friction_estimation import Friction, regressor
+from test_link_torque import MODEL, READINGS, accelerations
+
+from fbse_drake.estimators.beliefs import USUAL_SENSORS
+from fbse_drake.estimators.force_delay import (
+    delays_of,
+    force_delay_type,
+    forget_force_delay,
+    watch_force_delay,
+)
+from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.recursive import Clock
+from fbse_drake.estimators.spatial import vector
+
+TICK = CLOCK.period
+
+
+def specific_force(time: np.ndarray, step: float = 0.5) -> np.ndarray:
+    """Of a walk: it rolls from side to side and jerks where a foot lands, (N, 3) [m/s^2]."""
+    landing = np.exp(-(time % step) / 0.02) * np.sin(2 * np.pi * 25 * (time % step))
+    sway = 2 * np.pi / (2 * step) * time
+    return np.stack([landing, 0.5 * np.sin(sway), 9.81 + 5 * landing + 0.3 * np.cos(2 * sway)], 1)
+
+
+@njit
+def _watch(
+    record: np.ndarray, shown: np.ndarray, read: np.ndarray, usable: np.ndarray
+) -> np.ndarray:
+    x, result = record[()], np.empty(len(shown))
+    for k in range(len(shown)):
+        if usable[k]:
+            watch_force_delay(x, vector(shown[k]), vector(read[k]), 0.02, TICK)
+        else:
+            forget_force_delay(x)
+        result[k] = x.ticks
+    return result
+
+
+def found(truth: np.ndarray, forces: np.ndarray, gaps: tuple[int, ...] = ()) -> np.ndarray:
+    """The delay after every tick, by noisy IMU and joints and by forces, (N, 3) each [ticks]."""
+    generator = np.random.default_rng(0)
+    shown = truth + 0.2 * generator.standard_normal(truth.shape)
+    read = forces + 0.02 * generator.standard_normal(forces.shape)
+    usable = ~np.isin(np.arange(len(truth)), gaps)
+    return _watch(np.zeros((), force_delay_type(CLOCK)), shown, read, usable)
+
+
+@pytest.mark.parametrize("late", [0, 1, 5, 9])
+def test_a_delay_is_found_and_forgotten(late: int):
+    """To a tick, within two steps of the walk, and as soon again when it is over.
+
+    Gaps do not matter.
+    """
+    truth = specific_force(TICK * np.arange(4000))
+    forces = truth.copy()
+    forces[late:2000] = truth[: 2000 - late]
+    ticks = found(truth, forces, gaps=(700, 1300, 1301))
+    assert np.all(np.abs(ticks[1000:2000] - late) <= 1)
+    assert np.all(ticks[3000:] == 0)
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.1])
+def test_a_wrong_gain_or_bias_is_no_delay(gain: float):
+    truth = specific_force(TICK * np.arange(2000))
+    assert not found(truth, gain * truth).any()
+    assert not found(truth, truth + [0.3, -0.3, 0.3]).any()
+
+
+def test_what_does_not_change_tells_no_delay():
+    """At rest noise alone decides, and must not; a delay that was found is kept."""
+    still = np.tile([0.0, 0.0, 9.81], (3000, 1))
+    assert not found(still, still).any()
+    truth = np.concatenate([specific_force(TICK * np.arange(1500)), still])
+    late = np.concatenate([truth[:4], truth[:-4]])
+    assert np.all(np.abs(found(truth, late)[1000:] - 4) <= 1)
+
+
+def test_delays_that_are_looked_for():
+    assert delays_of(CLOCK) == 11
+    assert delays_of(Clock.every(5e-4)) == 21
+    # Slower sensors than that cannot be late by a whole tick.
+    assert delays_of(Clock.every(0.02)) == 1
+
+
+BASE_STATE = record_type(force_delay=record_type(ticks=()))
+
+
+def test_link_torque_with_late_forces_is_that_of_the_tick_they_belong_to():
+    generator, late, ticks = np.random.default_rng(1), 3, 12
+    base, acceleration = Base.of(), accelerations()
+    types = READINGS, MODEL, acceleration.posterior_type, CLOCK
+    # What is learned of the forces' noise is of the past.
+    sensors = dataclasses.replace(USUAL_SENSORS, learns_force_noise=False)
+    usual = Rig(LinkTorqueEstimator(sensors, base.robot, *types))
+    delayed = Rig(LinkTorqueEstimator(sensors, base.robot, *types, BASE_STATE))
+    forces = generator.uniform(0, 200, size=(ticks, 8, 3))
+    fields = "link_torque", "residual", "torque_variance", "impulse_variance", "own_inertia"
+    told = np.zeros((), BASE_STATE)
+    told["force_delay"]["ticks"] = late
+    expected, compared = [], 0
+    for k in range(ticks):
+        start = base.model_of(joint_position=generator.uniform(-0.4, 0.4, size=12))
+        inputs = {
+            "model_over_step": start,
+            "joint_acceleration": pack(
+                acceleration,
+                joint_acceleration=generator.normal(size=12),
+                known=generator.integers(0, 2, size=12),
+                sensitivity=generator.normal(size=(18, 18)),
+            ),
+            "torque_command": generator.normal(size=12),
+        }
+        expected.append(usual.tick(measurements=base.measurements(pad_force=forces[k]), **inputs))
+        old = base.measurements(pad_force=forces[max(0, k - late)])
+        posterior = delayed.tick(measurements=old, base_state=told, **inputs)
+        if k <= late:  # There is no tick before the first.
+            assert not posterior["valid"].any()
+            continue
+        for name in fields:
+            np.testing.assert_allclose(posterior[name], expected[k - late][name], rtol=1e-12)
+        np.testing.assert_array_equal(posterior["valid"], expected[k - late]["valid"])
+        compared += 1
+    assert compared > 5
+
+
+def test_friction_is_of_now_though_it_was_measured_some_ticks_ago():
+    """Its law is found from the residual of five ticks ago, and told for the present velocity.
+
+    Whoever takes the residual for that of now is wrong.
+    """
+    truth, late, errors = np.array([3.0, 2.0]), 5, {}
+    time = TICK * np.arange(1500)
+    velocity = 0.5 * np.sin(2 * np.pi * np.outer(time, np.linspace(1, 3, 12)))
+    friction = regressor(velocity) @ truth
+    for told in (late, 0):
+        estimator = Friction(ModelAided(velocity_smoothing=0.0))
+        error = []
+        for k in range(len(time)):
+            residual = friction[max(0, k - late)]
+            posterior = estimator.see(velocity[k], residual, torque=1e-3, late=told)
+            error.append(posterior["friction"] - friction[k])
+        errors[told] = math.sqrt(np.mean(np.square(error[500:])))
+    assert errors[late] < 0.02
+    assert errors[0] > 0.3
