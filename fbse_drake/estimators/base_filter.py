@@ -725,8 +725,11 @@ def _estimate_base(
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
         cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
-        shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
-        watch_force_delay(x.force_delay, shown, push, sensors.acceleration_noise, elapsed)
+        if trust.max() == 0:
+            shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
+            watch_force_delay(x.force_delay, shown, push, sensors.acceleration_noise, elapsed)
+        else:
+            forget_force_delay(x.force_delay)
     else:
         forget_force_delay(x.force_delay)
         if not is_fresh or elapsed > LONGEST_COMPARED_TICK:
