@@ -7,7 +7,7 @@ from numba import njit
 
 from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock
-from fbse_drake.estimators.spatial import Vector, dot, put, vector
+from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, vector
 
 # The longest delay that is looked for, and for how long what it was found by counts [s]: no longer
 # than a step, so that sensors which are in time again are soon seen to be.
@@ -22,13 +22,14 @@ def force_delay_type(clock: Clock) -> np.dtype:
     """What `watch_force_delay` remembers, of delays of 0, 1, ... ticks.
 
     `shown` (delays, 3), how the centre of mass accelerated so many ticks ago [m/s^2]; `filled`, how
-    many of these are known; sums over the last time, of their `square` and of their product
-    `cross` with the forces, (delays,), and of the forces' `push_square` [m^2/s^4]; `count`, over how
-    many ticks; and `ticks`, the delay.
+    many of these are known; sums over the last time, of these, `total` (delays, 3), of their
+    `square` and of their product `cross` with the forces, (delays,), and of the forces,
+    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; and `ticks`, the
+    delay.
     """
     delays = delays_of(clock)
-    shapes = {"shown": (delays, 3), "square": (delays,), "cross": (delays,)}
-    return record_type(**shapes, push_square=(), filled=(), count=(), ticks=())
+    shapes = {"shown": (delays, 3), "total": (delays, 3), "square": (delays,), "cross": (delays,)}
+    return record_type(**shapes, push_total=(3,), push_square=(), filled=(), count=(), ticks=())
 
 
 def delays_of(clock: Clock) -> int:
@@ -40,9 +41,11 @@ def delays_of(clock: Clock) -> int:
 def watch_force_delay(
     x: np.ndarray, acceleration: Vector, push: Vector, noise: float, elapsed: float
 ) -> None:
-    """One tick: the delay is that with which forces and other sensors agree best.
+    """One tick: the delay is that of the sensors by which the forces are explained best.
 
-    A gain that is wrong, or the robot's mass, does not count. Where forces hardly change all delays are alike, and it stays what it is.
+    What explains them is a gain times how the centre of mass accelerated, and a constant: a gain or
+    a bias that is wrong, or the robot's mass, does not count. Where forces hardly change all delays
+    are alike, and it stays what it is.
 
     Args:
         x: record of `force_delay_type`, of the tick before; filled.
@@ -59,12 +62,19 @@ def watch_force_delay(
     keep = math.exp(-elapsed / _MEMORY)
     x.count = keep * x.count + 1.0
     x.push_square = keep * x.push_square + dot(push, push)
+    put(x.push_total, add(scale(keep, vector(x.push_total)), push))
+    middle = scale(1.0 / x.count, vector(x.push_total))
+    push_square = x.push_square - dot(vector(x.push_total), middle)
     best, mismatch = 0, np.empty(len(x.shown))
     for late in range(len(mismatch)):
         shown = vector(x.shown[late])
         x.square[late] = keep * x.square[late] + dot(shown, shown)
         x.cross[late] = keep * x.cross[late] + dot(shown, push)
-        mismatch[late] = x.square[late] - x.cross[late] ** 2 / max(x.push_square, 1e-9)
+        put(x.total[late], add(scale(keep, vector(x.total[late])), shown))
+        total = vector(x.total[late])
+        square = x.square[late] - dot(total, total) / x.count
+        cross = x.cross[late] - dot(total, middle)
+        mismatch[late] = push_square - cross**2 / max(square, 1e-9)
         if mismatch[late] < mismatch[best]:
             best = late
     variance = max(noise**2, mismatch[best] / (3.0 * x.count))
