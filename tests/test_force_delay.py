@@ -15,6 +15,7 @@ from fbse_drake.estimators.force_delay import (
     delays_of,
     force_delay_type,
     forget_force_delay,
+    tick_of,
     watch_force_delay,
 )
 from fbse_drake.estimators.friction import ModelAided
@@ -35,25 +36,35 @@ def specific_force(time: np.ndarray, step: float = 0.5) -> np.ndarray:
 
 @njit
 def _watch(
-    record: np.ndarray, shown: np.ndarray, read: np.ndarray, usable: np.ndarray
+    record: np.ndarray,
+    shown: np.ndarray,
+    read: np.ndarray,
+    usable: np.ndarray,
+    elapsed: np.ndarray,
 ) -> np.ndarray:
     x, result = record[()], np.empty(len(shown))
     for k in range(len(shown)):
         if usable[k]:
-            watch_force_delay(x, vector(shown[k]), vector(read[k]), 0.02, TICK)
+            watch_force_delay(x, vector(shown[k]), vector(read[k]), 0.02, elapsed[k], TICK)
         else:
             forget_force_delay(x)
-        result[k] = x.ticks
+        result[k] = x.delay / TICK
     return result
 
 
-def found(truth: np.ndarray, forces: np.ndarray, gaps: tuple[int, ...] = ()) -> np.ndarray:
+def found(
+    truth: np.ndarray,
+    forces: np.ndarray,
+    gaps: tuple[int, ...] = (),
+    elapsed: float | np.ndarray = TICK,
+) -> np.ndarray:
     """The delay after every tick, by noisy IMU and joints and by forces, (N, 3) each [ticks]."""
     generator = np.random.default_rng(0)
     shown = truth + 0.2 * generator.standard_normal(truth.shape)
     read = forces + 0.02 * generator.standard_normal(forces.shape)
     usable = ~np.isin(np.arange(len(truth)), gaps)
-    return _watch(np.zeros((), force_delay_type(CLOCK)), shown, read, usable)
+    ticks = np.broadcast_to(elapsed, len(truth)).copy()
+    return _watch(np.zeros((), force_delay_type(CLOCK)), shown, read, usable, ticks)
 
 
 @pytest.mark.parametrize("late", [0, 1, 5, 9])
@@ -86,6 +97,26 @@ def test_what_does_not_change_tells_no_delay():
     assert np.all(np.abs(found(truth, late)[1000:] - 4) <= 1)
 
 
+def test_on_an_uneven_clock_no_delay_is_found():
+    """A velocity's difference over a tick is then off by as much as the tick: chance decides."""
+    generator, late = np.random.default_rng(2), 4
+    truth = specific_force(TICK * np.arange(3000))
+    forces = np.concatenate([truth[:late], truth[:-late]])
+    uneven = TICK * (1.0 + 0.1 * generator.uniform(-1, 1, len(truth)))
+    shown = truth * (TICK / uneven)[:, None]
+    assert not found(shown, forces, elapsed=uneven).any()
+    assert np.all(np.abs(found(truth, forces)[1000:] - late) <= 1)
+
+
+def test_the_tick_that_ended_so_long_ago():
+    duration = np.array([1.0, 1.0, 2.0, 1.0, 1.0])
+    assert [tick_of(duration, delay) for delay in (0.0, 1.1, 1.9, 2.9, 3.1, 5.0)] == [
+        0, 1, 2, 2, 3, 4,
+    ]  # fmt: skip
+    assert tick_of(np.zeros(5), 3.0) == 4  # None is remembered yet.
+    assert tick_of(duration, math.nan) == 0
+
+
 def test_delays_that_are_looked_for():
     assert delays_of(CLOCK) == 11
     assert delays_of(Clock.every(5e-4)) == 21
@@ -93,7 +124,7 @@ def test_delays_that_are_looked_for():
     assert delays_of(Clock.every(0.02)) == 1
 
 
-BASE_STATE = record_type(force_delay=record_type(ticks=()))
+BASE_STATE = record_type(force_delay=record_type(delay=()))
 
 
 def test_link_torque_with_late_forces_is_that_of_the_tick_they_belong_to():
@@ -107,7 +138,7 @@ def test_link_torque_with_late_forces_is_that_of_the_tick_they_belong_to():
     forces = generator.uniform(0, 200, size=(ticks, 8, 3))
     fields = "link_torque", "residual", "torque_variance", "impulse_variance", "own_inertia"
     told = np.zeros((), BASE_STATE)
-    told["force_delay"]["ticks"] = late
+    told["force_delay"]["delay"] = late * TICK
     expected, compared = [], 0
     for k in range(ticks):
         start = base.model_of(joint_position=generator.uniform(-0.4, 0.4, size=12))

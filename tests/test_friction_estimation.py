@@ -113,7 +113,7 @@ class Friction(Rig):
             "own_inertia": np.full(12, inertia),
             "valid": np.full(12, valid),
         }
-        link = pack(self._link, residual=residual, late=late, **noise)
+        link = pack(self._link, residual=residual, late=late, duration=TICK, **noise)
         return self.tick(
             measurements=BASE.measurements(joint_velocity=velocity, support=support),
             link_torque=link,

@@ -647,8 +647,8 @@ def _estimate_base(
     Args:
         known: record with the numbers of `InvariantFilter` and `SensorBeliefs`, `mount`, see
             `ImuMount`, `pads`, see `FootPads`, `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
-            sure the first posterior is, and `origin`, where the middle of the soles is at the start
-            (3,) [m].
+            sure the first posterior is, `origin`, where the middle of the soles is at the start
+            (3,) [m], and the `period` of ticks [s].
     """
     posterior[()] = last[()]
     x, last, measured, model, known = posterior[()], last[()], measured[()], model[()], known[()]
@@ -727,7 +727,8 @@ def _estimate_base(
         cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
         if trust.max() == 0:
             shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
-            watch_force_delay(x.force_delay, shown, push, sensors.acceleration_noise, elapsed)
+            noise, period = sensors.acceleration_noise, known.period
+            watch_force_delay(x.force_delay, shown, push, noise, elapsed, period)
         else:
             forget_force_delay(x.force_delay)
     else:
@@ -898,8 +899,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                the tick before; `stepped`, `age`, `habit_age` and `agreed`, for how
                                long the gyro is doubted for its step, all is watched, the habit is
                                learned, and nothing contradicts [s]
-        force_delay            what `watch_force_delay` remembers: `ticks` by which foot forces are
-                               late, and more, see `force_delay_type`
+        force_delay            what `watch_force_delay` remembers: the `delay` of the foot forces
+                               [s], and more, see `force_delay_type`
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
         leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
@@ -935,6 +936,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             gravity=plant.gravity_field().gravity_vector(),
             start=record(tilt=0.2, velocity=0.1, acceleration=0.05),
             origin=np.array([*origin, 0.0]),
+            period=clock.period,
         )
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)

@@ -14,6 +14,9 @@ from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, vector
 _LONGEST, _MEMORY = 0.01, 0.3
 # How much of that time it takes to know the noise.
 _LEAST = 0.5
+# By how much of itself a tick may be longer or shorter for its velocities' difference to be an
+# acceleration that is worth comparing, and for its number to be a time.
+_UNEVEN = 0.01
 # By how much more likely another delay must be, as the logarithm of the ratio, before it counts.
 _EVIDENCE = 30.0
 
@@ -24,12 +27,12 @@ def force_delay_type(clock: Clock) -> np.dtype:
     `shown` (delays, 3), how the centre of mass accelerated so many ticks ago [m/s^2]; `filled`, how
     many of these are known; sums over the last time, of these, `total` (delays, 3), of their
     `square` and of their product `cross` with the forces, (delays,), and of the forces,
-    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; and `ticks`, the
-    delay.
+    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; and the
+    `delay` [s].
     """
     delays = delays_of(clock)
     shapes = {"shown": (delays, 3), "total": (delays, 3), "square": (delays,), "cross": (delays,)}
-    return record_type(**shapes, push_total=(3,), push_square=(), filled=(), count=(), ticks=())
+    return record_type(**shapes, push_total=(3,), push_square=(), filled=(), count=(), delay=())
 
 
 def delays_of(clock: Clock) -> int:
@@ -38,21 +41,50 @@ def delays_of(clock: Clock) -> int:
 
 
 @njit(cache=True)
+def tick_of(duration: np.ndarray, delay: float) -> int:
+    """Which tick ended so long ago [s], by how long each took, (ticks,) [s], the latest first.
+
+    The nearest of those that are remembered; the latest if the delay is no number.
+    """
+    age, best, nearest = 0.0, 0, abs(delay)
+    for tick in range(1, len(duration)):
+        age += duration[tick - 1]
+        if abs(age - delay) <= nearest:
+            best, nearest = tick, abs(age - delay)
+    return best
+
+
+@njit(cache=True)
+def forget_force_delay(x: np.ndarray) -> None:
+    """A tick in which a sensor is not trusted; what has been found out stays."""
+    x.filled = 0.0
+
+
+@njit(cache=True)
 def watch_force_delay(
-    x: np.ndarray, acceleration: Vector, push: Vector, noise: float, elapsed: float
+    x: np.ndarray,
+    acceleration: Vector,
+    push: Vector,
+    noise: float,
+    elapsed: float,
+    period: float,
 ) -> None:
     """One tick: the delay is that of the sensors by which the forces are explained best.
 
     What explains them is a gain times how the centre of mass accelerated, and a constant: a gain or
     a bias that is wrong, or the robot's mass, does not count. Where forces hardly change all delays
-    are alike, and it stays what it is.
+    are alike, and it stays what it is. So it does on a clock that is not even.
 
     Args:
         x: record of `force_delay_type`, of the tick before; filled.
         acceleration, push: specific force of the centre of mass by IMU and joints, and by the
             forces [m/s^2].
         noise: of the accelerometer, that no difference is below [m/s^2].
+        elapsed, period: of this tick, and of one that is neither early nor late [s].
     """
+    if abs(elapsed - period) > _UNEVEN * period:
+        forget_force_delay(x)
+        return
     for age in range(len(x.shown) - 1, 0, -1):
         x.shown[age] = x.shown[age - 1]
     put(x.shown[0], acceleration)
@@ -79,11 +111,6 @@ def watch_force_delay(
             best = late
     variance = max(noise**2, mismatch[best] / (3.0 * x.count))
     is_known = x.count * elapsed > _LEAST * _MEMORY
-    if is_known and mismatch[int(x.ticks)] - mismatch[best] > 2.0 * _EVIDENCE * variance:
-        x.ticks = best
-
-
-@njit(cache=True)
-def forget_force_delay(x: np.ndarray) -> None:
-    """A tick in which a sensor is not trusted; what has been found out stays."""
-    x.filled = 0.0
+    believed = round(x.delay / period)
+    if is_known and mismatch[believed] - mismatch[best] > 2.0 * _EVIDENCE * variance:
+        x.delay = best * period

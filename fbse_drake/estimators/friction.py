@@ -278,7 +278,7 @@ class FrictionEstimator(RecursiveEstimator):
             "measurements": record_type(
                 trust=(2 + feet,), support=(max(1, feet),), joint_velocity=(n,)
             ),
-            "link_torque": record_type(**dict.fromkeys(measured, (n,)), late=()),
+            "link_torque": record_type(**dict.fromkeys(measured, (n,)), late=(), duration=()),
         }
 
 
@@ -452,6 +452,8 @@ def _estimate_friction(
     posterior.covariance[:] = last.covariance
     keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / NOISE_TIME)
+    # Of the tick that was measured.
+    T = link.duration
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
@@ -467,21 +469,21 @@ def _estimate_friction(
         P, noise = posterior.covariance[joint], last.noise[joint]
         impulse_uncertainty = P[0, 0]
         # Prediction: the impulse error grows by the friction's error times the tick ...
-        innovation = last.impulse[joint] + elapsed * link.residual[joint]
-        added = elapsed**2 * noise * link.torque_variance[joint]
+        innovation = last.impulse[joint] + T * link.residual[joint]
+        added = T**2 * noise * link.torque_variance[joint]
         for k in range(m + 1):
-            innovation -= elapsed * regressor[k] * x[k]
+            innovation -= T * regressor[k] * x[k]
         for i in range(size):
             c = 0.0
             for k in range(m + 1):
-                c += elapsed * P[i, 1 + k] * regressor[k]
+                c += T * P[i, 1 + k] * regressor[k]
             P[i, 0] += c
             if i > 0:
-                added += elapsed * regressor[i - 1] * c
+                added += T * regressor[i - 1] * c
         # ... which also comes of the noise in the velocity that the model sees. The measured
         # impulse has it, too, as it is made of the same velocity.
         velocity_variance = noise * known.velocity_variance
-        through_model, through_link = elapsed * slope, link.own_inertia[joint]
+        through_model, through_link = T * slope, link.own_inertia[joint]
         added += through_model**2 * velocity_variance
         # Its own row and column are the same.
         P[0, 0] += P[0, 0] - impulse_uncertainty + added
@@ -523,7 +525,7 @@ def _estimate_friction(
             agreement = keep * last.agreement[joint] + (1.0 - keep) * likely * innovation
             posterior.agreement[joint] = agreement
             if count * agreement * agreement > AGREEMENT * S:
-                unexplained = column[0] / S * agreement / elapsed
+                unexplained = column[0] / S * agreement / T
                 P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
         else:
             # A joint that is not measured is left to its model.
@@ -625,11 +627,12 @@ class ModelAidedEstimator(FrictionEstimator):
             return
         share = start_share(elapsed, self._reading)
         seen = smooth_velocity(posterior, last, measured, elapsed, share, self._smoothing)
-        past, late = posterior["past_velocity"], int(link_torque["late"])
+        past, late = posterior["past_velocity"], float(link_torque["late"])
+        then = int(late) if 0 < late < len(past) else 0
         past[1:] = last["past_velocity"][:-1]
         past[0] = posterior["velocity"]
         phi_now, slopes = self._regressor(past[0])
-        phi, slopes = self._regressor(past[late]) if late else (phi_now, slopes)
+        phi, slopes = self._regressor(past[then]) if then else (phi_now, slopes)
         _estimate_friction(
             posterior,
             last,

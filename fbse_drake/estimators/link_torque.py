@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import model_type
-from fbse_drake.estimators.force_delay import delays_of
+from fbse_drake.estimators.force_delay import delays_of, tick_of
 from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -34,6 +34,7 @@ def _clear(posterior: np.ndarray, status: float) -> None:
     posterior.valid[:] = 0.0
     past = posterior.past
     past.valid[:] = 0.0
+    past.duration[:] = 0.0
     past.torque_command[:] = 0.0
     past.inertial_torque[:] = 0.0
     past.torque_variance[:] = 0.0
@@ -83,13 +84,13 @@ def _estimate_link_torque(
     model: np.ndarray,
     acceleration: np.ndarray,
     torque_command: np.ndarray,
-    late: float,
+    delay: float,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
     Args:
-        late: by how many ticks the forces are late.
+        delay: by how much the forces are late [s].
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
@@ -99,9 +100,9 @@ def _estimate_link_torque(
     model, acceleration, known = model[()], acceleration[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
-    posterior.late = late
+    posterior.late = posterior.duration = 0.0
     _watch_forces(posterior, last, elapsed, wrench, known)
-    if not np.isfinite(torque_command).all():
+    if not np.isfinite(torque_command).all() or not math.isfinite(delay):
         _clear(posterior, _NOT_FINITE)
         return
     if math.isnan(elapsed):
@@ -115,15 +116,16 @@ def _estimate_link_torque(
     a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
     a[6:] = acceleration.joint_acceleration
     # What is known now, forces apart, belongs to the forces that are read so much later.
-    past, before, late = posterior.past, last.past, posterior.late
+    past, before = posterior.past, last.past
     _shift(past.valid, before.valid)
+    _shift(past.duration, before.duration)
     _shift(past.torque_command, before.torque_command)
     _shift(past.inertial_torque, before.inertial_torque)
     _shift(past.torque_variance, before.torque_variance)
     _shift(past.impulse_variance, before.impulse_variance)
     _shift(past.own_inertia, before.own_inertia)
     _shift(past.lever, before.lever)
-    past.torque_command[0] = torque_command
+    past.duration[0], past.torque_command[0] = elapsed, torque_command
     for foot in range(feet):
         past.lever[0, foot] = model.foot_jacobian[foot, :, 6:]
     for i in range(n):
@@ -149,7 +151,8 @@ def _estimate_link_torque(
         past.impulse_variance[0, i], past.own_inertia[0, i] = impulse_variance, to_sensors[6 + i]
         is_known = trust[0] == 0 and trust[1] == 0
         past.valid[0, i] = acceleration.known[i] if is_known else 0.0
-    then = int(late)
+    then = tick_of(past.duration, delay)
+    posterior.late, posterior.duration = then, past.duration[then]
     for i in range(n):
         link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
         for foot in range(feet):
@@ -209,10 +212,11 @@ class LinkTorqueEstimator(RecursiveEstimator):
         valid              1 where all that the residual needs was known
 
     `base_state` is there where somebody knows that foot forces come late: then all this is of the
-    tick in which they were what is read now. Further `late`, by how many ticks that is; `past`,
-    what is known of these ticks but for the forces: `valid`, `torque_command`, `inertial_torque`
-    and the noise's `torque_variance`, `impulse_variance` and `own_inertia`, (delays, n), and the
-    `lever` of the wrenches, (delays, feet, 6, n);
+    tick in which they were what is read now. Further `late`, how many ticks ago that was, and its
+    `duration` [s]; `past`, what is known of these ticks but for the forces: `duration` (delays,);
+    `valid`, `torque_command`, `inertial_torque` and the noise's `torque_variance`,
+    `impulse_variance` and `own_inertia`, (delays, n); and the `lever` of the wrenches,
+    (delays, feet, 6, n);
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
     believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
@@ -253,7 +257,8 @@ class LinkTorqueEstimator(RecursiveEstimator):
             wrench=(len(legs), 6),
             wrench_change=(len(legs), 6),
             late=(),
-            past=record_type(**past, lever=(delays, len(legs), 6, n)),
+            duration=(),
+            past=record_type(**past, duration=(delays,), lever=(delays, len(legs), 6, n)),
         )
         super().__init__(posterior_type, clock)
         pads = FootPads(robot)
@@ -293,9 +298,9 @@ class LinkTorqueEstimator(RecursiveEstimator):
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
-        late = 0.0
+        delay = 0.0
         if self._base_state is not None:
-            late = float(self._base_state.Eval(context)["force_delay"]["ticks"])
+            delay = float(self._base_state.Eval(context)["force_delay"]["delay"])
         _estimate_link_torque(
             posterior,
             last,
@@ -304,6 +309,6 @@ class LinkTorqueEstimator(RecursiveEstimator):
             self._model.Eval(context),
             self._acceleration.Eval(context),
             self._torque_command.Eval(context),
-            late,
+            delay,
             self._known,
         )
