@@ -453,7 +453,7 @@ def _estimate_friction(
     keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / NOISE_TIME)
     # Of the tick that was measured.
-    T = link.duration
+    T = link.duration if link.late > 0 else elapsed
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
