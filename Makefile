@@ -4,13 +4,14 @@
 # make rivals compares all methods of estimating friction, and writes out/rivals/*/report.html
 # make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
 # make bench  prints speeds, as ratios measured in one run
+# make fuzz   gives the commands 20,000 wrong files
 PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test lint format bench fbse rivals hidden clean
+.PHONY: walk test lint format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -33,6 +34,10 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.estimator_tick
 	$(VENV)/bin/python -m benchmarks.convert
 	$(VENV)/bin/python -m benchmarks.campaigns
+
+# Nothing may end in a traceback, hang, leave a half-written file or run code; what does is kept in out/fuzz. About two hours on a core.
+fuzz: $(INSTALLED)
+	$(VENV)/bin/python -m benchmarks.fuzz
 
 # How good the friction estimate is, in tables: ten seeds of every walk, half an hour on two cores; then on walks that nobody tuned to,
 # with faults of the sensors, beside the smallest error that the sensors allow, and whether it is as sure as it says, a quarter of an hour

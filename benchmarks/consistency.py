@@ -27,7 +27,7 @@ from benchmarks.console import print_table
 from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.campaign.steps import Material
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import (
     friction_error,
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print_table(console, f"Consistency from {_START:g} s on", Table(header, tuple(lines)))
     path = options.out / "consistency.json"
     options.out.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps([dict(zip(header, line, strict=True)) for line in lines]) + "\n")
+    write_json(path, [dict(zip(header, line, strict=True)) for line in lines])
 
 
 if __name__ == "__main__":

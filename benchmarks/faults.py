@@ -21,7 +21,6 @@ not finite, and writes DIR/faults.json. It is one process; a fault takes half a 
 """
 
 import argparse
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +38,7 @@ from benchmarks.console import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.estimate import Replay
 from fbse_drake.estimators.estimator import EstimatorDiagram, NoEstimator
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import ended_step
 
@@ -499,7 +498,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counts = Counter(verdict.outcome for verdict in verdicts)
     content = {"counts": counts, "faults": list(map(asdict, verdicts))}
     options.out.mkdir(parents=True, exist_ok=True)
-    write_text(options.out / "faults.json", json.dumps(content, indent=1) + "\n")
+    write_json(options.out / "faults.json", content)
     console.print(f"All faults: {options.out / 'faults.json'}")
 
 

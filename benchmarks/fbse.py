@@ -26,7 +26,7 @@ from fbse_drake.campaign.steps import Material
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.identification import identify
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.resources import folder, package_checksum
@@ -465,15 +465,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     made = tables(results, robust)
     for title, table in made.items():
         print_table(console, title, table)
-    write_text(
-        options.out / "figures.json",
-        json.dumps(
-            {title: {"header": table.header, "rows": table.rows} for title, table in made.items()},
-            indent=1,
-            default=float,
-        )
-        + "\n",
-    )
+    content = {title: {"header": t.header, "rows": t.rows} for title, t in made.items()}
+    write_json(options.out / "figures.json", content)
     sections = tuple(Section(title, tables=(table,)) for title, table in made.items())
     outcome = (
         f"Means over {options.seeds} seeds ({options.robustness_seeds} in the robustness table)."

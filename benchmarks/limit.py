@@ -35,7 +35,6 @@ DIR/limit.json. A seed of the whole walk takes about a minute.
 """
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -56,7 +55,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import (
     ended_step,
@@ -521,7 +520,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     records = [asdict(row) | {"seed": seed} for seed, of in enumerate(by_seed) for row in of]
     path = options.out / "limit.json"
-    write_text(path, json.dumps(records, indent=1) + "\n")
+    write_json(path, records)
     console.print(f"Mean squares of every seed: {path}", highlight=False)
 
 

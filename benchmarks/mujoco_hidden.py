@@ -9,7 +9,6 @@ and a line for each case that went wrong, and saves both as DIR/figures.json.
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from importlib.util import find_spec
 
@@ -17,7 +16,7 @@ from rich.console import Console
 
 from benchmarks.cases import Result, add_options, share
 from benchmarks.console import print_table
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 
 
@@ -123,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "figures": [dict(zip(table.header, row, strict=True)) for row in table.rows],
         "failures": lines,
     }
-    write_text(options.out / "figures.json", json.dumps(tree, indent=1) + "\n")
+    write_json(options.out / "figures.json", tree)
     console.print(f"{len(everything)} cases: {options.out / 'figures.json'}", highlight=False)
 
 

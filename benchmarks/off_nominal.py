@@ -29,7 +29,7 @@ from fbse_drake.campaign.steps import Material
 from fbse_drake.estimate import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import Estimator
-from fbse_drake.files import write_text
+from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import friction_error, joint_sides, run_metrics, settled, stance
 from fbse_drake.resources import package_checksum
@@ -297,7 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     path = options.out / "off_nominal.json"
     options.out.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(records, indent=1) + "\n")
+    write_json(path, records)
     console.print(f"All variants: {path}", highlight=False)
 
 

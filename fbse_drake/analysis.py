@@ -36,7 +36,7 @@ from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError
-from fbse_drake.files import write_text
+from fbse_drake.files import origin, write_json, write_text
 from fbse_drake.interop.convert import read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.log import Log, joined
@@ -60,7 +60,6 @@ from fbse_drake.report.identification import (
     identification_outcome,
     write_identification_report,
 )
-from fbse_drake.report.metrics import write_json
 from fbse_drake.results import Result, made_folder
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, dump_scenario
@@ -173,6 +172,7 @@ class AnalysisResult(Result):
 
         Raises:
             InputError: the folder cannot be made.
+            OSError: a file cannot be written; none is half-written.
         """
         out = made_folder(folder)
         if inputs is None:
@@ -182,10 +182,10 @@ class AnalysisResult(Result):
                 log.save(path)
             for path, (_, log) in zip(inputs.tests, self._further_tests, strict=True):
                 log.save(path)
-        content = self.json()
+        write_text(out / "scenario.yaml", dump_scenario(self.case.scenario, self.case.name))
+        content = origin(log=Path(inputs.log), scenario=out / "scenario.yaml") | self.json()
         write_json(out / f"{self.file}.json", content)
         write_json(out / "metrics.json", content)
-        write_text(out / "scenario.yaml", dump_scenario(self.case.scenario, self.case.name))
         if (completed := self._completed) is not None:
             write_text(out / "completed.yaml", dump_scenario(completed, self.case.name))
         self._report(out / "report.html", replace(inputs, hygiene=self.hygiene))

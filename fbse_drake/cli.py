@@ -2,6 +2,7 @@
 """The `fbse` command line. Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input."""
 
 import argparse
+import errno
 import os
 import signal
 import sys
@@ -11,9 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, on_one_line
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 # What can be listed.
 LISTED = ("scenarios", "robots", "effects", "estimators", "sensors", "compensations")
 _FIRST_STEPS = """first steps:
@@ -40,11 +42,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return DONE if COMMANDS[options.command](options) else FAILED
     except InputError as error:
-        print(f"fbse: {error}", file=sys.stderr)
+        _complain(str(error))
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("fbse: interrupted; no file was left half-written", file=sys.stderr)
-        return FAILED
+        _complain("interrupted; no file was left half-written")
+    except MemoryError:
+        _complain("there is not enough memory for this; no file was left half-written")
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _complain(f"{place}{error.strerror or error}; no file was left half-written")
+        # That a disk is full is nobody's wrong input; that a folder cannot be written to is.
+        return FAILED if error.errno in _DISK else BAD_INPUT
+    return FAILED
+
+
+def _complain(line: str) -> None:
+    print(f"fbse: {on_one_line(line)}", file=sys.stderr)
 
 
 def entry() -> None:
@@ -53,7 +66,17 @@ def entry() -> None:
         # What `nohup` ignores stays ignored.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
-    sys.exit(main())
+    for stream in (sys.stdout, sys.stderr):
+        # What a terminal of an old locale cannot show becomes a question mark.
+        stream.reconfigure(errors="replace")
+    status = main()
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        from fbse_drake.console import silence_stdout
+
+        silence_stdout()
+    sys.exit(status)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -386,6 +409,7 @@ def _parser() -> argparse.ArgumentParser:
         ),
     )
     run.add_argument("campaign", metavar="CAMPAIGN", type=Path, help="a YAML file")
+    _add_allow_code(run, "it names (!Call, and effect_modules of its scenarios)")
     run.add_argument(
         "--out",
         metavar="DIR",
@@ -486,6 +510,15 @@ def _add_scenario(run: argparse.ArgumentParser) -> None:
         default=[],
         dest="overrides",
         help="changes a value, as in seed=3; repeatable",
+    )
+    _add_allow_code(run, "the scenario names (effect_modules)")
+
+
+def _add_allow_code(run: argparse.ArgumentParser, which: str) -> None:
+    run.add_argument(
+        "--allow-code",
+        action="store_true",
+        help=f"run the Python code that {which} also where the file came with a log or a download",
     )
 
 

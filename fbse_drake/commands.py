@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import json
 import os
 import sys
 import time as clock
@@ -13,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, StartMeshcat
-from rich.console import Console, Group
+from pydrake.geometry import Meshcat, MeshcatParams
+from rich.console import Group
 from rich.markup import escape
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
@@ -23,14 +22,16 @@ from rich.text import Text
 
 from fbse_drake.analysis import AnalysisResult, compare, diagnose, identify, reveal, study
 from fbse_drake.cli import LISTED
+from fbse_drake.console import Console
 from fbse_drake.discrepancy.diagnosis.add import add, read_findings
 from fbse_drake.discrepancy.diagnosis.diagnose import Finding
 from fbse_drake.discrepancy.diagnosis.identify import identifiability_text
 from fbse_drake.discrepancy.exercises.hidden import make_exercise, seal
 from fbse_drake.effects.effect import spaced
-from fbse_drake.errors import InputError, located
+from fbse_drake.effects.user import require_trusted
+from fbse_drake.errors import InputError, located, on_one_line
 from fbse_drake.estimate import estimate
-from fbse_drake.files import write_atomically, write_text
+from fbse_drake.files import origin, read_json, to_json, write_atomically, write_json, write_text
 from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
@@ -41,10 +42,10 @@ from fbse_drake.report.discrepancy_figures import targets_text
 from fbse_drake.report.html import Table as ReportTable
 from fbse_drake.report.html import number, percent
 from fbse_drake.report.identification import base_table
-from fbse_drake.report.metrics import worst_joint, write_json
+from fbse_drake.report.metrics import worst_joint
 from fbse_drake.report.run import law_sentence
 from fbse_drake.results import RunResult
-from fbse_drake.scenario import Scenario, dump_scenario, read_scenario
+from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
 from fbse_drake.simulate import SimulationResult, simulate
 
 # Failures and findings that are printed.
@@ -56,7 +57,7 @@ _ADDED = "# Effects added by fbse add"
 
 
 def _simulate(options: argparse.Namespace) -> bool:
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    name, scenario = _read_scenario(options)
     out = _output_folder(options, "")
     console = Console(quiet=options.quiet)
     meshcat = _start_meshcat(console) if options.meshcat else None
@@ -78,7 +79,7 @@ def _simulate(options: argparse.Namespace) -> bool:
 
 
 def _estimate(options: argparse.Namespace) -> bool:
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    name, scenario = _read_scenario(options)
     log = read_log(options.log, options.map)
     out = _output_folder(options, "_estimate")
     if (out / "log.npz").exists() and (out / "log.npz").samefile(options.log):
@@ -92,7 +93,7 @@ def _estimate(options: argparse.Namespace) -> bool:
         result = estimate(scenario, log, name=name, progress=lambda time: progress(time - start))
     _write_run(console, out, result)
     for remark in result.remarks:
-        console.print(remark, highlight=False, markup=False, soft_wrap=True)
+        console.print(remark, soft_wrap=True)
     return True
 
 
@@ -146,7 +147,7 @@ def _identify(options: argparse.Namespace) -> bool:
             name=given.inputs.name,
             progress=progress,
         )
-    given.console.print(identifiability_text(result.inertia), highlight=False)
+    given.console.print(identifiability_text(result.inertia))
     given.console.print(_printed(base_table(result), given.inputs.name))
     _conclude(given, result)
     return True
@@ -174,12 +175,9 @@ def _convert(options: argparse.Namespace) -> bool:
                 f"{findings[0]}{f' (and {len(findings) - 1} more findings)' if findings[1:] else ''}"
             )
         status.update(f"writing {escape(out.name)}")
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            write(log, out)
-        except OSError as error:
-            raise InputError(f"{out}: {error.strerror or error}") from None
-    table = Table(title=escape(str(out)), show_header=False, title_justify="left")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write(log, out)
+    table = Table(title=str(out), show_header=False, title_justify="left")
     table.add_row(
         "rows",
         f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} s apart",
@@ -187,7 +185,7 @@ def _convert(options: argparse.Namespace) -> bool:
     table.add_row("joints", ", ".join(log.joints))
     table.add_row("channels", ", ".join(name for name in log if name != "time"))
     for finding in findings:
-        table.add_row("left out", escape(finding))
+        table.add_row("left out", finding)
     console.print(table)
     return True
 
@@ -209,18 +207,22 @@ class _Given:
         (log,) = self.logs.values()
         return log
 
-    @property
-    def recordings(self) -> Log | dict[str, Log]:
-        """One log as it is, several by name."""
-        return self.logs if len(self.logs) > 1 else self.log
+    for further in result.further_tables():
+        console.print(_printed(further, given.inputs.name))
+def _read_scenario(options: argparse.Namespace) -> tuple[str, Scenario]:
+    """The scenario and its name; says whose code it runs."""
+    name, scenario = read_scenario(
+        options.scenario, options.name, options.overrides, allow_code=options.allow_code
+    )
+    if scenario.effect_modules:
+        modules = ", ".join(scenario.effect_modules)
+        Console(quiet=options.quiet).print(f"Code of the scenario: {modules}", soft_wrap=True)
+    return name, scenario
 
 
-def _scenario_and_logs(options: argparse.Namespace, paths: Sequence[Path], suffix: str) -> _Given:
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
-    if len(set(paths)) < len(paths):
-        raise InputError(f"{paths[0]}: a log is given twice")
-    alike = len({path.stem for path in paths}) < len(paths)
-    logs = {str(path) if alike else path.stem: read_log(path, options.map) for path in paths}
+def _scenario_and_log(options: argparse.Namespace, suffix: str) -> _Given:
+    name, scenario = _read_scenario(options)
+    log = read_log(options.log, options.map)
     out = _output_folder(options, suffix)
     inputs = Inputs(
         name,
@@ -257,9 +259,7 @@ def _told(
             with lines.stopped_by_keyboard():
                 yield lines
         return
-    lines = ProgressLines(
-        lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True), limit
-    )
+    lines = ProgressLines(lambda line: console.print(line, soft_wrap=True), limit)
     with lines.stopped_by_keyboard():
         yield lines
 
@@ -278,8 +278,8 @@ def _conclude(given: _Given, result: AnalysisResult) -> None:
         console.print(_printed(table, given.inputs.name))
     for further in result.further_tables():
         console.print(_printed(further, given.inputs.name))
-    console.print(result.outcome, highlight=False)
-    console.print(f"Report: {given.out / 'report.html'}", highlight=False, soft_wrap=True)
+    console.print(result.outcome)
+    console.print(f"Report: {given.out / 'report.html'}", soft_wrap=True)
 
 
 def _printed(table: ReportTable, title: str) -> Table:
@@ -291,17 +291,13 @@ def _printed(table: ReportTable, title: str) -> Table:
 
 
 def _add(options: argparse.Namespace) -> bool:
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    name, scenario = _read_scenario(options)
     path = options.diagnosis / "diagnosis.json" if options.diagnosis.is_dir() else options.diagnosis
-    try:
-        diagnosis = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
-    except ValueError:
-        raise InputError(f"{path}: not a JSON file") from None
+    diagnosis = read_json(path)
     with located(f"{path}: "):
         findings = read_findings(diagnosis, options.effect)
         completed = add(scenario, findings)
+        check_joints(completed)
     out = options.out
     # Nobody's own file is lost.
     if out.is_dir() or (out.exists() and not out.read_bytes().startswith(_ADDED.encode())):
@@ -312,21 +308,13 @@ def _add(options: argparse.Namespace) -> bool:
         f"{_ADDED} to {options.scenario}, from {path}.",
         *(f"# {line}" for finding in findings for line in _value_lines(finding)),
     ]
-    header = "\n".join(map(_on_one_line, lines))
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_text(out, f"{header}\n{dump_scenario(completed, name)}")
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror}") from None
+    header = "\n".join(map(on_one_line, lines))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_text(out, f"{header}\n{dump_scenario(completed, name)}")
     console = Console(quiet=options.quiet)
     console.print(_printed(findings_table(findings), name))
-    console.print(f"Scenario: {out}", highlight=False, soft_wrap=True)
+    console.print(f"Scenario: {out}", soft_wrap=True)
     return True
-
-
-def _on_one_line(text: str) -> str:
-    """The text with what is not printable escaped: no file that it comes from can end a comment."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def _value_lines(finding: Finding) -> list[str]:
@@ -341,7 +329,7 @@ def _value_lines(finding: Finding) -> list[str]:
 
 
 def _hide(options: argparse.Namespace) -> bool:
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    name, scenario = _read_scenario(options)
     out = _output_folder(options, "_hidden")
     console = Console(quiet=options.quiet)
     with (
@@ -363,7 +351,6 @@ def _hide(options: argparse.Namespace) -> bool:
     write_text(out / "answer.sealed", seal(exercise.answer))
     console.print(
         f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}",
-        highlight=False,
         soft_wrap=True,
     )
     return True
@@ -372,7 +359,8 @@ def _hide(options: argparse.Namespace) -> bool:
 def _reveal(options: argparse.Namespace) -> bool:
     revealed = reveal(options.folder)
     answer = revealed.answer
-    write_json(options.folder / "answer.json", revealed.json())
+    made_by = origin(log=None, scenario=None)
+    write_json(options.folder / "answer.json", made_by | revealed.json())
     console = Console(quiet=options.quiet)
     table = Table(
         "hidden", "in", "values", title=f"{options.folder}: {answer.kind}", title_justify="left"
@@ -385,11 +373,9 @@ def _reveal(options: argparse.Namespace) -> bool:
         table.add_row(spaced(effect.effect), targets_text(effect.targets), ", ".join(values))
     console.print(table if answer.effects else "Nothing was hidden.")
     if revealed.score is None:
-        console.print(
-            f"No diagnosis.json or study.json in {options.folder} to score.", highlight=False
-        )
+        console.print(f"No diagnosis.json or study.json in {options.folder} to score.")
     else:
-        console.print(revealed.score.text, highlight=False)
+        console.print(revealed.score.text)
     return True
 
 
@@ -398,11 +384,13 @@ def _campaign(options: argparse.Namespace) -> bool:
         from fbse_drake.campaign.campaign import load_campaign
         from fbse_drake.campaign.cluster import run_campaign
     campaign = load_campaign(options.campaign)
+    if not options.allow_code:
+        require_trusted(options.campaign, campaign.code)
     place = options.out or str(Path("out") / options.campaign.stem)
     console = Console(quiet=options.quiet)
 
     def tell(line: str) -> None:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
     with _told(console, first="starting") as progress:
         outcome = run_campaign(
@@ -449,21 +437,18 @@ def _table(options: argparse.Namespace) -> bool:
         )
         shown.add_row(*map(str, same), str(count), str(failed), *cells)
     console.print(shown)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomically(out / "table.csv", lambda partial: write_csv(rows, partial))
-        bounds = (f"{value}{end}" for value in values for end in ("", " from", " to"))
-        lines = [[*by, "runs", "failed", *bounds], *summaries]
-        write_atomically(out / "groups.csv", lambda partial: _write_lines(partial, lines))
-        if options.plot is not None:
-            y, x = options.plot
-            path = out / f"{y}_over_{x}.png"
-            figure = tables.picture(rows, y, x, by)
-            write_atomically(path, lambda partial: figure.savefig(partial, format="png", dpi=120))
-            console.print(f"Picture: {path}", highlight=False, soft_wrap=True)
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror}") from None
-    console.print(f"Rows: {out / 'table.csv'}", highlight=False, soft_wrap=True)
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / "table.csv", lambda partial: write_csv(rows, partial))
+    bounds = (f"{value}{end}" for value in values for end in ("", " from", " to"))
+    lines = [[*by, "runs", "failed", *bounds], *summaries]
+    write_atomically(out / "groups.csv", lambda partial: _write_lines(partial, lines))
+    if options.plot is not None:
+        y, x = options.plot
+        path = out / f"{y}_over_{x}.png"
+        figure = tables.picture(rows, y, x, by)
+        write_atomically(path, lambda partial: figure.savefig(partial, format="png", dpi=120))
+        console.print(f"Picture: {path}", soft_wrap=True)
+    console.print(f"Rows: {out / 'table.csv'}", soft_wrap=True)
     return True
 
 
@@ -473,7 +458,7 @@ def _rivals(options: argparse.Namespace) -> bool:
         from fbse_drake.rivals.campaign import Campaigns, Plan, compare_methods
         from fbse_drake.rivals.cases import CASES, NOMINAL
         from fbse_drake.rivals.comparison import comparison_json
-    name, scenario = read_scenario(options.scenario, options.name, options.overrides)
+    name, scenario = _read_scenario(options)
     cases = [case for case in CASES if case in (NOMINAL, *(options.case or CASES))]
     for case in options.case or ():
         if case not in CASES:
@@ -482,7 +467,7 @@ def _rivals(options: argparse.Namespace) -> bool:
     plan = Plan(scenario, name, cases, options.seeds, options.trials)
 
     def tell(line: str) -> None:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
     try:
         with (
@@ -495,10 +480,11 @@ def _rivals(options: argparse.Namespace) -> bool:
         print(f"fbse: {stop}; the same command goes on", file=sys.stderr)
         return False
     text = dump_scenario(scenario, name)
-    content = {"seeds": options.seeds, "trials": options.trials, **comparison_json(comparison)}
-    for file in ("rivals", "metrics"):
-        write_json(out / f"{file}.json", content)
     write_text(out / "scenario.yaml", text)
+    settings = {"seeds": options.seeds, "trials": options.trials}
+    made_of = origin(log=None, scenario=out / "scenario.yaml")
+    for file in ("rivals", "metrics"):
+        write_json(out / f"{file}.json", made_of | settings | comparison_json(comparison))
     with console.status("writing the report"):
         report.write_rivals_report(
             out / "report.html", comparison, name=name, seeds=options.seeds, scenario=text
@@ -526,7 +512,7 @@ def _list(options: argparse.Namespace) -> bool:
     kinds = [options.what] if options.what else LISTED
     found = {kind: listing(kind) for kind in kinds}
     if options.json:
-        print(json.dumps(found, indent=2))
+        print(to_json(found, indent=2))
         return True
     console = Console(quiet=options.quiet)
     for kind, lines in found.items():
@@ -555,8 +541,8 @@ def _write_run(console: Console, out: Path, result: RunResult) -> None:
         result.save(out)
     console.print(_summary(result.name, result.metrics))
     if sentence := law_sentence(result.metrics["friction_law_error"]):
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)
+    console.print(f"Report: {out / 'report.html'}", soft_wrap=True)
 
 
 def _output_folder(options: argparse.Namespace, suffix: str) -> Path:
@@ -576,10 +562,11 @@ def _output_folder(options: argparse.Namespace, suffix: str) -> Path:
 
 
 def _start_meshcat(console: Console) -> Meshcat:
-    meshcat = StartMeshcat()
+    # On this machine alone.
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
     # From the right front, near enough for a robot.
     meshcat.SetCameraPose([2.2, -2.2, 1.3], [0.2, 0.0, 0.5])
-    console.print(f"Watch the run at {meshcat.web_url()}", highlight=False)
+    console.print(f"Watch the run at {meshcat.web_url()}")
     return meshcat
 
 
@@ -587,7 +574,7 @@ def _start_meshcat(console: Console) -> Meshcat:
 def _progress(console: Console, title: str, duration: float) -> Iterator[Callable[[float], None]]:
     """A bar over simulated or recorded time; its value is the function to call with it."""
     columns = (
-        TextColumn(title),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.completed:.1f} of {task.total:.1f} s"),
         TimeElapsedColumn(),

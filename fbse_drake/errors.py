@@ -8,6 +8,11 @@ class InputError(ValueError):
     """Bad input from a user; the message is one line that says what, where and what is allowed."""
 
 
+def on_one_line(text: str) -> str:
+    """The text with what is not printable escaped: nothing that it quotes can end a line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 @contextmanager
 def located(where: str) -> Iterator[None]:
     """Puts `where` in front of the message of an InputError raised inside."""
@@ -30,3 +35,11 @@ def require_not_negative(config: object, *names: str) -> None:
     for name in names:
         if not getattr(config, name) >= 0:
             raise InputError(f"{name}: expected a number >= 0, found {getattr(config, name):g}")
+
+
+def require_at_most(config: object, **largest: float) -> None:
+    """Refuses a configuration in which one of these numbers is given (not None) and too large."""
+    for name, bound in largest.items():
+        value = getattr(config, name)
+        if value is not None and value > bound:
+            raise InputError(f"{name}: expected at most {bound:g}, found {value:g}")

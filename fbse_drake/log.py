@@ -5,18 +5,17 @@ then; commanded torque, friction torque and the law of the friction (at the velo
 of the step) of the step that begins then.
 """
 
-import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fbse_drake.errors import InputError, located
-from fbse_drake.files import write_atomically
+from fbse_drake import schema
+from fbse_drake.errors import InputError, located, require_positive
+from fbse_drake.files import from_json, to_json, write_atomically
+from fbse_drake.npz import read_npz
 from fbse_drake.signals import channel_kind
 
 if TYPE_CHECKING:
@@ -26,6 +25,65 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 1
 
 _REQUIRED = ("time", "joint/position")
+# Not even a recording with gaps lacks more rows for each that it has.
+_MOST_GAPS = 100
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a simulation ended."""
+
+    # None of a recording, of which nobody knows.
+    fell: bool | None
+    reason: str
+    finished: bool = True
+    time: float | None = None
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames in the robot's model; the soles by side."""
+
+    base: str = ""
+    imu: str = ""
+    soles: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LogMeta:
+    """What a log says beside its channels."""
+
+    # Names, in the order of the columns.
+    joints: list[str]
+    # Nominal time between rows [s].
+    period: float
+    sides: list[str] = field(default_factory=list)
+    # Joints by side.
+    legs: dict[str, list[str]] = field(default_factory=dict)
+    frames: Frames = field(default_factory=Frames)
+    # Where the force sensors are in the sole frames [m], by side.
+    pads: dict[str, list[list[float]]] = field(default_factory=dict)
+    source: str = ""
+    title: str = ""
+    # YAML texts: of the scenario, and of the one whose estimator ran over the log afterwards.
+    scenario: str = ""
+    estimator_scenario: str = ""
+    outcome: Outcome | None = None
+    # Of a converted recording: the stretch that each file became ("start", "end" [s], and numbers
+    # and texts that the map keeps), and what was left out, in words.
+    segments: list[dict[str, Any]] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        require_positive(self, "period")
+        if len(set(self.joints)) != len(self.joints):
+            raise InputError("joints: a name is given twice")
+        for side, places in self.pads.items():
+            if any(len(place) != 3 for place in places):
+                raise InputError(f"pads.{side}: expected places of three coordinates")
+        for number, segment in enumerate(self.segments):
+            span = {key: segment.get(key) for key in ("start", "end")}
+            schema.build(dict[str, float], span, file=f"segments[{number}]")
 
 
 @dataclass(frozen=True)
@@ -44,10 +102,7 @@ class Log(Mapping[str, np.ndarray]):
     """
 
     channels: dict[str, np.ndarray]
-    # "joints": names in column order; "sides"; "legs": joints by side;
-    # "frames"; "pads": places in the sole frames [m]; "period" [s]; "source"; "title";
-    # "scenario": YAML text; "outcome"; "estimator_scenario": YAML text of the scenario whose estimator ran over the log afterwards.
-    # Of a converted recording: "segments": the stretch that each file became; "findings": what was left out, in words.
+    # See `LogMeta`; further keys are kept.
     meta: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -57,6 +112,7 @@ class Log(Mapping[str, np.ndarray]):
         for key in ("joints", "period"):
             if key not in self.meta:
                 raise InputError(f"meta has no {key}")
+        schema.build(LogMeta, self.meta, file="meta", further_keys=True)
         n, samples = len(self.meta["joints"]), len(self.channels["time"])
         if samples == 0:
             raise InputError("no samples")
@@ -144,7 +200,7 @@ class Log(Mapping[str, np.ndarray]):
 
         def write(partial: Path) -> None:
             with partial.open("wb") as file:
-                np.savez_compressed(file, meta=np.array(json.dumps(meta)), **self.channels)
+                np.savez_compressed(file, meta=np.array(to_json(meta)), **self.channels)
 
         write_atomically(Path(path), write)
 
@@ -156,21 +212,19 @@ class Log(Mapping[str, np.ndarray]):
             InputError: no such file, truncated, not a log, or another format version.
         """
         try:
-            file = np.load(path, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ValueError("a single array")
-            with file:
-                content = {name: file[name] for name in file.files}
+            content = read_npz(path)
         except OSError as error:
-            raise InputError(f"{path}: {error.strerror or 'not a log file (npz)'}") from None
-        except (zipfile.BadZipFile, ValueError, EOFError, zlib.error) as error:
+            raise InputError(f"{path}: {error.strerror or error}") from None
+        except ValueError as error:
             raise InputError(f"{path}: truncated or not a log file (npz): {error}") from None
         if "meta" not in content:
             raise InputError(f"{path}: not a log file: it has no meta")
         try:
-            meta = json.loads(str(content.pop("meta")))
-        except json.JSONDecodeError:
+            meta = from_json(str(content.pop("meta")))
+        except ValueError:
             raise InputError(f"{path}: meta is not JSON text") from None
+        if not isinstance(meta, dict):
+            raise InputError(f"{path}: meta: expected a mapping, found {schema.describe(meta)}")
         version = meta.pop("format_version", None)
         meta.pop("units", None)
         if version != FORMAT_VERSION:
@@ -178,7 +232,29 @@ class Log(Mapping[str, np.ndarray]):
                 f"{path}: log format version {version}, this program reads {FORMAT_VERSION}"
             )
         with located(f"{path}: "):
-            return cls(content, meta)
+            log = cls(content, meta)
+            check_recorded(log)
+        return log
+
+
+def check_recorded(log: Log) -> None:
+    """Checks what only a damaged recording is, however its numbers came about.
+
+    Raises:
+        InputError: numbers that nothing measurable has, or a period that is not that of the rows.
+    """
+    for name, values in log.items():
+        if (largest := float(np.abs(values).max(initial=0.0))) > schema.LARGEST_NUMBER:
+            raise InputError(
+                f"channel {name}: expected numbers of size at most {schema.LARGEST_NUMBER:g}, "
+                f"found {largest:g}"
+            )
+    periods = float(log.time[-1] - log.time[0]) / float(log.meta["period"])
+    if periods > _MOST_GAPS * len(log.time):
+        raise InputError(
+            f"meta.period: expected about the time between rows, found {log.meta['period']:g} s, "
+            f"{periods:g} times in all for {len(log.time)} rows"
+        )
 
 
 def joined(logs: Mapping[str, "Log"], gap: float = 1.0) -> Log:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fbse_drake.errors import InputError
-from fbse_drake.files import write_text
+from fbse_drake.files import origin, write_json, write_text
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, dump_scenario
 
@@ -79,13 +79,13 @@ class RunResult(Result):
 
         Raises:
             InputError: the folder cannot be made.
+            OSError: a file cannot be written; none is half-written.
         """
-        from fbse_drake.report.metrics import write_json
-
         out = made_folder(folder)
         self.log.save(out / "log.npz")
-        write_json(out / "metrics.json", self.metrics)
         write_text(out / "scenario.yaml", dump_scenario(self.scenario, self.name))
+        made_of = origin(log=out / "log.npz", scenario=out / "scenario.yaml")
+        write_json(out / "metrics.json", made_of | self.metrics)
         self.report(out / "report.html")
 
 

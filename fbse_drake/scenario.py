@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
-from pydrake.common.yaml import yaml_load
 from pydrake.multibody.plant import (
     ApplyMultibodyPlantConfig,
     MultibodyPlant,
@@ -25,7 +23,7 @@ from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.geometry import joint_shifts
 from fbse_drake.effects.inertia import inertia_changes
-from fbse_drake.effects.user import import_effect_modules
+from fbse_drake.effects.user import import_effect_modules, require_trusted
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs, beliefs_of
 from fbse_drake.estimators.estimator import Estimator, NoEstimator
@@ -229,6 +227,9 @@ def _plant_config() -> MultibodyPlantConfig:
 # Control, log and sensors tick at least this far apart, unless they are given a period [s].
 _USUAL_PERIOD = 0.001
 
+# Of the plant, in a simulation.
+_MOST_STEPS = 10**8
+
 T = TypeVar("T")
 
 
@@ -299,6 +300,11 @@ class Scenario:
             allowed = "sap, similar or lagged, which solve joint friction too"
             key = "plant.discrete_contact_approximation"
             raise InputError(f"{key}: expected {allowed}; found {approximation}")
+        if self.duration > _MOST_STEPS * self.plant.time_step:
+            raise InputError(
+                f"duration: expected at most {_MOST_STEPS:g} steps of plant.time_step = "
+                f"{self.plant.time_step:g} s, found {self.duration:g} s"
+            )
         # Frozen from here on: nobody has seen it yet.
         usual = self.usual_period
         object.__setattr__(self, "control", _with_period(self.control, usual))
@@ -418,10 +424,21 @@ def load_scenario(
 
 
 def read_scenario(
-    scenario: str | Path, name: str | None = None, overrides: Sequence[str] = ()
+    scenario: str | Path,
+    name: str | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    allow_code: bool = True,
 ) -> tuple[str, Scenario]:
-    """As `load_scenario`; returns the scenario's name as well."""
+    """As `load_scenario`; returns the scenario's name as well.
+
+    Args:
+        allow_code: may its `effect_modules` be run, also where the file came with a log or a
+            download?
+    """
     tree = ScenarioTree.read(scenario, name)
+    if not allow_code:
+        require_trusted(tree.path, tree.code)
     for override in overrides:
         tree = tree.overridden(override)
     return tree.name, tree.build()
@@ -475,6 +492,11 @@ class ScenarioTree:
         text = text or f"{key}={value}"
         return replace(self, tree=schema.merge(self.tree, value), changes=(*self.changes, text))
 
+    @property
+    def code(self) -> Any:
+        """The Python code that it runs, as its `effect_modules` say; empty or None if none."""
+        return self.tree.get("effect_modules") if isinstance(self.tree, dict) else None
+
     def build(self) -> Scenario:
         """The scenario; see `load_scenario`.
 
@@ -525,7 +547,7 @@ def dump_scenario(scenario: Scenario, name: str) -> str:
 
 def _from_text(text: str) -> Scenario:
     """Reads what `dump_scenario` wrote, with the modules that it names."""
-    tree = yaml_load(data=text)["scenario"]
+    tree = schema.parse(text, file="pickled scenario")["scenario"]
     import_effect_modules(tree.get("effect_modules", []), Path())
     return schema.build(Scenario, tree, file="pickled scenario")
 
@@ -536,7 +558,7 @@ def _override(text: str) -> tuple[str, Any]:
         raise InputError(
             f"--set {text}: expected KEY=VALUE, as in --set reference.step_length=0.05"
         )
-    try:
-        return key.strip(), yaml_load(data=f"value: {value}")["value"]
-    except yaml.YAMLError:
-        raise InputError(f"--set {text}: {value!r} is not valid YAML") from None
+    tree = schema.parse(f"value: {value}", file=f"--set {text}")
+    if list(tree) != ["value"]:
+        raise InputError(f"--set {text}: expected one value")
+    return key.strip(), tree["value"]

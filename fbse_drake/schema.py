@@ -9,13 +9,14 @@ import contextlib
 import dataclasses
 import difflib
 import math
+import textwrap
 import types
 import typing
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydrake.common.yaml import yaml_load_file
+from pydrake.common.yaml import yaml_load
 
 from fbse_drake.errors import InputError
 
@@ -23,28 +24,100 @@ T = TypeVar("T")
 
 _SCALARS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
+# No length, force, count or seed is larger; squares and ratios of such numbers are still numbers.
+LARGEST_NUMBER = 1e15
+# What somebody wrote by hand has fewer bytes, and fewer values once its aliases are written out.
+_LARGEST_FILE, _MOST_VALUES = 2**24, 10**6
+
 
 def load_tree(path: Path) -> dict[str, Any]:
     """Parses a YAML file; a tag becomes the key `_tag` of its mapping.
 
     Raises:
-        InputError: the file cannot be read, is no YAML or no mapping.
+        InputError: the file cannot be read, is too large, is no YAML or no mapping; see `parse`.
     """
     try:
-        tree = yaml_load_file(path)
+        if path.stat().st_size > _LARGEST_FILE:
+            raise InputError(f"{path}: expected at most {_LARGEST_FILE} bytes")
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
+    tree = parse(text, file=str(path))
+    if not isinstance(tree, dict):
+        raise InputError(f"{path}: expected a mapping of keys to values, found {describe(tree)}")
+    return tree
+
+
+def parse(text: str, *, file: str) -> Any:
+    """Parses YAML text into mappings with texts as keys, lists, texts, numbers, true, false and nothing.
+
+    Args:
+        file: where it stands, for messages.
+
+    Raises:
+        InputError: it is no YAML, has other types (as dates), or more values than anybody writes.
+    """
+    try:
+        _check_size(text, file)
+        tree = yaml_load(data=f"{text}\n")
+        _check_types(tree, file, "")
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark else ""
-        raise InputError(
-            f"{path}{where}: not valid YAML: {getattr(error, 'problem', error)}"
-        ) from None
-    if not isinstance(tree, dict):
-        raise InputError(f"{path}: expected a mapping of keys to values, found {_describe(tree)}")
+        problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+        raise InputError(f"{file}{where}: not valid YAML: {problem}") from None
+    except RecursionError:
+        raise InputError(f"{file}: not valid YAML: nested too deeply") from None
+    except ValueError as error:
+        # As of the 45th of a month.
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: not valid YAML: {error}") from None
     return tree
+
+
+def _check_size(text: str, file: str) -> None:
+    """Refuses aliases and merges that stand for more than anybody can have meant."""
+    counts: dict[int, int] = {}
+
+    def count(node: yaml.Node) -> int:
+        if id(node) not in counts:
+            # What holds itself is endless.
+            counts[id(node)] = _MOST_VALUES
+            children = node.value if isinstance(node, yaml.CollectionNode) else []
+            if isinstance(node, yaml.MappingNode):
+                children = [child for pair in children for child in pair]
+            counts[id(node)] = 1 + sum(map(count, children))
+        return counts[id(node)]
+
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    if root is None:
+        return
+    if count(root) > _MOST_VALUES:
+        raise InputError(f"{file}: not valid YAML: its aliases stand for too many values")
+    for key, _ in root.value if isinstance(root, yaml.MappingNode) else []:
+        if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
+            raise InputError(
+                f'{file}: expected a text as key, found {key.value}; write "{key.value}"'
+            )
+
+
+def _check_types(value: Any, file: str, key: str) -> None:
+    if isinstance(value, dict):
+        for name, item in value.items():
+            if not isinstance(name, str):
+                raise InputError(
+                    f'{file}: {key}: expected a text as key, found {name}; write "{name}"'
+                )
+            _check_types(item, file, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            _check_types(item, file, f"{key}[{i}]")
+    elif value is not None and not isinstance(value, bool | int | float | str):
+        kind = type(value).__name__
+        raise InputError(f"{file}: {key}: expected a text or a number, found the {kind} {value}")
 
 
 def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
@@ -64,17 +137,28 @@ def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def build(schema: type[T], tree: Any, *, file: str, key: str = "", default: T | None = None) -> T:
+def build(
+    schema: type[T],
+    tree: Any,
+    *,
+    file: str,
+    key: str = "",
+    default: T | None = None,
+    further_keys: bool = False,
+) -> T:
     """Builds an object of the dataclass `schema` from a parsed document.
 
     Args:
-        tree: what `load_tree` returned, or a part of it.
+        tree: what `load_tree` or `read_json` returned, or a part of it.
         file, key: where the tree stands, for messages.
         default: takes the place of the schema's own defaults.
+        further_keys: may the document say more than the schema? What it says more is left out.
 
     Raises:
         InputError: unknown key, wrong type or a value that the dataclass itself refuses.
     """
+    if further_keys:
+        tree = _known_part(schema, tree)
     return _build(schema, tree, default, f"{file}: ", key)
 
 
@@ -141,6 +225,19 @@ def _tagged(value: Any) -> Any:
     return _Tagged(value["_tag"], content) if "_tag" in value else content
 
 
+def _known_part(schema: Any, value: Any) -> Any:
+    """A tree without what a schema of dataclasses, lists and mappings does not have."""
+    origin, args = typing.get_origin(schema), typing.get_args(schema)
+    if origin in (list, tuple) and isinstance(value, list):
+        return [_known_part(args[0], item) for item in value]
+    if origin is dict and isinstance(value, dict):
+        return {key: _known_part(args[1], item) for key, item in value.items()}
+    if dataclasses.is_dataclass(schema) and isinstance(value, dict):
+        fields = _fields(schema)
+        return {k: _known_part(fields[k], item) for k, item in value.items() if k in fields}
+    return value
+
+
 def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
     if schema is Any:
         return value
@@ -152,19 +249,19 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
     if origin is typing.Literal:
         if value not in args:
             allowed = ", ".join(map(str, args))
-            raise InputError(f"{file}{key}: expected one of {allowed}; found {_describe(value)}")
+            raise InputError(f"{file}{key}: expected one of {allowed}; found {describe(value)}")
         return value
     if _alternatives(schema):
         return _alternative(_alternatives(schema), value, default, file, key)
     if origin is list:
         if not isinstance(value, (list, tuple)):
-            raise InputError(f"{file}{key}: expected a list, found {_describe(value)}")
+            raise InputError(f"{file}{key}: expected a list, found {describe(value)}")
         return [_build(args[0], item, None, file, f"{key}[{i}]") for i, item in enumerate(value)]
     if origin is tuple:
         return tuple(_build(list[args[0]], value, None, file, key))
     if origin is dict:
         if not isinstance(value, dict):
-            raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")
+            raise InputError(f"{file}{key}: expected a mapping, found {describe(value)}")
         old = default or {}
         items = {
             str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()
@@ -184,9 +281,14 @@ def _scalar(schema: type, value: Any, file: str, key: str) -> Any:
             value = float(value)  # YAML 1.1 reads 1e6 as a text
     matches = isinstance(value, schema) or (schema is float and isinstance(value, int))
     if not matches or (isinstance(value, bool) and schema is not bool):
-        raise InputError(f"{file}{key}: expected {_SCALARS[schema]}, found {_describe(value)}")
+        raise InputError(f"{file}{key}: expected {_SCALARS[schema]}, found {describe(value)}")
     if schema is float and not math.isfinite(value):
         raise InputError(f"{file}{key}: expected a finite number, found {value}")
+    if schema in (int, float) and abs(value) > LARGEST_NUMBER:
+        raise InputError(
+            f"{file}{key}: expected a number of size at most {LARGEST_NUMBER:g}, "
+            f"found {describe(value)}"
+        )
     return schema(value)
 
 
@@ -199,10 +301,12 @@ def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, 
             return _build(options[0], value, default, file, key)
     names = {option.__name__: option for option in options}
     tag = value.get("_tag") if isinstance(value, dict) else None
+    if not isinstance(tag, str | None):
+        raise InputError(f"{file}{key}._tag: expected a text, found {describe(tag)}")
     if tag is None and type(default) in options:
         tag = f"!{type(default).__name__}"
     if tag is None or tag[1:] not in names:
-        found = f"the tag {tag}" if tag else f"{_describe(value)} without a tag"
+        found = f"the tag {tag}" if tag else f"{describe(value)} without a tag"
         raise InputError(
             f"{file}{key}: expected one of {', '.join(f'!{name}' for name in names)}, found {found}"
         )
@@ -212,7 +316,7 @@ def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, 
 
 def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
     if not isinstance(value, collections.abc.Mapping):
-        raise InputError(f"{file}{key}: expected a mapping, found {_describe(value)}")
+        raise InputError(f"{file}{key}: expected a mapping, found {describe(value)}")
     fields = _fields(schema)
     content = {k: v for k, v in value.items() if k != "_tag"}
     prefix = f"{key}." if key else ""
@@ -260,11 +364,14 @@ def _fields(schema: Any) -> dict[str, Any]:
     return {field.name: field.type for field in schema.__fields__}
 
 
-def _describe(value: Any) -> str:
+def describe(value: Any) -> str:
+    """What a value of a document is, in a few words."""
     if value is None:
         return "nothing"
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list):
         return "a list"
-    return f"{value!r}"
+    if isinstance(value, int) and abs(value) > LARGEST_NUMBER:
+        return "a larger one"
+    return textwrap.shorten(repr(value), 80, placeholder="...")

@@ -19,6 +19,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, 
 from fbse_drake import signals
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
 from fbse_drake.effects.system import loss_over_time
+from fbse_drake.errors import InputError
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log
 from fbse_drake.results import RunResult
@@ -31,8 +32,8 @@ from fbse_drake.wiring import release
 
 # Why a run failed that was stopped by Ctrl-C.
 INTERRUPTED = "interrupted"
-# The run is looked at (fall, progress, interruption) this often in simulated time [s].
-_LOOK_PERIOD = 0.01
+# The run is looked at (fall, progress, interruption) this often in simulated time [s], and after so many steps of the plant.
+_LOOK_PERIOD, _LOOK_STEPS = 0.01, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +119,10 @@ def _simulate(
     views = state_views(diagram, context)
     failure, fell, start = None, False, clock.perf_counter()
     try:
-        looks = int(np.ceil(scenario.duration / _LOOK_PERIOD - 1e-9))
+        period = min(_LOOK_PERIOD, _LOOK_STEPS * scenario.plant.time_step)
+        looks = int(np.ceil(scenario.duration / period - 1e-9))
         for look in range(1, looks + 1):
-            simulator.AdvanceTo(min(look * _LOOK_PERIOD, scenario.duration))
+            simulator.AdvanceTo(min(look * period, scenario.duration))
             failure = fall_reason(station.robot, robot_context, scenario.fall, height)
             if failure is not None:
                 fell = True
@@ -212,6 +214,10 @@ def _make_log(
     ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
     # A run that diverges may end in rows that are not numbers.
     finite = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
+    if not finite.any():
+        raise InputError(
+            "the state is not finite from the start: values are too large or too small"
+        )
     ticks = dict(zip(names, np.split(record.data().T[finite], ends, axis=1), strict=True))
     velocity = _joint_velocity(robot, ticks["plant_state"])
     forces = (ticks["net_actuation"], ticks["explicit_force"])

@@ -1,20 +1,25 @@
 import functools
 import json
-import math
 import os
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from urllib.parse import urlparse
 
 import numpy as np
 import pytest
 
-from fbse_drake import Log, diagnose, load_scenario, simulate, study
+from fbse_drake import InputError, Log, diagnose, load_scenario, simulate, study
+from fbse_drake.campaign.campaign import load_campaign
 from fbse_drake.cli import BAD_INPUT, DONE, FAILED, main
+from fbse_drake.commands import _start_meshcat
+from fbse_drake.console import Console
 from fbse_drake.effects.effect import library
+from fbse_drake.effects.user import require_trusted
 from fbse_drake.schema import load_tree
 from fbse_drake.simulate import fall_reason
 
@@ -43,7 +48,7 @@ def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert metrics["simulated_time"] == pytest.approx(0.5)
     assert metrics["real_time_factor"] == pytest.approx(0.5 / metrics["wall_time"])
     assert set(metrics["joint_tracking_rms"]) == set(Log.load(tmp_path / "out/log.npz").joints)
-    assert math.isnan(metrics["friction_rmse"]["stance"]["left_hip_yaw"])
+    assert metrics["friction_rmse"]["stance"]["left_hip_yaw"] is None
     assert load_scenario(tmp_path / "out/scenario.yaml").seed == 4
     printed = capsys.readouterr().out
     assert "squat" in printed
@@ -302,7 +307,7 @@ def test_a_robot_without_effects_has_no_law_error(tmp_path: Path, capsys: pytest
     assert main(["simulate", "frictionless_walk", *options]) == DONE
     error = json.loads((tmp_path / "metrics.json").read_text())["friction_law_error"]
     assert len(error) == 12
-    assert all(math.isnan(value) for value in error.values())
+    assert all(value is None for value in error.values())
     printed = capsys.readouterr().out
     assert "its law" not in printed
     assert "nan" not in printed
@@ -341,14 +346,14 @@ def test_estimate_writes_everything_and_equals_the_live_estimates(
     )
     assert set(after) == set(before)
     assert 0.01 < after["friction_nrmse"]["swing"]["right_knee_pitch"] < 0.5
-    assert math.isnan(after["friction_nrmse"]["swing"]["left_knee_pitch"])
+    assert after["friction_nrmse"]["swing"]["left_knee_pitch"] is None
     for key in ("friction_rmse", "friction_nrmse"):
         for phase in ("stance", "swing"):
             assert after[key][phase] == pytest.approx(before[key][phase], nan_ok=True)
     assert after["friction_law_error"] == pytest.approx(before["friction_law_error"])
     assert after["attitude_rmse_deg"] == pytest.approx(before["attitude_rmse_deg"])
     assert 0 < after["tick_us"]["median"] <= after["tick_us"]["p99"]
-    assert math.isnan(before["tick_us"]["median"])
+    assert before["tick_us"]["median"] is None
     printed = capsys.readouterr().out
     for text in (
         "right_knee_pitch",
@@ -398,9 +403,9 @@ def test_a_recording_of_a_robot_is_enough(
     assert np.sqrt(np.mean(error**2)) < 0.6 * np.sqrt(np.mean(truth**2))
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["fell"], metrics["outcome"]) == (None, "recorded")
-    assert math.isnan(metrics["friction_nrmse"]["stance"]["left_knee_pitch"])
+    assert metrics["friction_nrmse"]["stance"]["left_knee_pitch"] is None
     assert metrics["tick_us"]["median"] > 0
-    assert all(math.isnan(value) for value in metrics["friction_law_error"].values())
+    assert all(value is None for value in metrics["friction_law_error"].values())
     assert "A recording of 1.00 s." in (out / "report.html").read_text()
     printed = capsys.readouterr().out
     assert "estimator tick" in printed
@@ -751,3 +756,28 @@ def test_hide_and_reveal(tmp_path: Path, capsys: pytest.CaptureFixture):
     (tmp_path / "answer.sealed").write_text("0 0")
     assert main(["reveal", str(tmp_path)]) == BAD_INPUT
     assert "damaged" in capsys.readouterr().err
+
+
+def test_code_that_came_with_a_log_is_not_run_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """A scenario whose module tells that it ran, alone and beside a log."""
+    (tmp_path / "mine.py").write_text("from pathlib import Path; raise OSError('it ran')")
+    (tmp_path / "mine.yaml").write_text("mine: {effect_modules: [mine.py]}")
+    (tmp_path / "many.yaml").write_text("steps: {one: !Call {function: mine.py:f, gives: {}}}")
+    command = ["simulate", str(tmp_path / "mine.yaml")]
+    assert main(command) == BAD_INPUT
+    assert "it ran" in capsys.readouterr().err
+    (tmp_path / "log.npz").touch()
+    assert main(command) == BAD_INPUT
+    refused = r"may have come with log\.npz, and it runs .*mine\.py.*--allow-code"
+    assert re.search(refused, capsys.readouterr().err)
+    with pytest.raises(InputError, match=refused):
+        require_trusted(tmp_path / "many.yaml", load_campaign(tmp_path / "many.yaml").code)
+    assert main([*command, "--allow-code"]) == BAD_INPUT
+    assert "it ran" in capsys.readouterr().err
+
+
+def test_meshcat_listens_on_this_machine_alone():
+    console = Console(quiet=True)
+    assert urlparse(_start_meshcat(console).web_url()).hostname == "localhost"

@@ -419,7 +419,7 @@ def test_reveal_scores_what_is_in_the_folder(tmp_path: Path):
     assert reveal(tmp_path).score.first
     (tmp_path / "study.json").write_text("{}")
     with pytest.raises(
-        InputError, match=r"study.json: not the contents of a study.json \(at 'diagnoses'\)"
+        InputError, match=r"study.json: not the contents of a study.json: .*diagnoses is missing"
     ):
         reveal(tmp_path)
 

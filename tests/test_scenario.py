@@ -73,6 +73,12 @@ def test_the_model_is_the_robot_without_its_effects():
     assert believed.effects == {}
 
 
+def bomb(begin: str, end: str) -> str:
+    """YAML each of whose lines stands for ten times as many values as the one before."""
+    lines = (f"a{i}: &a{i} {begin}{', '.join([f'*a{i - 1}'] * 10)}{end}" for i in range(1, 12))
+    return "\n".join(["a0: &a0 {x: 1}", *lines])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -152,6 +158,20 @@ def test_the_model_is_the_robot_without_its_effects():
         ("mine: [1, 2]", r"expected a mapping, found a list"),
         ("- 1", r"mine\.yaml: expected a mapping of keys to values, found a list"),
         ("mine: {a: [}", r"mine\.yaml:1: not valid YAML"),
+        ("mine: {title: 2020-01-01}", r"mine\.title: .* found the date 2020-01-01"),
+        ("mine: {duration: 2020-13-45}", r"mine\.yaml: not valid YAML: month must be in"),
+        ("mine: {seed: " + "9" * 5000 + "}", r"mine\.yaml: not valid YAML: Exceeds the limit"),
+        ("mine: {seed: 1" + "0" * 30 + "}", r"seed: expected a number of size at most 1e\+15"),
+        ("mine: {ground: {stiffness: 1e300}}", r"ground\.stiffness: .* of size at most 1e\+15"),
+        ("mine: {duration: 1e9}", r"duration: expected at most 1e\+08 steps of plant\.time_step"),
+        ("mine: {reference: !Walk {single_supports: 99999}}", r"single_supports: .* at most 10000"),
+        ("1: {}", r'mine\.yaml: expected a text as key, found 1; write "1"'),
+        ("mine: {1: {}}", r'mine\.yaml: mine: expected a text as key, found 1; write "1"'),
+        ("mine: {reference: {_tag: 5}}", r"reference\._tag: expected a text, found 5"),
+        ("mine: &me {robot: *me}", r"not valid YAML: its aliases stand for too many values"),
+        (bomb("[", "]"), r"not valid YAML: its aliases stand for too many values"),
+        (bomb("{<<: [", "]}"), r"not valid YAML: its aliases stand for too many values"),
+        ("mine: " + "[" * 5000 + "]" * 5000, r"not valid YAML: nested too deeply"),
     ],
 )
 def test_bad_input_gets_one_line_with_file_and_key(tmp_path: Path, text: str, message: str):
@@ -165,7 +185,7 @@ def test_bad_input_gets_one_line_with_file_and_key(tmp_path: Path, text: str, me
     [
         ("seed", r"--set seed: expected KEY=VALUE"),
         ("=3", r"--set =3: expected KEY=VALUE"),
-        ("seed={", r"--set seed=\{: .* is not valid YAML"),
+        ("seed={", r"--set seed=\{:1: not valid YAML: "),
         ("control.kp.hip=1", r"control\.kp\.hip: unknown joint"),
     ],
 )

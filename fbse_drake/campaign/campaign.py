@@ -10,7 +10,7 @@ from typing import Any
 from fbse_drake import schema
 from fbse_drake.campaign.columns import Column, design_column
 from fbse_drake.campaign.design import Design, Grid
-from fbse_drake.campaign.steps import Step, settings
+from fbse_drake.campaign.steps import Call, Step, settings
 from fbse_drake.errors import InputError, located
 from fbse_drake.scenario import ScenarioTree
 
@@ -84,6 +84,12 @@ class Campaign:
                 tree = tree.overridden(override)
             trees[name] = tree
         return trees
+
+    @property
+    def code(self) -> list[Any]:
+        """The Python code that it runs: functions of its steps, modules of its scenarios."""
+        functions = [step.function for step in self.steps.values() if isinstance(step, Call)]
+        return [*functions, *(tree.code for tree in self.trees.values() if tree.code)]
 
     @cached_property
     def runs(self) -> list[Run]:

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import (
+    InputError,
+    require_at_most,
+    require_not_negative,
+    require_positive,
+)
+
+# Of a campaign, in one scenario.
+_MOST_RUNS = 10**6
 
 
 @dataclass(frozen=True)
@@ -106,10 +114,14 @@ class Grid(Design):
 
     def __post_init__(self) -> None:
         require_positive(self, "seeds")
+        require_at_most(self, seeds=_MOST_RUNS)
         require_not_negative(self, "first_seed")
         for key, values in self.values.items():
             if not values:
                 raise InputError(f"values.{key}: expected at least one value, found none")
+        runs = self.seeds * math.prod(map(len, self.values.values()))
+        if runs > _MOST_RUNS:
+            raise InputError(f"values: expected at most {_MOST_RUNS} combinations, found {runs}")
 
     def points(self) -> Iterator[Point]:
         for seed in range(self.first_seed, self.first_seed + self.seeds):
@@ -129,6 +141,7 @@ class Random(Design):
 
     def __post_init__(self) -> None:
         require_positive(self, "runs")
+        require_at_most(self, runs=_MOST_RUNS)
         require_not_negative(self, "seed", "first_seed")
 
     def points(self) -> Iterator[Point]:

@@ -2,9 +2,12 @@
 
 import importlib
 import importlib.util
+import os
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from fbse_drake.errors import InputError
 
@@ -33,6 +36,39 @@ def import_effect_modules(entries: Iterable[str], folder: Path) -> list[str]:
             ) from None
         imported.append(name)
     return imported
+
+
+# What logs, exercises and recordings are called.
+_DATA = (".npz", ".sealed", ".mcap", ".db3", ".bag", ".mat", ".csv")
+# Where browsers and download tools note that a file came from elsewhere.
+_ORIGINS = ("user.xdg.origin.url", "com.apple.quarantine")
+
+
+def require_trusted(file: Path, code: Any) -> None:
+    """Refuses to run code that may be somebody else's.
+
+    Args:
+        file: that says what is to be run.
+        code: what it says; empty or None if nothing.
+
+    Raises:
+        InputError: the file was downloaded, or lies beside a log or a recording, with which it may
+            have come.
+    """
+    if code and (reason := _why_not_trusted(file)) is not None:
+        raise InputError(
+            f"{file}: this file {reason}, and it runs Python code ({code}); "
+            "--allow-code lets it, if you trust where it is from"
+        )
+
+
+def _why_not_trusted(file: Path) -> str | None:
+    attributes = getattr(os, "listxattr", lambda _: ())
+    with suppress(OSError):
+        if any(name in _ORIGINS for name in attributes(file)):
+            return "was downloaded"
+    beside = sorted(path.name for path in file.resolve().parent.iterdir() if path.suffix in _DATA)
+    return f"may have come with {beside[0]}" if beside else None
 
 
 def _import_file(path: str) -> None:

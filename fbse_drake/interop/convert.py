@@ -14,7 +14,7 @@ from fbse_drake.interop.bags import is_bag, open_bag
 from fbse_drake.interop.mapping import ChannelMap, LogMap, load_map
 from fbse_drake.interop.tables import Progress, Table, listed, open_table
 from fbse_drake.interop.units import si_factor
-from fbse_drake.log import Log
+from fbse_drake.log import Log, check_recorded
 
 # Sensors are interpolated between samples that are at most so many of their periods apart.
 _NEIGHBOURS = 3.0
@@ -444,7 +444,9 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
             for finding in r.findings
         ],
     }
-    return Log(channels, meta | ({"pads": log_map.pads} if log_map.pads else {}))
+    log = Log(channels, meta | ({"pads": log_map.pads} if log_map.pads else {}))
+    check_recorded(log)
+    return log
 
 
 def _chained(parts: Sequence[np.ndarray]) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.io
 
 from fbse_drake.errors import InputError
+from fbse_drake.npz import read_npz
 
 # Rows of a CSV file that are read at a time.
 _CHUNK = 65536
@@ -342,8 +343,7 @@ def _flattened(content: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def _open_npz(path: Path) -> Table:
-    with np.load(path, allow_pickle=False) as file:
-        return _table_of_arrays(path, {name: file[name] for name in file.files})
+    return _table_of_arrays(path, read_npz(path))
 
 
 def _table_of_arrays(path: Path, arrays: Mapping[str, Any]) -> Table:

@@ -674,14 +674,19 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
             if len(known) > 1
             else []
         )
-    if worst := _worst(comparison):
-        blocks += [
+    worst = _worst(comparison)
+    # A short log has no bins.
+    if binned := [channel for channel in worst if figures.binned_variables(channel)]:
+        blocks.append(
             FigureBlock(
                 "The worst channels against what they may depend on",
                 "Mean error in bins. Where the interval is narrow and away from zero, the error follows that variable; where it is "
                 "wide, the error depends on something else. A positive error means that the model's torque (or force) is too low.",
-                figures.error_bins(worst),
-            ),
+                figures.error_bins(binned),
+            )
+        )
+    if worst:
+        blocks += [
             FigureBlock(
                 "The worst channels over time",
                 f"Averages over {number(1e3 * motion.length * motion.period)} ms. Inside the grey band is what sensor noise explains.",

@@ -318,12 +318,14 @@ def _label(variable: str, row: Row) -> str:
     return _LABELS[row.unit][variable] if row.kind == "joint" else f"{variable} [N]"
 
 
+def binned_variables(channel: Channel) -> list[str]:
+    """The variables against which the channel's error is known in bins."""
+    return [name for name in channel.bins if name != "none" and channel.bins[name]]
+
+
 def error_bins(channels: Sequence[Channel]) -> Figure:
     """Mean error of channels against each variable, with its 95 % interval and the noise of the mean; a row for each channel."""
-    columns = [
-        [name for name in channel.bins if name != "none" and channel.bins[name]]
-        for channel in channels
-    ]
+    columns = [binned_variables(channel) for channel in channels]
     width = max(map(len, columns))
     figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * len(channels)), layout="constrained")
     grid = figure.subplots(len(channels), width, sharey="row", squeeze=False)

@@ -13,6 +13,7 @@ from pathlib import Path
 import jinja2
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from fbse_drake.files import write_text
 
@@ -131,6 +132,10 @@ def _png_uri(figure: Figure) -> str:
     # What `savefig` does, without its first drawing of a figure with a layout engine.
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     figure.set_dpi(_DPI)
+    # Dollars that are there before ticks are labelled stand in names: no figure of ours has formulas.
+    for text in figure.findobj(Text):
+        if "$" in text.get_text():
+            text.set_parse_math(False)
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")

@@ -4,17 +4,14 @@ Estimates are compared with the truth from `_SETTLING_TIME` on. Friction is that
 ends at `time[k]`, row k of the truth to the step that begins then.
 """
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from fbse_drake.files import write_text
 from fbse_drake.log import Log
 
 # A foot counts as standing while it carries at least this share of the weight.
@@ -39,7 +36,9 @@ class Consistency:
 
 
 def run_metrics(log: Log, wall_time: float, tick_time: np.ndarray | None = None) -> dict[str, Any]:
-    """Contents of metrics.json for a simulated log or one with estimates; NaN (and null for `fell`) where a figure does not apply.
+    """Contents of metrics.json for a simulated log or one with estimates.
+
+    What does not apply is NaN (None for `fell`), which becomes null in the file.
 
     Args:
         wall_time: time the run took [s].
@@ -358,8 +357,3 @@ def _rms(values: np.ndarray) -> np.ndarray:
     return (
         np.sqrt(np.mean(values**2, axis=0)) if len(values) else np.full(values.shape[1:], math.nan)
     )
-
-
-def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Writes JSON; what is not a number becomes `NaN`."""
-    write_text(Path(path), json.dumps(content, indent=2) + "\n")

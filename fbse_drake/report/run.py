@@ -35,10 +35,12 @@ def write_run_report(
         metrics: contents of metrics.json, see `run_metrics`.
         name: what the scenario is called.
     """
-    pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items()}
-    # A sole reaches at least as far as its pads.
+    pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items() if places}
+    # A sole reaches at least as far as its pads; those in one line have no outline.
     outlines = {
-        side: places[ConvexHull(places[:, :2]).vertices, :2] for side, places in pads.items()
+        side: places[ConvexHull(places[:, :2]).vertices, :2]
+        for side, places in pads.items()
+        if np.linalg.matrix_rank(np.diff(places[:, :2], axis=0)) == 2
     }
     figures = {
         topic: tuple(blocks)

@@ -395,8 +395,10 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
         else:
             parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
             ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
-    except (RuntimeError, ElementTree.ParseError) as error:
-        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
+    # Drake's parsers say it in several ways; where they do not, SystemExit stands for an assertion.
+    except (Exception, SystemExit) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{key}: {reason}") from None
 
 
 # What is not taken from a URDF: shapes, whose meshes need not be there; friction, which is an effect; actuators, which every joint has that

@@ -7,7 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PPoly
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import (
+    InputError,
+    require_at_most,
+    require_not_negative,
+    require_positive,
+)
 from fbse_drake.robot.plant import gravity_on_slope
 from fbse_drake.walking.lipm import LipmTrajectory, solve_lipm
 from fbse_drake.walking.plan import (
@@ -107,6 +112,7 @@ class Walk:
             raise InputError(
                 f"single_supports: expected a whole number >= 1, found {self.single_supports}"
             )
+        require_at_most(self, single_supports=10_000)
         require_not_negative(self, "step_height")
         if len(self.slope) != 2:
             raise InputError(f"slope: expected two numbers, found {self.slope}")

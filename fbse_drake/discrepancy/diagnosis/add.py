@@ -5,7 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.written import written_diagnosis
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.errors import InputError
@@ -20,26 +23,23 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
         effect: which effect of the ranking, on the targets where it explains most; by default all that the diagnosis chose.
 
     Raises:
-        InputError: the ranking has no such effect, or there is nothing to add.
+        InputError: these are not such contents, the ranking has no such effect, or there is nothing to add.
     """
-    try:
-        ranking = [
-            Finding(
-                entry["effect"],
-                tuple(entry["joints"]),
-                entry["held_out_before"],
-                entry["held_out_after"],
-                {
-                    name: Estimate(float(p["value"]), tuple(p["interval"]), p["unit"])
-                    for name, p in entry["parameters"].items()
-                },
-                tuple(entry["confusable_with"]),
-                entry["chosen"],
-            )
-            for entry in diagnosis["ranking"]
-        ]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"not the contents of a diagnosis.json (at {error})") from None
+    ranking = [
+        Finding(
+            entry.effect,
+            tuple(entry.joints),
+            np.nan if entry.held_out_before is None else entry.held_out_before,
+            np.nan if entry.held_out_after is None else entry.held_out_after,
+            {
+                name: Estimate(p.value, (p.interval[0], p.interval[1]), p.unit)
+                for name, p in entry.parameters.items()
+            },
+            tuple(entry.confusable_with),
+            entry.chosen,
+        )
+        for entry in written_diagnosis(diagnosis).ranking
+    ]
     named = [finding for finding in ranking if effect in (None, finding.effect)]
     findings = [finding for finding in named if finding.chosen] or (named[:1] if effect else [])
     if not findings:
@@ -95,7 +95,12 @@ def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:
     kind = library().get(name)
     if kind is None:
         raise InputError(f"the library has no effect {name} (there are: {', '.join(library())})")
+    if not values or set(values) - set(kind.parameters):
+        expected, found = ", ".join(kind.parameters), ", ".join(values) or "none"
+        raise InputError(f"effect {name}: expected the parameters {expected}; found {found}")
     targets = list(next(iter(values.values())))
+    if not targets or any(list(numbers) != targets for numbers in values.values()):
+        raise InputError(f"effect {name}: its parameters are not of the same joints")
     return kind.from_values(
         targets,
         {

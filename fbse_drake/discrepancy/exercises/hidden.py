@@ -1,9 +1,7 @@
 """Blind exercises: the log of a robot with physics that its model lacks, the answer sealed, and a score for whoever finds it."""
 
 import base64
-import binascii
 import hashlib
-import json
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,12 +10,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fbse_drake import schema
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.written import written_diagnosis, written_study
 from fbse_drake.discrepancy.exercises.sizes import SIZES, Size
 from fbse_drake.discrepancy.exercises.strangers import STRANGERS
 from fbse_drake.effects.effect import Effect, library, spaced
-from fbse_drake.errors import InputError
-from fbse_drake.files import write_text
+from fbse_drake.errors import InputError, located
+from fbse_drake.files import from_json, read_json, to_json, write_text
 from fbse_drake.log import Log
 from fbse_drake.results import made_folder
 from fbse_drake.robot.plant import Robot
@@ -31,6 +31,8 @@ Kind = Literal["library", "decoy", "stranger"]
 _SHARE = 1 / 8
 # A robot that falls gets half the size, this often.
 _HALVINGS = 6
+# A sealed answer that has more bytes is none.
+_LARGEST_ANSWER = 2**20
 # Step at which the reference is looked at [s].
 _COARSE = 0.01
 
@@ -215,6 +217,13 @@ class HiddenEffect:
     # By parameter and target.
     parameters: dict[str, dict[str, float]]
 
+    def __post_init__(self) -> None:
+        if not self.targets:
+            raise InputError("targets: expected at least one, found none")
+        for name, values in self.parameters.items():
+            if missing := [target for target in self.targets if target not in values]:
+                raise InputError(f"parameters.{name}: no value for {missing[0]}")
+
     @property
     def kind(self) -> type[Effect]:
         return (library() | STRANGERS)[self.effect]
@@ -234,6 +243,10 @@ class Answer:
     size: Size
     shrunk: float
     effects: tuple[HiddenEffect, ...]
+
+    def __post_init__(self) -> None:
+        if bool(self.effects) == (self.kind == "decoy"):
+            raise InputError(f"effects: expected some unless the kind is decoy, found {self.kind}")
 
 
 @dataclass(frozen=True)
@@ -466,7 +479,7 @@ def record(
 
 def seal(answer: Answer) -> str:
     """Text of an answer that nobody reads by accident: a checksum, then the answer."""
-    content = zlib.compress(json.dumps(asdict(answer)).encode())
+    content = zlib.compress(to_json(asdict(answer)).encode())
     return f"{hashlib.sha256(content).hexdigest()}\n{base64.b64encode(content).decode()}\n"
 
 
@@ -481,14 +494,13 @@ def unseal(text: str) -> Answer:
         data = base64.b64decode(content, validate=True)
         if hashlib.sha256(data).hexdigest() != checksum:
             raise ValueError
-        tree = json.loads(zlib.decompress(data))
-    except (ValueError, binascii.Error, zlib.error):
+        opened = zlib.decompressobj()
+        tree = from_json(opened.decompress(data, _LARGEST_ANSWER))
+        if not opened.eof:
+            raise ValueError
+    except (ValueError, zlib.error):
         raise InputError("the sealed answer is damaged") from None
-    effects = tuple(
-        HiddenEffect(**(effect | {"targets": tuple(effect["targets"])}))
-        for effect in tree["effects"]
-    )
-    return Answer(**(tree | {"effects": effects}))
+    return schema.build(Answer, tree, file="the sealed answer is damaged")
 
 
 def reveal(folder: Path) -> "Revealed":
@@ -499,21 +511,21 @@ def reveal(folder: Path) -> "Revealed":
     """
     path = folder / "answer.sealed"
     try:
-        answer = unseal(path.read_text())
+        answer = unseal(path.read_text(encoding="utf-8", errors="replace"))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; fbse hide makes one") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     for file in (folder / "study.json", folder / "diagnosis.json"):
         if file.exists():
-            try:
-                found = json.loads(file.read_text())
-                diagnoses = found["diagnoses"] if file.stem == "study" else [found]
-                return Revealed(answer, score(answer, diagnoses))
-            except (ValueError, KeyError, TypeError) as error:
-                raise InputError(
-                    f"{file}: not the contents of a {file.name} (at {error})"
-                ) from None
+            content = read_json(file)
+            with located(f"{file}: "):
+                diagnoses = (
+                    written_study(content).diagnoses
+                    if file.stem == "study"
+                    else [written_diagnosis(content)]
+                )
+            return Revealed(answer, score(answer, [asdict(diagnosis) for diagnosis in diagnoses]))
     return Revealed(answer, None)
 
 

@@ -1,0 +1,1 @@
+"""An attack on the commands: damaged, malicious and merely wrong files of every kind."""
