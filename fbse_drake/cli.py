@@ -3,6 +3,7 @@
 
 import argparse
 import errno
+import io
 import os
 import signal
 import sys
@@ -68,7 +69,8 @@ def entry() -> None:
             signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
     for stream in (sys.stdout, sys.stderr):
         # What a terminal of an old locale cannot show becomes a question mark.
-        stream.reconfigure(errors="replace")
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     status = main()
     try:
         sys.stdout.flush()

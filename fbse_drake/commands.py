@@ -565,7 +565,8 @@ def _start_meshcat(console: Console) -> Meshcat:
     # On this machine alone.
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     # From the right front, near enough for a robot.
-    meshcat.SetCameraPose(np.array([2.2, -2.2, 1.3]), np.array([0.2, 0.0, 0.5]))
+    camera, target = [2.2, -2.2, 1.3], [0.2, 0.0, 0.5]
+    meshcat.SetCameraPose(camera, target)  # type: ignore[arg-type]
     console.print(f"Watch the run at {meshcat.web_url()}")
     return meshcat
 
