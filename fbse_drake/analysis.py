@@ -183,7 +183,8 @@ class AnalysisResult(Result):
             for path, (_, log) in zip(inputs.tests, self._further_tests, strict=True):
                 log.save(path)
         write_text(out / "scenario.yaml", dump_scenario(self.case.scenario, self.case.name))
-        content = origin(log=Path(inputs.log), scenario=out / "scenario.yaml") | self.json()
+        made_of = origin([*map(Path, inputs.logs)], out / "scenario.yaml")
+        content = made_of | self.json()
         write_json(out / f"{self.file}.json", content)
         write_json(out / "metrics.json", content)
         if (completed := self._completed) is not None:

@@ -207,8 +207,12 @@ class _Given:
         (log,) = self.logs.values()
         return log
 
-    for further in result.further_tables():
-        console.print(_printed(further, given.inputs.name))
+    @property
+    def recordings(self) -> Log | dict[str, Log]:
+        """One log as it is, several by name."""
+        return self.logs if len(self.logs) > 1 else self.log
+
+
 def _read_scenario(options: argparse.Namespace) -> tuple[str, Scenario]:
     """The scenario and its name; says whose code it runs."""
     name, scenario = read_scenario(
@@ -220,9 +224,12 @@ def _read_scenario(options: argparse.Namespace) -> tuple[str, Scenario]:
     return name, scenario
 
 
-def _scenario_and_log(options: argparse.Namespace, suffix: str) -> _Given:
+def _scenario_and_logs(options: argparse.Namespace, paths: Sequence[Path], suffix: str) -> _Given:
     name, scenario = _read_scenario(options)
-    log = read_log(options.log, options.map)
+    if len(set(paths)) < len(paths):
+        raise InputError(f"{paths[0]}: a log is given twice")
+    alike = len({path.stem for path in paths}) < len(paths)
+    logs = {str(path) if alike else path.stem: read_log(path, options.map) for path in paths}
     out = _output_folder(options, suffix)
     inputs = Inputs(
         name,
@@ -359,7 +366,7 @@ def _hide(options: argparse.Namespace) -> bool:
 def _reveal(options: argparse.Namespace) -> bool:
     revealed = reveal(options.folder)
     answer = revealed.answer
-    made_by = origin(log=None, scenario=None)
+    made_by = origin()
     write_json(options.folder / "answer.json", made_by | revealed.json())
     console = Console(quiet=options.quiet)
     table = Table(
@@ -482,7 +489,7 @@ def _rivals(options: argparse.Namespace) -> bool:
     text = dump_scenario(scenario, name)
     write_text(out / "scenario.yaml", text)
     settings = {"seeds": options.seeds, "trials": options.trials}
-    made_of = origin(log=None, scenario=out / "scenario.yaml")
+    made_of = origin(scenario=out / "scenario.yaml")
     for file in ("rivals", "metrics"):
         write_json(out / f"{file}.json", made_of | settings | comparison_json(comparison))
     with console.status("writing the report"):

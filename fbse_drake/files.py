@@ -6,7 +6,7 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from io import BufferedWriter
@@ -120,21 +120,22 @@ def from_json(text: str | bytes) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def origin(*, log: Path | None, scenario: Path | None) -> dict[str, Any]:
+def origin(logs: Sequence[Path] = (), scenario: Path | None = None) -> dict[str, Any]:
     """Keys that say what a JSON file was made by, and of what.
 
     Args:
-        log, scenario: what it was made of, if anything.
+        logs, scenario: what it was made of, if anything.
+
+    Returns:
+        The versions, and the hashes of what it was made of: `log_sha256`, one for each log, and
+        `scenario_sha256`.
     """
-    hashes = {
-        f"{name}_sha256": _sha256(path)
-        for name, path in (("log", log), ("scenario", scenario))
-        if path is not None
-    }
+    hashes = {"log_sha256": [_sha256(path) for path in logs]} if logs else {}
+    made_of = hashes if scenario is None else hashes | {"scenario_sha256": _sha256(scenario)}
     return {
         "schema_version": SCHEMA_VERSION,
         "package_version": version("fbse_drake"),
-        **hashes,
+        **made_of,
     }
 
 

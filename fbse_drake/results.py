@@ -84,7 +84,7 @@ class RunResult(Result):
         out = made_folder(folder)
         self.log.save(out / "log.npz")
         write_text(out / "scenario.yaml", dump_scenario(self.scenario, self.name))
-        made_of = origin(log=out / "log.npz", scenario=out / "scenario.yaml")
+        made_of = origin([out / "log.npz"], out / "scenario.yaml")
         write_json(out / "metrics.json", made_of | self.metrics)
         self.report(out / "report.html")
 

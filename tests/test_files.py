@@ -53,13 +53,13 @@ def test_a_file_says_what_it_was_made_of(tmp_path: Path):
     (tmp_path / "bag/1").write_text("ab")
     (tmp_path / "bag/2").write_text("c")
     (tmp_path / "scenario.yaml").write_text("abc")
-    made_of = origin(log=tmp_path / "bag", scenario=tmp_path / "scenario.yaml")
+    made_of = origin([tmp_path / "bag"], tmp_path / "scenario.yaml")
     # That of "abc" is in the standard, FIPS 180-2.
     assert made_of["scenario_sha256"].startswith("ba7816bf8f01cfea414140de5dae2223")
-    assert made_of["log_sha256"] == made_of["scenario_sha256"]
+    assert made_of["log_sha256"] == [made_of["scenario_sha256"]]
     assert made_of["schema_version"] == 1
     assert made_of["package_version"]
-    assert "log_sha256" not in origin(log=None, scenario=None)
+    assert "log_sha256" not in origin()
 
 
 KILLED = """
