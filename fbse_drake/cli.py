@@ -463,6 +463,22 @@ def _parser() -> argparse.ArgumentParser:
 
     run = _add_command(
         commands,
+        "init",
+        help="make a robot of yours ready: description, scenario, map, picture",
+        description="Proposes what must be said of a robot from its URDF, writes it with a "
+        "scenario that runs, and tries that. A robot on two legs of six joints squats; of any "
+        "other the joints swing.",
+        examples=("fbse init my_robot.urdf", "fbse init robots/g1.urdf --name g1 --out g1"),
+    )
+    run.add_argument("urdf", metavar="URDF", type=Path, help="the robot's model")
+    run.add_argument("--name", help="what the robot is called (default: as the file)")
+    run.add_argument(
+        "--out", metavar="DIR", type=Path, help="where the files go (default: the robot's name)"
+    )
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = _add_command(
+        commands,
         "list",
         help="what there is: scenarios, effects, estimators, sensors",
         description="Lists what a scenario can be made of, a line for each.",

@@ -32,6 +32,7 @@ from fbse_drake.effects.user import require_trusted
 from fbse_drake.errors import InputError, located, on_one_line
 from fbse_drake.estimate import estimate
 from fbse_drake.files import origin, read_json, to_json, write_atomically, write_json, write_text
+from fbse_drake.init_robot import init_robot
 from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
@@ -515,6 +516,27 @@ def _write_lines(path: Path, lines: Sequence[Sequence[object]]) -> None:
         csv.writer(file).writerows(lines)
 
 
+def _init(options: argparse.Namespace) -> bool:
+    console = Console(quiet=options.quiet)
+    with console.status("looking at the robot"):
+        made = init_robot(options.urdf, options.out, name=options.name)
+    table = Table(title=made.description.stem, show_header=False, title_justify="left")
+    for what, path in (
+        ("description", made.description),
+        ("scenario", made.scenario),
+        ("map of recordings", made.log_map),
+        ("picture", made.picture),
+    ):
+        table.add_row(what, Text(str(path)))
+    console.print(table)
+    for remark in made.remarks:
+        console.print(remark, highlight=False, markup=False, soft_wrap=True)
+    for problem in made.problems:
+        print(f"fbse: {made.scenario}: {problem}", file=sys.stderr)
+    console.print(f"Next: fbse simulate {made.scenario}", highlight=False, soft_wrap=True)
+    return not made.problems
+
+
 def _list(options: argparse.Namespace) -> bool:
     kinds = [options.what] if options.what else LISTED
     found = {kind: listing(kind) for kind in kinds}
@@ -667,6 +689,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "reveal": _reveal,
     "campaign": _campaign,
     "table": _table,
+    "init": _init,
     "list": _list,
     "rivals": _rivals,
 }

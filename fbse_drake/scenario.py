@@ -512,10 +512,22 @@ class ScenarioTree:
             with located(f"{where}: "):
                 modules = import_effect_modules(entries, self.path.parent)
             tree = {**tree, "effect_modules": modules}
-        result = schema.build(Scenario, tree, file=where)
+        result = schema.build(Scenario, self._with_places(tree), file=where)
         with located(f"{where}: "):
             check_joints(result)
         return result
+
+    def _with_places(self, tree: Any) -> Any:
+        """With the paths of descriptions that lie beside the file."""
+        if not isinstance(tree, dict):
+            return tree
+        found = {}
+        for key in ("robot", "model"):
+            config = tree.get(key)
+            name = config.get("description") if isinstance(config, dict) else None
+            if isinstance(name, str) and (self.path.parent / name).is_file():
+                found[key] = {**config, "description": str((self.path.parent / name).resolve())}
+        return {**tree, **found}
 
 
 def check_joints(scenario: Scenario) -> None:

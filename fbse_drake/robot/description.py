@@ -44,6 +44,22 @@ class Leg:
 
 
 @dataclass(frozen=True)
+class AddedFrame:
+    """A frame that the model lacks, fixed to a body of it."""
+
+    body: str
+    # Of its origin, in the body's frame [m].
+    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    # Roll, pitch and yaw against the body's frame [rad].
+    rotation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        for key in ("translation", "rotation"):
+            if len(getattr(self, key)) != 3:
+                raise InputError(f"{key}: expected three numbers, found {getattr(self, key)}")
+
+
+@dataclass(frozen=True)
 class RobotDescription:
     """Names of a robot's parts in its model; read from YAML by `load_description`.
 
@@ -66,6 +82,8 @@ class RobotDescription:
     joints: list[str] = field(default_factory=list)
     # Angles [rad] (or places [m]) of joints that are not named above; 0 by default.
     held: dict[str, float] = field(default_factory=dict)
+    # Frames that the model lacks, by name, as those of soles.
+    frames: dict[str, AddedFrame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if bool(self.directives) == bool(self.urdf):

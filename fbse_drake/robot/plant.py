@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cached_property
 from os.path import expandvars
 from pathlib import Path
@@ -11,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, SceneGraph, Sphere
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -24,6 +25,7 @@ from pydrake.multibody.tree import (
     Frame,
     Joint,
     JointActuator,
+    ModelInstanceIndex,
     PrismaticJoint,
     RevoluteJoint,
     RigidBody,
@@ -38,6 +40,10 @@ from fbse_drake.errors import InputError, located, require_not_negative, require
 from fbse_drake.robot.description import Leg, RobotDescription, load_description
 from fbse_drake.robot.implicit import ImplicitTorque, add_implicit_torque, clamp_name
 
+# The instance that holds a robot's model: the first after Drake's own two.
+_MODEL = ModelInstanceIndex(2)
+# So many names are offered in the place of a wrong one.
+_NAMED = 12
 # Between a body's name and the number in the names of the bodies that carry its point masses.
 _POINT_MASS = "_point_mass_"
 # A corner of a foot with a six-axis sensor touches the ground in one point, and is far stiffer than any ground.
@@ -340,6 +346,7 @@ def make_robot(
     plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), diagram)
     with located(f"{path}: "):
         _add_model(plant, names, path)
+        _add_frames(plant, names)
         _check_names(plant, names)
         _hold_other_joints(plant, names)
     _shift_joints(plant, joint_shifts or {})
@@ -391,7 +398,7 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
     parser = Parser(plant)
     try:
         if names.urdf:
-            parser.AddModelsFromString(_bare(source), "urdf")
+            parser.AddModelsFromString(bare_urdf(source), "urdf")
         else:
             parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
             ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
@@ -406,13 +413,48 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
 _NOT_TAKEN = ("visual", "collision", "dynamics", "transmission", "mimic")
 
 
-def _bare(urdf: Path) -> str:
-    """A URDF with bodies, joints and frames only."""
+def bare_urdf(urdf: Path) -> str:
+    """A URDF with bodies, joints and frames only.
+
+    Limits of which the lower one is the upper one are none: who writes 0 and 0 did not know them.
+    """
     root = ElementTree.parse(urdf).getroot()
     for element in [root, *root.iter("link"), *root.iter("joint")]:
         for part in [part for part in element if part.tag in _NOT_TAKEN]:
             element.remove(part)
+    for joint in root.iter("joint"):
+        limit = joint.find("limit")
+        if joint.get("type") == "revolute" and limit is not None:
+            low, high = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+            if low == high:
+                joint.set("type", "continuous")
+                for end in ("lower", "upper"):
+                    limit.attrib.pop(end, None)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _add_frames(plant: MultibodyPlant, names: RobotDescription) -> None:
+    for name, frame in names.frames.items():
+        if not plant.HasBodyNamed(frame.body):
+            raise InputError(f"frames.{name}.body: {_no_such(plant, 'body', frame.body)}")
+        if plant.HasFrameNamed(name):
+            raise InputError(f"frames.{name}: the model has a frame of this name already")
+        body = plant.GetBodyByName(frame.body)
+        X_BF = RigidTransform(RollPitchYaw(frame.rotation), frame.translation)
+        plant.AddFrame(FixedOffsetFrame(name, body.body_frame(), X_BF, body.model_instance()))
+
+
+def _no_such(plant: MultibodyPlant, kind: str, name: str) -> str:
+    """That the model lacks something of this name, and the nearest names that it has."""
+    known = {
+        "body": lambda: (plant.get_body(k).name() for k in plant.GetBodyIndices(_MODEL)),
+        "frame": lambda: (plant.get_frame(k).name() for k in plant.GetFrameIndices(_MODEL)),
+        "joint": lambda: (plant.get_joint(k).name() for k in plant.GetJointIndices(_MODEL)),
+    }[kind.split()[-1]]()
+    names = sorted(known)
+    near = get_close_matches(name, names, n=_NAMED, cutoff=0.0) if len(names) > _NAMED else names
+    more = ", ..." if len(near) < len(names) else ""
+    return f"the model has no {kind} called {name} (there are: {', '.join(near)}{more})"
 
 
 def _moving_joints(plant: MultibodyPlant) -> list[Joint]:
@@ -433,7 +475,7 @@ def _is_carried(plant: MultibodyPlant, body: str) -> bool:
 def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
     def check(key: str, name: str, exists: bool, kind: str) -> None:
         if not exists:
-            raise InputError(f"{key}: the model has no {kind} called {name}")
+            raise InputError(f"{key}: {_no_such(plant, kind, name)}")
 
     check("base", names.base, plant.HasBodyNamed(names.base), "body")
     if names.imu:

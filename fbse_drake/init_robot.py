@@ -1,0 +1,323 @@
+"""Makes a robot ready to be simulated: description, scenario and recording map from a URDF."""
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+
+from fbse_drake.errors import InputError
+from fbse_drake.files import write_atomically, write_text
+from fbse_drake.log import Log
+from fbse_drake.report.robot_figure import robot_figure
+from fbse_drake.robot.description import RobotDescription
+from fbse_drake.robot.plant import Robot, make_robot
+from fbse_drake.robot.proposal import propose
+from fbse_drake.scenario import load_scenario
+from fbse_drake.simulate import simulate
+from fbse_drake.walking.reference import Reference, make_reference
+from fbse_drake.walking.stand import Squat
+
+# How far below its height with straight legs the centre of mass is tried to stand.
+_HEIGHTS = np.arange(0.98, 0.7, -0.02)
+# One deeper than the highest that is possible leaves the knees room to move.
+_DEEPER = 0.02
+# Amplitude of the squat over the height of the centre of mass; how often and how long.
+_AMPLITUDE, _FREQUENCY, _DURATION = 0.02, 0.5, 4.0
+# Position gain over what a joint that carries the whole robot like a pendulum needs to hold it.
+_STIFFNESS = 7.0
+# The motors' rotors make a joint as fast as this with that gain [rad/s]; damping over gain [s].
+_BANDWIDTH, _DAMPING = 160.0, 0.007
+# Amplitude and frequency of joints that swing [rad], [Hz].
+_SWING, _SWING_FREQUENCY = 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was written, and what was found out."""
+
+    description: Path
+    scenario: Path
+    log_map: Path
+    picture: Path
+    # In words; and what speaks against the robot as it is.
+    remarks: list[str]
+    problems: list[str]
+
+
+def init_robot(urdf: Path, out: Path | None = None, *, name: str | None = None) -> Made:
+    """Proposes description, scenario and recording map of a robot, writes and tries them.
+
+    Args:
+        urdf: the robot's URDF.
+        out: the folder that they are written to, which is made if need be; by default one that is
+            called like the robot.
+        name: what the robot is called; by default as the URDF's file.
+
+    Raises:
+        InputError: no URDF, a foot that cannot be found, or a description that exists already.
+    """
+    name = name or urdf.stem
+    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name):
+        raise InputError(f"--name {name}: expected letters, digits, _ and -")
+    folder = out or Path(name)
+    folder.mkdir(parents=True, exist_ok=True)
+    description = folder / f"{name}.yaml"
+    if description.exists():
+        raise InputError(f"{description}: this exists already, and may have been edited")
+    proposal = propose(urdf, _path_from(urdf, folder))
+    write_text(description, _description_text(proposal.description, name, proposal.remarks))
+    try:
+        robot, _ = make_robot(description)
+        legged = bool(proposal.description.legs)
+        stands = _standing(robot) if legged else None
+        text = _squat(robot, name, stands) if stands else _swing(robot, name)
+        posture = stands[1].joint_position[0] if stands else np.zeros(len(robot.joint_names))
+    except BaseException:
+        description.unlink()
+        raise
+    scenario = folder / f"{name}_{'squat' if stands else 'swing'}.yaml"
+    write_text(scenario, text)
+    log_map = folder / f"{name}.map.yaml"
+    write_text(log_map, _map_text(robot))
+    figure = robot_figure(robot, posture)
+    picture = folder / f"{name}.png"
+    write_atomically(picture, lambda partial: _save(figure, partial))
+    remarks, problems = _tried(scenario)
+    return Made(description, scenario, log_map, picture, [*proposal.remarks, *remarks], problems)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, format="png", dpi=120)
+
+
+def _path_from(urdf: Path, folder: Path) -> str:
+    """How a file in the folder names the URDF: by its place from there, if that is near."""
+    relative = os.path.relpath(urdf.resolve(), folder.resolve())
+    return relative if relative.count("..") < 3 else str(urdf.resolve())
+
+
+def _standing(robot: Robot) -> tuple[Squat, Reference] | None:
+    """A squat that the robot can do, and its motion.
+
+    Raises:
+        InputError: the legs do not reach the ground from any height, or their joints' limits
+            forbid it; says what is in the way at the last one that was tried.
+    """
+    context = robot.plant.CreateDefaultContext()
+    robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
+    soles = {
+        side: robot.sole(side).CalcPose(context, robot.base.body_frame()).translation()
+        for side in robot.description.sides
+    }
+    com = robot.plant.CalcCenterOfMassPositionInWorld(context)
+    base = robot.plant.EvalBodyPoseInWorld(context, robot.base).translation()
+    straight = float((com - base)[2] - min(place[2] for place in soles.values()))
+    left, right = soles.values()
+    centres = [robot.pad_positions(side)[:, 0] for side in robot.description.sides]
+    squat = Squat(
+        amplitude=round(_AMPLITUDE * straight, 4),
+        frequency=_FREQUENCY,
+        ramp=1.0,
+        foot_spacing=round(float(abs(left[1] - right[1])), 4),
+        zmp_forward=round(float(np.mean([0.5 * (x.min() + x.max()) for x in centres])), 4),
+        zmp_margin=round(0.2 * min(float(np.ptp(x)) for x in centres), 4),
+    )
+    time = np.arange(0.0, _DURATION, 0.05)
+    reason: InputError | None = None
+    for share in _HEIGHTS:
+        higher, lower = (
+            replace(squat, com_height=round(straight * float(s), 3))
+            for s in (share, share - _DEEPER)
+        )
+        try:
+            make_reference(higher, robot, time)
+            return lower, make_reference(lower, robot, time)
+        except InputError as error:
+            reason = error
+    raise InputError(f"the robot cannot stand with level feet: {reason}")
+
+
+def _gain(robot: Robot, arm: float) -> float:
+    """Position gain of all joints [Nm/rad]: a round number.
+
+    Args:
+        arm: how far the robot's weight reaches [m].
+    """
+    mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+    gravity = float(np.linalg.norm(robot.plant.gravity_field().gravity_vector()))
+    return float(f"{_STIFFNESS * mass * gravity * arm:.1e}")
+
+
+_SCENARIO = """\
+# Made by fbse init: {what}. Try it: fbse simulate {file}
+# Then hide something in it, and find it: fbse hide {file} --seed 1 --out mystery
+{name}:
+  title: {title}
+  duration: {duration:g}
+  reference: {reference}
+  robot: &robot
+    description: {robot}.yaml{hanging}
+    # Of motors and gears, as they act on the joints [kg m^2]. A guess: put in those of your drives.
+    rotor_inertia: {{all: {inertia:.2g}}}
+    # What really acts in the robot; `fbse list effects` says what there is.
+    effects: {{}}
+  # What is believed of it: here all.
+  model: *robot
+  # Noise of usual sensors, standard deviations of a sample.
+  sensors:
+    encoders: {{resolution: 4.8e-5, velocity_noise: 5.0e-4}}
+    imu: {{acceleration_noise: 0.02, angular_velocity_noise: 1.0e-3}}
+    foot_force: {{noise: 0.5, moment_noise: 0.02}}
+  # Of the position loops [Nm/rad], [Nms/rad]. A guess from the robot's weight.
+  control: {{kp: {{all: {kp:g}}}, kd: {{all: {kd:.3g}}}}}
+"""
+
+
+def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
+    squat, _ = stands
+    kp = _gain(robot, squat.com_height)
+    words = ", ".join(
+        f"{key}: {getattr(squat, key):g}"
+        for key in (
+            "amplitude",
+            "frequency",
+            "ramp",
+            "com_height",
+            "foot_spacing",
+            "zmp_forward",
+            "zmp_margin",
+        )
+    )
+    return _SCENARIO.format(
+        what="both feet stand, the body goes up and down",
+        file=f"{name}_squat.yaml",
+        name=f"{name}_squat",
+        title=f"{name} squats.",
+        duration=_DURATION,
+        reference=f"!Squat {{{words}}}",
+        robot=name,
+        hanging="",
+        inertia=kp / _BANDWIDTH**2,
+        kp=kp,
+        kd=_DAMPING * kp,
+    )
+
+
+def _swing(robot: Robot, name: str) -> str:
+    """Every joint swings about the middle of its range, or about 0 if that is inside."""
+    joints = [robot.plant.GetJointByName(joint) for joint in robot.joint_names]
+    limits = [(j.position_lower_limits()[0], j.position_upper_limits()[0]) for j in joints]
+    posture = {
+        joint.name(): round(float(0.5 * (low + high)), 3)
+        for joint, (low, high) in zip(joints, limits, strict=True)
+        if not low + _SWING < 0.0 < high - _SWING
+    }
+    context = robot.plant.CreateDefaultContext()
+    origin = robot.plant.EvalBodyPoseInWorld(context, robot.base).translation()
+    bodies = robot.plant.GetBodyIndices(robot.base.model_instance())
+    places = [
+        robot.plant.EvalBodyPoseInWorld(context, robot.plant.get_body(k)).translation() - origin
+        for k in bodies
+    ]
+    reach = max(float(np.linalg.norm(place)) for place in places)
+    kp = _gain(robot, max(0.5 * reach, 0.1))
+    reference = yaml.safe_dump(
+        {
+            "posture": posture,
+            "amplitude": {"all": _SWING},
+            "frequency": {"all": _SWING_FREQUENCY},
+        },
+        default_flow_style=True,
+        width=1000,
+    ).strip()
+    return _SCENARIO.format(
+        what="the base is held, every joint swings",
+        file=f"{name}_swing.yaml",
+        name=f"{name}_swing",
+        title=f"{name} swings its joints; its base is held.",
+        duration=_DURATION,
+        reference=f"!JointSines {reference}",
+        robot=name,
+        hanging=f"\n    gantry_height: {2 * reach:.2f}",
+        inertia=kp / _BANDWIDTH**2,
+        kp=kp,
+        kd=_DAMPING * kp,
+    )
+
+
+def _tried(path: Path) -> tuple[list[str], list[str]]:
+    """What the scenario shows, and what goes wrong in it."""
+    try:
+        run = simulate(load_scenario(path))
+    except InputError as error:
+        return [], [f"it cannot be simulated: {error}"]
+    if run.failure is not None:
+        return [], [run.failure]
+    error = run.metrics["joint_tracking_rms"]
+    worst = max(error, key=lambda joint: error[joint])
+    remarks = [f"It follows its plan within {1e3 * error[worst]:.2g} mrad rms ({worst})."]
+    if run.log.sides:
+        remarks.append(_weight_text(run.log))
+    return remarks, []
+
+
+def _weight_text(log: Log) -> str:
+    loads = {side: log[f"foot/{side}/wrench"][1:, 5].mean() for side in log.sides}
+    return "It stands: " + ", ".join(
+        f"{load:.0f} N on the {side} foot" for side, load in loads.items()
+    )
+
+
+def _description_text(description: RobotDescription, name: str, remarks: list[str]) -> str:
+    tree = _given(asdict(description))
+    # Names from the URDF cannot end a comment.
+    lines = [f"# {name}, as fbse init proposes it."]
+    lines += [f"# {' '.join(remark.split())}" for remark in remarks]
+    body = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
+    return "\n".join([*lines, body])
+
+
+def _given(value: Any) -> Any:
+    """Without what says nothing."""
+    if not isinstance(value, dict):
+        return value
+    content = {key: _given(item) for key, item in value.items()}
+    return {key: item for key, item in content.items() if item not in ("", [], {}, False)}
+
+
+_MAP_HEADER = """\
+# What the columns of a recording mean; rename them, and take out what yours has not.
+# A bag with standard messages needs no map. Use: fbse convert run.csv run.npz --map FILE
+"""
+
+
+def _map_text(robot: Robot) -> str:
+    """A map of a table with a column for each number."""
+    joints = robot.joint_names
+
+    def channel(kind: str, names: Sequence[str], unit: str) -> dict[str, Any]:
+        return {"columns": [f"{kind}_{name}" for name in names], "unit": unit}
+
+    channels = {
+        "joint/position": channel("position", joints, "rad"),
+        "joint/velocity": channel("velocity", joints, "rad/s"),
+        "joint/torque_command": channel("torque", joints, "Nm"),
+    }
+    if robot.description.legs:
+        channels["imu/linear_acceleration"] = channel("acc", "xyz", "m/s^2")
+        channels["imu/angular_velocity"] = channel("gyro", "xyz", "rad/s")
+    six = ("mx", "my", "mz", "fx", "fy", "fz")
+    for side in robot.description.sides:
+        channels[f"foot/{side}/wrench"] = {"columns": [f"{side}_{axis}" for axis in six]}
+    tree = {
+        "joints": joints,
+        "time": {"column": "time", "unit": "s"},
+        "channels": channels,
+    }
+    return _MAP_HEADER + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
