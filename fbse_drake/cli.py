@@ -487,6 +487,15 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("what", choices=LISTED, nargs="?", help="list these alone")
     run.add_argument("--json", action="store_true", help="print JSON: a text by name, by kind")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = _add_command(
+        commands,
+        "schema",
+        help="what a scenario file can say, as a JSON schema for editors",
+        description="Prints the JSON schema of scenario files: keys, types and what they mean.",
+        examples=("fbse schema > scenario.schema.json",),
+    )
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 

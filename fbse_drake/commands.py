@@ -38,6 +38,7 @@ from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, ProgressLines
+from fbse_drake.reference import json_schema
 from fbse_drake.report.discrepancy import Inputs, findings_table, parameter_text
 from fbse_drake.report.discrepancy_figures import targets_text
 from fbse_drake.report.html import Table as ReportTable
@@ -552,6 +553,12 @@ def _list(options: argparse.Namespace) -> bool:
     return True
 
 
+def _schema(options: argparse.Namespace) -> bool:
+    if not options.quiet:
+        print(json.dumps(json_schema(), indent=2))
+    return True
+
+
 @contextmanager
 def _extra_installed(what: str) -> Iterator[None]:
     """Says what to install if an import inside fails."""
@@ -691,5 +698,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "table": _table,
     "init": _init,
     "list": _list,
+    "schema": _schema,
     "rivals": _rivals,
 }

@@ -34,6 +34,7 @@ class FixedFriction(Estimator):
     knows: ClassVar[str] = "the friction law, identified beforehand"
     measures: ClassVar[str] = "nothing, once it is identified"
 
+    # The law, with its values.
     model: FrictionModel = field(default_factory=CoulombViscousFriction)
 
     def identified(self, log: Log) -> "FixedFriction":

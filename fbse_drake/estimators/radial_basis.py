@@ -21,6 +21,7 @@ class RadialBasisFriction(LearnedFriction):
     to zero.
     """
 
+    # How many functions there are.
     centres: int = 21
     # Velocity on whose scale the functions are narrowest [rad/s].
     finest: float = 0.01

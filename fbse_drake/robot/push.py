@@ -24,6 +24,7 @@ _ROUNDING = 1e-9
 class Push:
     """A constant force at a body's centre of mass."""
 
+    # Which body is pushed.
     body: str
     # In the world's axes [N].
     force: list[float]
