@@ -18,6 +18,7 @@ from fbse_drake.robot.description import load_description as load_description
 from fbse_drake.robot.plant import Ground as Ground
 from fbse_drake.robot.plant import Robot as Robot
 from fbse_drake.robot.plant import make_robot as make_robot
+from fbse_drake.robot.push import Push as Push
 from fbse_drake.walking.reference import JointSines as JointSines
 from fbse_drake.walking.reference import Recorded as Recorded
 from fbse_drake.walking.stand import Squat as Squat
@@ -136,10 +137,14 @@ from fbse_drake.estimators.estimator import Estimator as Estimator
 from fbse_drake.estimators.estimator import NoEstimator as NoEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS as USUAL_SENSORS
 from fbse_drake.estimators.beliefs import SensorBeliefs as SensorBeliefs
+from fbse_drake.estimators.actuator_fault import ActuatorFault as ActuatorFault
 from fbse_drake.estimators.adaptive_friction import AdaptiveFriction as AdaptiveFriction
 from fbse_drake.estimators.attitude import AttitudeEstimator as AttitudeEstimator
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver as DisturbanceObserver
+from fbse_drake.estimators.disturbance_observers import ExtendedState as ExtendedState
+from fbse_drake.estimators.disturbance_observers import FilteredDisturbance as FilteredDisturbance
 from fbse_drake.estimators.fbse import Fbse as Fbse
+from fbse_drake.estimators.filtered_model import FilteredModel as FilteredModel
 from fbse_drake.estimators.fixed_friction import FixedFriction as FixedFriction
 from fbse_drake.estimators.floating_base import ImuMount as ImuMount
 from fbse_drake.estimators.friction import ModelAided as ModelAided
@@ -152,6 +157,7 @@ from fbse_drake.estimators.true_friction import TrueFriction as TrueFriction
 
 # What the controller makes of an estimate.
 from fbse_drake.control.compensation import Compensation as Compensation
+from fbse_drake.control.compensation import FaultReconfiguration as FaultReconfiguration
 from fbse_drake.control.compensation import FeedforwardCompensation as FeedforwardCompensation
 from fbse_drake.control.compensation import IntegralCompensation as IntegralCompensation
 from fbse_drake.control.compensation import NoCompensation as NoCompensation

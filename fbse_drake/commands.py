@@ -555,7 +555,7 @@ def _list(options: argparse.Namespace) -> bool:
 
 def _schema(options: argparse.Namespace) -> bool:
     if not options.quiet:
-        print(json.dumps(json_schema(), indent=2))
+        print(to_json(json_schema(), indent=2))
     return True
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import fbse_drake as fd
+from fbse_drake.files import from_json, to_json
 from fbse_drake.scenario import dump_scenario
 
 FEW = [fd.CoulombFriction, fd.ViscousFriction, fd.TorqueBias]
@@ -153,7 +154,7 @@ def test_compare_diagnose_add_agree_and_are_saved(rubbing, tmp_path: Path):
     assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
     content = json.loads((tmp_path / "found/diagnosis.json").read_text())
     assert content["verdict"] == "effect_found"
-    assert content == json.loads(json.dumps(found.json()))
+    assert content.items() >= from_json(to_json(found.json())).items()
     # The commands that the report proposes can be run.
     scenario_file = tmp_path / "found/scenario.yaml"
     assert f"fbse add {scenario_file}" in (tmp_path / "found/report.html").read_text()

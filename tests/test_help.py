@@ -10,8 +10,9 @@ from importlib.metadata import version
 
 import pytest
 
-from fbse_drake import libraries, load_scenario
+from fbse_drake import libraries, load_scenario, resources
 from fbse_drake.cli import DONE, LISTED, _parser, main
+from fbse_drake.schema import load_tree
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
@@ -26,7 +27,7 @@ def test_every_example_of_the_help_is_a_command_line_that_is_understood():
         examples = [line.strip() for line in command.epilog.splitlines()[1:]]
         assert examples
         for example in examples:
-            program, *arguments = shlex.split(example)
+            program, *arguments = shlex.split(example.partition(" > ")[0])
             assert (program, arguments[0]) == ("fbse", name)
             _parser().parse_args(arguments)
 
@@ -89,3 +90,41 @@ def test_commands_and_scenarios_are_completed():
     assert set(completions("fbse es")) == {"estimate"}
     assert "paper_walk_pd" in completions("fbse simulate paper")
     assert "squat" not in completions("fbse simulate paper")
+
+
+def test_the_schema_documents_every_key_and_accepts_the_shipped_scenarios(
+    capsys: pytest.CaptureFixture,
+):
+    assert main(["schema"]) == DONE
+    schema = json.loads(capsys.readouterr().out)
+    undocumented = [
+        f"{name}.{key}"
+        for name, mapping in schema["$defs"].items()
+        for key, value in mapping["properties"].items()
+        if not value.get("description")
+    ]
+    assert undocumented == []
+    # An editor that validates by it finds nothing wrong with what is shipped, and a typo.
+    squat = load_tree(resources.find("squat", kind="scenarios"))
+    assert wrong_keys(squat["squat"], schema["$defs"]["Scenario"], schema["$defs"]) == []
+    squat["squat"]["reference"]["amplitud"] = 1.0
+    assert wrong_keys(squat["squat"], schema["$defs"]["Scenario"], schema["$defs"]) == ["amplitud"]
+
+
+def wrong_keys(tree: object, schema: dict, definitions: dict) -> list[str]:
+    """Keys of a document that a schema does not know; of alternatives that which knows most."""
+    if "$ref" in schema:
+        return wrong_keys(tree, definitions[schema["$ref"].rpartition("/")[2]], definitions)
+    if "anyOf" in schema:
+        found = (wrong_keys(tree, one, definitions) for one in schema["anyOf"])
+        return min(found, key=len)
+    if not isinstance(tree, dict):
+        return []
+    known, others = schema.get("properties", {}), schema.get("additionalProperties", False)
+    wrong = []
+    for key, value in tree.items():
+        inner = known.get(key, others)
+        if key == "_tag":
+            continue
+        wrong += wrong_keys(value, inner, definitions) if inner else [key]
+    return wrong
