@@ -259,9 +259,9 @@ def _tried(path: Path) -> tuple[list[str], list[str]]:
         return [], [f"it cannot be simulated: {error}"]
     if run.failure is not None:
         return [], [run.failure]
-    error = run.metrics["joint_tracking_rms"]
-    worst = max(error, key=lambda joint: error[joint])
-    remarks = [f"It follows its plan within {1e3 * error[worst]:.2g} mrad rms ({worst})."]
+    tracking = run.metrics["joint_tracking_rms"]
+    worst = max(tracking, key=lambda joint: tracking[joint])
+    remarks = [f"It follows its plan within {1e3 * tracking[worst]:.2g} mrad rms ({worst})."]
     if run.log.sides:
         remarks.append(_weight_text(run.log))
     return remarks, []

@@ -123,8 +123,8 @@ class _Model:
             hip = self.pose(chain[-1].child_body())[:3, 3]
             found.append(_Chain(chain[::-1], joint.child_body(), float(lowest), hip))
         counts: dict[str, int] = {}
-        for chain in found:
-            for joint in chain.joints:
+        for one in found:
+            for joint in one.joints:
                 counts[joint.name()] = counts.get(joint.name(), 0) + 1
         return [c for c in found if all(counts[joint.name()] == 1 for joint in c.joints)]
 
