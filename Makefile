@@ -1,5 +1,6 @@
 # make walk   installs into .venv, simulates the paper's walk and says where its report is
 # make test   installs into .venv, checks style and types and runs the tests
+# make docs   builds the documentation into out/site
 # make fbse   prints how good the friction estimate is, and writes out/fbse/report.html
 # make rivals compares all methods of estimating friction, and writes out/rivals/*/report.html
 # make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
@@ -11,7 +12,7 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test lint format bench fuzz fbse rivals hidden clean
+.PHONY: walk test docs lint format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -27,6 +28,11 @@ lint: $(INSTALLED)
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
+
+# The documentation, strictly: a broken link is an error.
+docs: $(INSTALLED)
+	$(VENV)/bin/pip install --quiet --editable ".[dev,docs]" --constraint constraints.txt
+	$(VENV)/bin/mkdocs build
 
 bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop

@@ -1,4 +1,4 @@
-"""The figures of the README: `python -m benchmarks.figures` (some minutes)."""
+"""The figures of docs/accuracy.md: `python -m benchmarks.figures` (some minutes)."""
 
 import dataclasses
 from collections.abc import Sequence

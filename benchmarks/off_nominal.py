@@ -152,7 +152,7 @@ class Figures:
 
 
 def _counts(joint: str) -> bool:
-    """The hip yaws do not: they tremble at rest, see the README."""
+    """The hip yaws do not: they tremble at rest, see docs/accuracy.md."""
     return not joint.endswith("hip_yaw")
 
 

@@ -139,7 +139,8 @@ def api() -> str:
 
 def _described(module: str, name: str) -> Iterator[str]:
     value = getattr(__import__(module, fromlist=[name]), name)
-    if callable(value):
+    # An exception's is that of Python.
+    if callable(value) and not (inspect.isclass(value) and issubclass(value, Exception)):
         signature = str(inspect.signature(value)).replace("fbse_drake.", "")
         yield f"```python\n{name}{signature}\n```\n"
     doc = inspect.getdoc(value) or ""
