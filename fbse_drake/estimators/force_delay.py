@@ -17,8 +17,12 @@ _LEAST = 0.5
 # By how much of itself a tick may be longer or shorter for its velocities' difference to be an
 # acceleration that is worth comparing, and for its number to be a time.
 _UNEVEN = 0.01
-# By how much more likely another delay must be, as the logarithm of the ratio, before it counts.
-_EVIDENCE = 30.0
+# How much of the way in which forces change the other sensors must explain to tell their delay.
+_EXPLAINED = 0.5
+# By how much more likely another delay must be, as the logarithm of the ratio, before it counts,
+# and for how long [s]: noise that begins reaches the sensors of some ticks ago last, which looks
+# better until it does.
+_EVIDENCE, _LASTING = 30.0, 2.0 * _LONGEST
 
 
 def force_delay_type(clock: Clock) -> np.dtype:
@@ -27,12 +31,13 @@ def force_delay_type(clock: Clock) -> np.dtype:
     `shown` (delays, 3), how the centre of mass accelerated so many ticks ago [m/s^2]; `filled`, how
     many of these are known; sums over the last time, of these, `total` (delays, 3), of their
     `square` and of their product `cross` with the forces, (delays,), and of the forces,
-    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; and the
-    `delay` [s].
+    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `contradicted`, for
+    how long another delay has been better [s]; and the `delay` [s].
     """
     delays = delays_of(clock)
     shapes = {"shown": (delays, 3), "total": (delays, 3), "square": (delays,), "cross": (delays,)}
-    return record_type(**shapes, push_total=(3,), push_square=(), filled=(), count=(), delay=())
+    numbers = ("push_square", "filled", "count", "contradicted", "delay")
+    return record_type(**shapes, push_total=(3,), **dict.fromkeys(numbers, ()))
 
 
 def delays_of(clock: Clock) -> int:
@@ -56,8 +61,12 @@ def tick_of(duration: np.ndarray, delay: float) -> int:
 
 @njit(cache=True)
 def forget_force_delay(x: np.ndarray) -> None:
-    """A tick in which a sensor is not trusted; what has been found out stays."""
-    x.filled = 0.0
+    """A tick that cannot be compared, by whose sensors the ones before may be spoilt as well.
+
+    The delay that has been found stays.
+    """
+    x.total[:], x.square[:], x.cross[:], x.push_total[:] = 0.0, 0.0, 0.0, 0.0
+    x.push_square = x.filled = x.count = x.contradicted = 0.0
 
 
 @njit(cache=True)
@@ -106,11 +115,14 @@ def watch_force_delay(
         total = vector(x.total[late])
         square = x.square[late] - dot(total, total) / x.count
         cross = x.cross[late] - dot(total, middle)
-        mismatch[late] = push_square - cross**2 / max(square, 1e-9)
+        mismatch[late] = push_square - max(0.0, cross) ** 2 / max(square, 1e-9)
         if mismatch[late] < mismatch[best]:
             best = late
     variance = max(noise**2, mismatch[best] / (3.0 * x.count))
     is_known = x.count * elapsed > _LEAST * _MEMORY
-    believed = round(x.delay / period)
-    if is_known and mismatch[believed] - mismatch[best] > 2.0 * _EVIDENCE * variance:
-        x.delay = best * period
+    is_explained = mismatch[best] < (1.0 - _EXPLAINED) * push_square
+    gained = mismatch[round(x.delay / period)] - mismatch[best]
+    is_better = is_known and is_explained and gained > 2.0 * _EVIDENCE * variance
+    x.contradicted = x.contradicted + elapsed if is_better else 0.0
+    if x.contradicted > _LASTING:
+        x.delay, x.contradicted = best * period, 0.0
