@@ -107,6 +107,8 @@ ANSWER = {
         }
     ],
 }
+# Of the logs [s].
+DURATIONS = {"arm": 0.4, "biped": 0.25}
 OPTIONS = ("--out", "out", "--quiet")
 
 
@@ -124,8 +126,8 @@ class Kind:
     run: Callable[[Sequence[str]], int] = main
 
 
-def right_files(place: Path) -> None:
-    """Writes a right file of each kind."""
+def right_files(place: Path, logs: Sequence[str] = ("arm", "biped")) -> None:
+    """Writes a right file of each kind, and the logs of these robots."""
     texts = {
         "arm.scenario.yaml": ARM,
         "biped.scenario.yaml": BIPED,
@@ -143,19 +145,17 @@ def right_files(place: Path) -> None:
         (place / name).write_text(text, encoding="utf-8")
     effect = HiddenEffect("CoulombFriction", ("servo",), 0.5, ANSWER["effects"][0]["parameters"])
     (place / "answer.sealed").write_text(seal(Answer("library", "small", 1.0, (effect,))))
-    for name, duration in (("arm", 0.4), ("biped", 0.25)):
-        override = [f"duration={duration}", f"robot.description={place / 'arm.yaml'}"]
-        override = (
-            [*override, f"model.description={place / 'arm.yaml'}"]
-            if name == "arm"
-            else override[:1]
+    for name in logs:
+        description = place / "arm.yaml" if name == "arm" else "biped"
+        overrides = [f"duration={DURATIONS[name]}", f"robot.description={description}"]
+        if name == "arm":
+            overrides.append(f"model.description={description}")
+        log = simulate(load_scenario(place / f"{name}.scenario.yaml", overrides=overrides)).log
+        measured = {name: log[name] for name in log if not name.startswith("truth/")}
+        segment = {"start": 0.0, "end": 0.2, "source": "a", "recorded_start": 0.0, "gain": 2.0}
+        Log(measured, {**log.meta, "segments": [segment], "findings": ["x"]}).save(
+            place / f"{name}.npz"
         )
-        log = simulate(load_scenario(place / f"{name}.scenario.yaml", overrides=override)).log
-        log.save(place / f"{name}.npz")
-    segment = {"start": 0.0, "end": 0.3, "source": "a", "recorded_start": 0.0, "gain": 2.0}
-    log = Log.load(place / "arm.npz")
-    measured = {name: log[name] for name in log if not name.startswith("truth/")}
-    Log(measured, {**log.meta, "segments": [segment], "findings": ["x"]}).save(place / "arm.npz")
 
 
 def _json(content: bytes, random: np.random.Generator) -> bytes:
