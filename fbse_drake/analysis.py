@@ -39,6 +39,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.files import origin, write_json, write_text
 from fbse_drake.interop.convert import read_logs
 from fbse_drake.interop.export import writer_for
+from fbse_drake.interop.models import write_mjcf, write_urdf
 from fbse_drake.log import Log, joined
 from fbse_drake.progress import Progress, silent
 from fbse_drake.report.discrepancy import (
@@ -164,7 +165,7 @@ class AnalysisResult(Result):
 
     def save(self, folder: str | Path, inputs: Inputs | None = None) -> None:
         """Writes the JSON file (also as metrics.json), scenario.yaml, the completed scenario where
-        there is one, and report.html.
+        there is one with its model as URDF and MJCF (completed.xml), and report.html.
 
         Args:
             inputs: where scenario and logs lie, for the commands that the report proposes; by
@@ -189,6 +190,8 @@ class AnalysisResult(Result):
         write_json(out / "metrics.json", content)
         if (completed := self._completed) is not None:
             write_text(out / "completed.yaml", dump_scenario(completed, self.case.name))
+            write_urdf(completed.believed, out / "completed.urdf")
+            write_mjcf(completed.believed, out / "completed.xml")
         self._report(out / "report.html", replace(inputs, hygiene=self.hygiene))
 
     def _inputs_in(self, folder: Path) -> Inputs:

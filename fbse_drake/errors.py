@@ -4,13 +4,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class InputError(ValueError):
-    """Bad input from a user; the message is one line that says what, where and what is allowed."""
-
-
 def on_one_line(text: str) -> str:
     """The text with what is not printable escaped: nothing that it quotes can end a line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+class InputError(ValueError):
+    """Bad input from a user; the message is one line that says what, where and what is allowed."""
+
+    def __init__(self, message: str):
+        """Whatever is quoted in the message, it stays one line."""
+        super().__init__(on_one_line(message))
 
 
 @contextmanager

@@ -113,7 +113,9 @@ class Log(Mapping[str, np.ndarray]):
             if key not in self.meta:
                 raise InputError(f"meta has no {key}")
         schema.build(LogMeta, self.meta, file="meta", further_keys=True)
-        n, samples = len(self.meta["joints"]), len(self.channels["time"])
+        if self.time.ndim != 1:
+            raise InputError(f"channel time: expected one row, found {self.time.ndim} dimensions")
+        n, samples = len(self.meta["joints"]), len(self.time)
         if samples == 0:
             raise InputError("no samples")
         for name, values in self.channels.items():

@@ -159,6 +159,11 @@ class Robot:
             )
         return self.plant.GetBodyByName(name)
 
+    def rotor_inertia(self, joint: str) -> float:
+        """Reflected rotor inertia of a joint [kg m^2]; 0 without a motor."""
+        motors = _actuators(self.plant)
+        return motors[joint].default_rotor_inertia() if joint in motors else 0.0
+
     def added_to(self, name: str) -> list[RigidBody]:
         """Bodies that carry the point masses of a body, in its frame."""
         bodies = [
@@ -286,6 +291,11 @@ class Robot:
             velocities[start : start + 6] = 0.0 if V_WB is None else V_WB
         self.set_joint_positions(context, q)
         self.plant.SetVelocities(context, velocities)
+
+
+def is_point_mass(body: RigidBody) -> bool:
+    """Does the body carry point masses of another one?"""
+    return _POINT_MASS in body.name()
 
 
 def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
