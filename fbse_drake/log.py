@@ -233,8 +233,13 @@ class Log(Mapping[str, np.ndarray]):
             raise InputError(
                 f"{path}: log format version {version}, this program reads {FORMAT_VERSION}"
             )
+        # Other programs may write integers, truth values or numbers of less digits.
+        numbers = {
+            name: values.astype(float, copy=False) if values.dtype.kind in "fiub" else values
+            for name, values in content.items()
+        }
         with located(f"{path}: "):
-            log = cls(content, meta)
+            log = cls(numbers, meta)
             check_recorded(log)
         return log
 

@@ -65,6 +65,7 @@ _STATUS_COLORS = {
     Status.NOT_FINITE: "#c81e1e",
     Status.STUCK: "#e39b16",
     Status.LOST: "#7a4fa3",
+    Status.IMPLAUSIBLE: "#c9418b",
 }
 
 WIDTH = 10.0
