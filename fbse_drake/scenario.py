@@ -261,7 +261,7 @@ class Scenario:
     # Drake's settings of the robot's plant, whose time_step must be > 0.
     plant: MultibodyPlantConfig = field(default_factory=_plant_config)
     ground: Ground = field(default_factory=Ground)
-    # The motion: !Walk, !Squat, !Sway, !JointSines or !Recorded.
+    # The motion: !Walk, !Trot, !Squat, !Sway, !JointSines or !Recorded.
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)

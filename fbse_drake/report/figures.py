@@ -100,6 +100,7 @@ def support_phases(log: Log) -> list[Phase]:
             float(log.time[row]),
             float(end),
             tuple(side for side, stands in zip(log.sides, support[row], strict=True) if stands),
+            len(log.sides),
         )
         for row, end in zip(starts, ends, strict=True)
     ]
@@ -1250,7 +1251,7 @@ def _decorate_time(axes: Axes, log: Log, *, swing_of: str | None = None) -> None
                 facecolor=_side_color(log, side),
                 alpha=0.12,
                 linewidth=0,
-                label=f"{side} leg supports",
+                label=f"{' and '.join(phase.support)} leg supports",
             )
 
 

@@ -19,9 +19,10 @@ class Leg:
     joints: list[str]
     # Body that carries the sole and the force sensors.
     foot: str
-    # Frame: z up, origin on the ground when the foot is flat.
+    # Frame: z up, origin on the ground when the foot is flat. Of a point foot: in the point, z up as it mostly stands.
     sole: str
-    # A foot with 3-axis force sensors: the fixed joints that hold its pads, parallel to the sole frame.
+    # A foot with 3-axis force sensors: the fixed joints that hold its pads, parallel to the sole frame. One alone makes a point
+    # foot, which may turn while it stands.
     pads: list[str] = field(default_factory=list)
     # A foot with a six-axis sensor instead: where it meets the ground, points in the sole frame [m].
     corners: list[list[float]] = field(default_factory=list)
@@ -41,6 +42,11 @@ class Leg:
     def points(self) -> int:
         """At how many places the ground's force is known."""
         return len(self.pads) or len(self.corners)
+
+    @property
+    def is_point(self) -> bool:
+        """Does it touch the ground in one point?"""
+        return self.points == 1
 
 
 @dataclass(frozen=True)

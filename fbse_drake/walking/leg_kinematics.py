@@ -1,4 +1,4 @@
-"""Kinematics of a leg of six revolute joints, whatever their axes.
+"""Kinematics of a leg of n revolute joints, whatever their axes: six that turn and move a flat foot, or three that move a point foot.
 
 A leg with hip yaw, roll, pitch in one point, knee pitch, and ankle pitch, roll in one point has a closed inverse; any other is
 inverted by Newton's method. All functions work on arrays over time. B is the base frame, F the sole frame; quantities are expressed
@@ -42,10 +42,10 @@ class LegMotion:
     # Sole: rotation (N, 3, 3), position (N, 3) [m].
     R_BF: np.ndarray
     p_BF: np.ndarray
-    # Jacobian of the sole's spatial velocity [angular, linear], (N, 6, 6), and its rate times the joint velocity, (N, 6).
+    # Jacobian of the sole's spatial velocity [angular, linear], (N, 6, n), and its rate times the joint velocity, (N, 6).
     J: np.ndarray
     Jdot_v: np.ndarray
-    # First moment of mass (mass times centre of mass), (N, 3) [kg m], with Jacobian (N, 3, 6) and bias (N, 3).
+    # First moment of mass (mass times centre of mass), (N, 3) [kg m], with Jacobian (N, 3, n) and bias (N, 3).
     moment: np.ndarray
     J_moment: np.ndarray
     Jdot_v_moment: np.ndarray
@@ -55,30 +55,37 @@ class LegMotion:
 class LegKinematics:
     """Geometry and masses of one leg, read from the plant by `from_robot`; all vectors in B's axes, in the zero posture."""
 
-    # Unit axes of the joints, from hip to foot, shape (6, 3).
+    # Unit axes of the joints, from hip to foot, shape (n, 3).
     axes: np.ndarray
-    # First joint in B; then from joint to joint, last from the last joint to the sole; shape (7, 3) [m].
+    # First joint in B; then from joint to joint, last from the last joint to the sole; shape (n + 1, 3) [m].
     offsets: np.ndarray
     # Attitude of the sole, R_BF, shape (3, 3).
     sole: np.ndarray
-    # Mass that moves with each joint but not the next [kg], (6,), and its centre from the joint, (6, 3) [m].
+    # Mass that moves with each joint but not the next [kg], (n,), and its centre from the joint, (n, 3) [m].
     masses: np.ndarray
     centers: np.ndarray
-    # The middle of each joint's range, where it has one [rad], shape (6,): which way a knee bends.
+    # The middle of each joint's range, where it has one [rad], shape (n,): which way a knee bends.
     middle: np.ndarray
+    # Which of a twist [angular, linear] of the sole its joints determine: all of a flat foot, what is linear of a point foot.
+    ruled: slice
 
     @classmethod
     def from_robot(cls, robot: Robot, side: str) -> "LegKinematics":
-        """Raises InputError where the leg has not six revolute joints, one behind the other, that begin at the base."""
+        """Raises InputError where the leg has not six revolute joints (with a point foot three), one behind the other, that begin
+        at the base."""
         plant, leg = robot.plant, robot.description.legs[side]
         context = plant.CreateDefaultContext()
         robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
         base = robot.base.body_frame()
         joints = [plant.GetJointByName(name) for name in leg.joints]
-        if len(joints) != 6 or not all(isinstance(joint, RevoluteJoint) for joint in joints):
+        ruled, needed = (slice(3, 6), "three") if leg.is_point else (slice(0, 6), "six")
+        is_right = len(joints) == ruled.stop - ruled.start
+        if not is_right or not all(isinstance(joint, RevoluteJoint) for joint in joints):
             raise InputError(
-                f"legs.{side}.joints: a walking robot's leg needs six revolute joints, found {len(joints)} joints"
+                f"legs.{side}.joints: a walking robot's leg needs {needed} revolute joints, found {len(joints)} joints"
             )
+        if leg.is_point and np.linalg.norm(robot.pad_positions(side)) > _AXIS_TOLERANCE:
+            raise InputError(f"legs.{side}.sole: expected the origin of a point foot in its pad")
         X_BJ = [joint.frame_on_parent().CalcPose(context, base) for joint in joints]
         axes = np.array(
             [X.rotation() @ joint.revolute_axis() for X, joint in zip(X_BJ, joints, strict=True)]
@@ -100,7 +107,7 @@ class LegKinematics:
                 )
         moved.append(set())
         masses, centers = [], []
-        for i, origin in enumerate(origins[:6]):
+        for i, origin in enumerate(origins[:-1]):
             bodies = [plant.get_body(index) for index in moved[i] - moved[i + 1]]
             mass = sum(body.get_mass(context) for body in bodies)
             moment = sum(
@@ -127,16 +134,22 @@ class LegKinematics:
             np.array(masses),
             np.array(centers),
             np.nan_to_num(middle, posinf=0.0, neginf=0.0),
+            ruled,
         )
+
+    @property
+    def joints(self) -> int:
+        """How many there are."""
+        return len(self.axes)
 
     @cached_property
     def has_closed_inverse(self) -> bool:
         """Are the hip's axes z, x, y in one point, knee and ankle straight below, the ankle's axes y, x in one point, the sole level?"""
+        if not np.array_equal(self.axes, _CLOSED_AXES):
+            return False
         in_line = np.concatenate([self.offsets[[1, 2, 5]].ravel(), self.offsets[3:5, :2].ravel()])
-        return (
-            np.array_equal(self.axes, _CLOSED_AXES)
-            and np.allclose(in_line, 0, atol=_AXIS_TOLERANCE)
-            and np.allclose(self.sole, np.eye(3), atol=_AXIS_TOLERANCE)
+        return np.allclose(in_line, 0, atol=_AXIS_TOLERANCE) and np.allclose(
+            self.sole, np.eye(3), atol=_AXIS_TOLERANCE
         )
 
     def inverse(
@@ -145,11 +158,11 @@ class LegKinematics:
         """Joint angles that put the sole at a pose; the knee bent as its range has it.
 
         Args:
-            R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m].
-            start: angles near the solution, shape (N, 6) [rad], if known; by default the middle of the joints' ranges.
+            R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m]; how a point foot is turned does not matter.
+            start: angles near the solution, shape (N, n) [rad], if known; by default the middle of the joints' ranges.
 
         Returns:
-            Angles from hip to foot, shape (N, 6) [rad].
+            Angles from hip to foot, shape (N, n) [rad].
 
         Raises:
             UnreachableError: the leg is too short or too long for a pose.
@@ -162,11 +175,12 @@ class LegKinematics:
         for _ in range(_MAX_ITERATIONS):
             R, p, J = self._pose(q)
             turn = Rotation.from_matrix(R_BF @ R.transpose(0, 2, 1)).as_rotvec()
-            error = np.concatenate([turn, p_BF - p], axis=1)
+            error = np.concatenate([turn, p_BF - p], axis=1)[:, self.ruled]
+            J = J[:, self.ruled]
             size = np.linalg.norm(error, axis=1)
             if size.max() < _POSE_TOLERANCE:
                 return q
-            normal = J @ J.transpose(0, 2, 1) + (0.5 * size**2)[:, None, None] * np.eye(6)
+            normal = J @ J.transpose(0, 2, 1) + (0.5 * size**2)[:, None, None] * np.eye(self.joints)
             q = q + np.einsum("nji,nj->ni", J, np.linalg.solve(normal, error[:, :, None])[:, :, 0])
         worst = int(size.argmax())
         raise UnreachableError(worst, f"the leg misses it by {size[worst]:.3f} m or rad")
@@ -200,23 +214,23 @@ class LegKinematics:
         return np.stack([hip_yaw, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll], axis=1)
 
     def _pose(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sole's rotation (N, 3, 3), position (N, 3) and Jacobian (N, 6, 6) for angles q (N, 6)."""
+        """Sole's rotation (N, 3, 3), position (N, 3) and Jacobian (N, 6, n) for angles q (N, n)."""
         R, p, axes, origins = (
             np.broadcast_to(np.eye(3), (len(q), 3, 3)),
             np.zeros((len(q), 3)),
             [],
             [],
         )
-        for i in range(6):
+        for i in range(self.joints):
             p = p + R @ self.offsets[i]
             axes.append(R @ self.axes[i])
             origins.append(p)
             R = R @ _rotation(self.axes[i], q[:, i])
-        p = p + R @ self.offsets[6]
+        p = p + R @ self.offsets[-1]
         return R @ self.sole, p, _jacobian(axes, origins, p)
 
     def first_moment(self, q: np.ndarray) -> np.ndarray:
-        """`moment` of `forward` alone, for angles q (N, 6) [rad]."""
+        """`moment` of `forward` alone, for angles q (N, n) [rad]."""
         moment = np.zeros((len(q), 3))
         for mass, center, (_, position, _, R) in zip(
             self.masses, self.centers, self._links(q), strict=True
@@ -230,7 +244,7 @@ class LegKinematics:
         """Of each link, from base to foot: its joint's place from the joint before, and from the
         base, and axis, (N, 3) each, and its rotation (N, 3, 3)."""
         R, position = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
-        for i in range(6):
+        for i in range(self.joints):
             r = R @ self.offsets[i]
             position = position + r
             axis = R @ self.axes[i]
@@ -238,7 +252,7 @@ class LegKinematics:
             yield r, position, axis, R
 
     def forward(self, q: np.ndarray, v: np.ndarray | None = None) -> LegMotion:
-        """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes (N, 6) [rad, rad/s]."""
+        """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes (N, n) [rad, rad/s]."""
         samples = len(q)
         v = np.zeros_like(q) if v is None else v
         axes, origins = [], []
@@ -246,7 +260,7 @@ class LegKinematics:
         omega, alpha, bias = np.zeros((samples, 3)), np.zeros((samples, 3)), np.zeros((samples, 3))
         moment, J_moment, bias_moment = (
             np.zeros((samples, 3)),
-            np.zeros((samples, 3, 6)),
+            np.zeros((samples, 3, self.joints)),
             np.zeros((samples, 3)),
         )
 
@@ -264,7 +278,7 @@ class LegKinematics:
             bias_moment = bias_moment + self.masses[i] * carried(r)
             for j in range(i + 1):
                 J_moment[:, :, j] += self.masses[i] * np.cross(axes[j], position + r - origins[j])
-        r = R @ self.offsets[6]
+        r = R @ self.offsets[-1]
         bias, position = carried(r), position + r
         J = _jacobian(axes, origins, position)
         return LegMotion(

@@ -64,19 +64,22 @@ class Phase:
     end: float
     # Sides that stand.
     support: tuple[str, ...]
+    # How many legs there are.
+    legs: int = 2
 
     @property
     def is_single(self) -> bool:
-        return len(self.support) == 1
+        """Do some feet stand and others not?"""
+        return 0 < len(self.support) < self.legs
 
     @property
     def label(self) -> str:
-        """`DS` for double support, else the supporting leg's initial and S, as `LS`; empty without support."""
-        return (
-            "DS"
-            if len(self.support) > 1
-            else "".join(f"{side[0].upper()}S" for side in self.support)
-        )
+        """`DS` for double support, `AS` for that of all of more legs, else the supporting legs' initials and S, as `LS` or
+        `FL+RRS`; empty without support."""
+        if len(self.support) == self.legs:
+            return "DS" if self.legs == 2 else "AS"
+        initials = ["".join(word[0].upper() for word in side.split("_")) for side in self.support]
+        return f"{'+'.join(initials)}S" if initials else ""
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,8 @@ def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float
     Args:
         foot_corners: places of the pads in each sole frame, (pads, 3) [m].
 
+    Two point feet have no polygon; nothing is said of them.
+
     Raises:
         InputError: names the phase, time and margin.
     """
@@ -171,6 +176,8 @@ def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float
             + foot_corners[side][:, :2] @ plan.yaw[side].rotation[first, :2, :2].T
             for side in phase.support
         ]
+        if sum(len(points) for points in corners) < 3:
+            continue  # Point feet: the ZMP has to be on the line between them.
         distance = support_margin(plan.zmp[inside], np.concatenate(corners))
         if distance.min() < margin:
             time = plan.time[inside][distance.argmin()]

@@ -14,10 +14,11 @@ from fbse_drake.errors import InputError, require_positive
 from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Ground, Robot
+from fbse_drake.walking.contact_forces import contact_forces, foot_weights
 from fbse_drake.walking.leg_kinematics import LegKinematics, LegMotion, UnreachableError
 from fbse_drake.walking.plan import PointMotion, TaskPlan
 from fbse_drake.walking.stand import Squat, Sway, smooth_sine
-from fbse_drake.walking.walk import Walk
+from fbse_drake.walking.walk import Trot, Walk
 
 # A sample that is late by less than this share of a step still belongs to it.
 _EARLY = 0.1
@@ -57,7 +58,7 @@ class Recorded:
     gain: str = ""
 
 
-ReferenceConfig = Walk | Squat | Sway | JointSines | Recorded
+ReferenceConfig = Walk | Trot | Squat | Sway | JointSines | Recorded
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ def _inverse_kinematics(
     plant.SetPositions(context, robot.base_pose_positions(RigidTransform()))
     robot.set_joint_positions(context, posture)
     # The legs' first moment is known in closed form; what is left belongs to the base.
-    rest = {side: leg.forward(np.zeros((1, 6))).moment[0] for side, leg in legs.items()}
+    rest = {side: leg.forward(np.zeros((1, leg.joints))).moment[0] for side, leg in legs.items()}
     base_moment = total_mass * plant.CalcCenterOfMassPositionInWorld(context) - sum(rest.values())
 
     trunk = plan.trunk_yaw
@@ -238,8 +239,11 @@ def _inverse_kinematics(
 
     # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m. All in the trunk's axes.
     still = {side: leg.forward(q[side]) for side, leg in legs.items()}
-    inverse = {side: m.J_moment @ np.linalg.inv(m.J) / total_mass for side, m in still.items()}
-    gain = {side: values[:, :, 3:] for side, values in inverse.items()}
+    inverse = {
+        side: m.J_moment @ np.linalg.inv(m.J[:, legs[side].ruled]) / total_mass
+        for side, m in still.items()
+    }
+    gain = {side: values[:, :, -3:] for side, values in inverse.items()}
     lever = np.eye(3) - sum(gain.values())
 
     def solve(
@@ -247,8 +251,11 @@ def _inverse_kinematics(
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """How the base moves, and how the feet move relative to it, turning and moving (N, 6); or
         accelerate, each as a trunk sees it that only turns."""
-        turned = {side: _turned(inverse[side][:, :, :3], turning[side]) for side in legs}
-        right = com - sum(_turned(gain[side], feet[side]) + turned[side] for side in legs)
+        right = com
+        for side, leg in legs.items():
+            twist = np.hstack([turning[side], feet[side]])[:, leg.ruled]
+            turned = _turned(inverse[side][:, :, :-3], twist[:, :-3])
+            right = right - (_turned(gain[side], feet[side]) + turned)
         base = np.linalg.solve(lever, right[:, :, None])[:, :, 0]
         return base, {side: np.hstack([turning[side], feet[side] - base]) for side in legs}
 
@@ -266,13 +273,13 @@ def _inverse_kinematics(
         {side: seen(plan.feet[side].velocity, arm[side]) for side in legs},
         turning,
     )
-    v = {side: _solve_leg(still[side].J, relative[side]) for side in legs}
+    v = {side: _solve_leg(leg, still[side].J, relative[side]) for side, leg in legs.items()}
     motions = {side: leg.forward(q[side], v[side]) for side, leg in legs.items()}
     com_velocity = seen(plan.com.velocity, com_arm) - v_WB
     # The same with accelerations; what the joint rates alone cause is taken off first.
     foot_bias, com_bias = {}, np.zeros((samples, 3))
     for side, motion in motions.items():
-        solved = _solve_leg(motion.J, motion.Jdot_v)
+        solved = _solve_leg(legs[side], motion.J, motion.Jdot_v)
         foot_bias[side] = solved
         com_bias += (motion.Jdot_v_moment - _turned(motion.J_moment, solved)) / total_mass
 
@@ -289,9 +296,12 @@ def _inverse_kinematics(
         },
         {side: _turned(R_BW, plan.yaw[side].angular_acceleration - w_dot) for side in legs},
     )
-    a = {side: _solve_leg(motions[side].J, relative[side]) - foot_bias[side] for side in legs}
+    a = {
+        side: _solve_leg(leg, motions[side].J, relative[side]) - foot_bias[side]
+        for side, leg in legs.items()
+    }
 
-    others = np.tile(posture[6 * len(legs) :], (samples, 1))
+    others = np.tile(posture[sum(leg.joints for leg in legs.values()) :], (samples, 1))
     joints = PointMotion(
         *(
             np.hstack([*values.values(), still])
@@ -307,8 +317,9 @@ def _turned(A: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", A, vectors)
 
 
-def _solve_leg(J: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(J, twist[:, :, None])[:, :, 0]
+def _solve_leg(leg: LegKinematics, J: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """Joint rates (N, n) that give the sole a twist [angular, linear] (N, 6), as far as they rule it."""
+    return np.linalg.solve(J[:, leg.ruled], twist[:, leg.ruled, None])[:, :, 0]
 
 
 def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
@@ -339,11 +350,9 @@ def _feedforward(
     base: PointMotion,
     motions: dict[str, LegMotion],
 ) -> np.ndarray:
-    """Joint torques that let the model follow the reference, feet loaded so that the ZMP is where inverse dynamics has it.
+    """Joint torques that let the model follow the reference.
 
-    Inverse dynamics gives the total contact wrench in its base rows. It is shared between the feet by one weight per foot
-    (`load_shares`). The centres of pressure are the points where the ZMP rests in each foot (`TaskPlan.anchor`), moved together so
-    that the ZMP comes out exactly.
+    Inverse dynamics gives the total contact wrench in its base rows, which the feet share.
     """
     plant, samples, trunk = robot.plant, len(plan.time), plan.trunk_yaw
     context = plant.CreateDefaultContext()
@@ -376,6 +385,37 @@ def _feedforward(
 
     # Total contact wrench: moment about the base origin and force, world axes.
     moment, force = generalized[:, start : start + 3], generalized[:, start + 3 : start + 6]
+    on_two_soles = len(plan.feet) == 2 and not any(
+        leg.is_point for leg in robot.description.legs.values()
+    )
+    share = _share_by_zmp if on_two_soles else _share_by_least_forces
+    wrenches = share(robot, plan, base, moment, force)
+    R_BW = trunk.rotation.transpose(0, 2, 1)
+    torque, first = generalized[:, robot.velocity_index].copy(), 0
+    for side, motion in motions.items():
+        joints_of_leg = slice(first, first + motion.J.shape[2])
+        M, F = (_turned(R_BW, part) for part in wrenches[side])
+        wrench = np.concatenate([M, F], axis=1)
+        torque[:, joints_of_leg] -= np.einsum("nji,nj->ni", motion.J, wrench)
+        first = joints_of_leg.stop
+    return torque
+
+
+def _share_by_zmp(
+    robot: Robot,  # noqa: ARG001
+    plan: TaskPlan,
+    base: PointMotion,
+    moment: np.ndarray,
+    force: np.ndarray,
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Moments about the soles' origins and forces, in the world, of two flat feet.
+
+    One weight per foot (`load_shares`); the centres of pressure are the points where the ZMP rests in each foot
+    (`TaskPlan.anchor`), moved together so that the ZMP comes out exactly.
+
+    Args:
+        moment, force: what both together give, about the base's origin, (N, 3) each [Nm, N].
+    """
     # Its ZMP: where the horizontal moment vanishes at the height of the feet that carry it.
     shares = load_shares(plan)
     ground = sum(shares[side] * plan.feet[side].position[:, 2] for side in plan.feet)
@@ -389,16 +429,33 @@ def _feedforward(
         (zmp[:, 0] - base.position[:, 0]) * force[:, 1]
         - (zmp[:, 1] - base.position[:, 1]) * force[:, 0]
     )
-    R_BW = trunk.rotation.transpose(0, 2, 1)
-    torque = generalized[:, robot.velocity_index].copy()
-    for k, (side, motion) in enumerate(motions.items()):
+    wrenches = {}
+    for side, foot in plan.feet.items():
         F = shares[side][:, None] * force
-        arm = np.zeros((samples, 3))
-        arm[:, :2] = plan.anchor(side) + offset - plan.feet[side].position[:, :2]
+        arm = np.zeros_like(F)
+        arm[:, :2] = plan.anchor(side) + offset - foot.position[:, :2]
         M = np.cross(arm, F) + np.stack([0 * spin, 0 * spin, shares[side] * spin], axis=1)
-        wrench = np.concatenate([_turned(R_BW, M), _turned(R_BW, F)], axis=1)
-        torque[:, 6 * k : 6 * k + 6] -= np.einsum("nji,nj->ni", motion.J, wrench)
-    return torque
+        wrenches[side] = M, F
+    return wrenches
+
+
+def _share_by_least_forces(
+    robot: Robot, plan: TaskPlan, base: PointMotion, moment: np.ndarray, force: np.ndarray
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The same of any feet, see `contact_forces`; each pad is a point."""
+    pads = {side: robot.pad_positions(side) for side in plan.feet}
+    arms = {side: pads[side] @ plan.yaw[side].rotation.transpose(0, 2, 1) for side in pads}
+    points = [plan.feet[side].position[:, None] + arms[side] for side in pads]
+    counts = [len(places) for places in pads.values()]
+    weights = np.repeat(foot_weights(plan), counts, axis=1)
+    about_origin = moment + np.cross(base.position, force)
+    wrench = np.concatenate([about_origin, force], axis=1)
+    forces = contact_forces(wrench, np.concatenate(points, axis=1), weights)
+    parts = np.split(forces, np.cumsum(counts)[:-1], axis=1)
+    return {
+        side: (np.cross(arms[side], part).sum(axis=1), part.sum(axis=1))
+        for side, part in zip(pads, parts, strict=True)
+    }
 
 
 def load_shares(plan: TaskPlan) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Motions with both feet on the ground: squatting and swaying."""
+"""Motions with all feet on the ground: squatting and swaying."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ def smooth_sine(
 
 @dataclass(frozen=True)
 class _Stand:
-    """Both feet stand side by side."""
+    """All feet stand side by side."""
 
     # Amplitude of the CoM's motion [m], its frequency [Hz], and the time in which it swells and dies out [s].
     amplitude: float = 0.03
@@ -50,8 +50,9 @@ class _Stand:
     ramp: float = 2.0
     # Height of the centre of mass above the ground at rest [m].
     com_height: float = 0.66
-    # Distance between the soles' centres [m].
+    # Distance between the soles' centres [m], and that of front and rear feet, where there are such.
     foot_spacing: float = 0.20
+    wheelbase: float = 0.0
     # Where the CoM stands ahead of the sole frames [m].
     zmp_forward: float = 0.025
     # Smallest distance of the planned ZMP to the edge of the support polygon [m].
@@ -76,10 +77,12 @@ class _Stand:
             smooth_sine(time, self.frequency, self.ramp, float(time[-1]))
         ):
             com[order][:, axis] += self.amplitude * values
-        still = np.zeros((len(time), 3))
+        still, reach = np.zeros((len(time), 3)), self.wheelbase / 2
         feet = {
             side: PointMotion(
-                still + [-self.zmp_forward, sign[1] * self.foot_spacing / 2, 0.0], still, still
+                still + [sign[0] * reach - self.zmp_forward, sign[1] * self.foot_spacing / 2, 0.0],
+                still,
+                still,
             )
             for side, sign in stance.items()
         }
@@ -93,7 +96,7 @@ class _Stand:
             feet,
             dict.fromkeys(stance, YawMotion.none(len(time))),
             zmp,
-            (Phase(0.0, float(time[-1]), tuple(stance)),),
+            (Phase(0.0, float(time[-1]), tuple(stance), len(stance)),),
             rest_point,
             gravity,
         )

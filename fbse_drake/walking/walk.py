@@ -87,8 +87,9 @@ class Walk:
     double_support: float = 0.9
     # Height of the centre of mass above the ground [m], constant; on a staircase above the line through its steps.
     com_height: float = 0.66
-    # Distance between the soles' centres [m].
+    # Distance between the soles' centres [m], and that of front and rear feet, where there are such.
     foot_spacing: float = 0.20
+    wheelbase: float = 0.0
     # Where the ZMP stands in the supporting foot [m]: ahead of the sole frame, and inwards from it (more means less sway).
     zmp_forward: float = 0.025
     zmp_inward: float = 0.01
@@ -126,29 +127,46 @@ class Walk:
         """How much the line through the footholds rises per way ahead."""
         return self.step_rise / self.step_length if self.step_rise else 0.0
 
-    def phases(self, sides: tuple[str, ...], duration: float) -> list[Phase]:
-        """Double and single supports in turn, up to the end of the last double support or `duration`, whichever is later.
+    def supports(self, stance: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The feet that support first, and those that support then, in turn.
+
+        Args:
+            stance: see `plan`.
 
         Raises:
-            InputError: `first_support` is no side of this robot.
+            InputError: `first_support` is no side of this robot, or it cannot walk so.
         """
-        if self.first_support not in sides:
+        self._check_side(stance)
+        if len(stance) != 2:
+            raise InputError(f"a walk takes two legs, found {', '.join(stance)}; use Trot")
+        other = next(side for side in stance if side != self.first_support)
+        return (self.first_support,), (other,)
+
+    def _check_side(self, stance: Mapping[str, np.ndarray]) -> None:
+        if self.first_support not in stance:
+            allowed = ", ".join(stance)
             raise InputError(
-                f"first_support: expected one of {', '.join(sides)}, found {self.first_support}"
+                f"first_support: expected one of {allowed}, found {self.first_support}"
             )
-        other = next(side for side in sides if side != self.first_support)
-        support = [self.first_support if k % 2 == 0 else other for k in range(self.single_supports)]
+
+    def phases(
+        self, sides: tuple[str, ...], supports: tuple[tuple[str, ...], ...], duration: float
+    ) -> list[Phase]:
+        """Double and single supports in turn, up to the end of the last double support or `duration`, whichever is later.
+
+        Args:
+            supports: see there.
+        """
+        legs, support = len(sides), [supports[k % 2] for k in range(self.single_supports)]
         # Rounded to a nanosecond, so that a phase ends on a control tick where it should.
-        phases = [Phase(0.0, round(self.initial_double_support, 9), sides)]
-        for side in support:
-            phases.append(
-                Phase(phases[-1].end, round(phases[-1].end + self.single_support, 9), (side,))
-            )
-            phases.append(
-                Phase(phases[-1].end, round(phases[-1].end + self.double_support, 9), sides)
-            )
+        phases = [Phase(0.0, round(self.initial_double_support, 9), sides, legs)]
+        for standing in support:
+            end = round(phases[-1].end + self.single_support, 9)
+            phases.append(Phase(phases[-1].end, end, standing, legs))
+            end = round(phases[-1].end + self.double_support, 9)
+            phases.append(Phase(phases[-1].end, end, sides, legs))
         last = phases[-1]
-        return [*phases[:-1], Phase(last.start, max(last.end, duration), sides)]
+        return [*phases[:-1], Phase(last.start, max(last.end, duration), sides, legs)]
 
     def steps(self, phases: list[Phase]) -> dict[int, Step]:
         """What happens in each single support, by phase number."""
@@ -183,9 +201,10 @@ class Walk:
         Raises:
             InputError: the ZMP leaves the support polygon less its margin, or a value is impossible.
         """
-        phases = self.phases(tuple(stance), float(time[-1]))
+        phases = self.phases(tuple(stance), self.supports(stance), float(time[-1]))
         steps = self.steps(phases)
-        beside = {side: sign * [0.0, self.foot_spacing / 2] for side, sign in stance.items()}
+        reach = np.array([self.wheelbase / 2, self.foot_spacing / 2])
+        beside = {side: sign * reach for side, sign in stance.items()}
         rest_point = {
             side: np.array([self.zmp_forward, -sign[1] * self.zmp_inward])
             for side, sign in stance.items()
@@ -323,3 +342,36 @@ class Walk:
         c = plain.c + first.c * amplitude[0] + last.c * amplitude[1]
         zmp = PPoly(c, breaks)
         return zmp, solve_lipm(zmp, self.com_height, gravity)
+
+
+@dataclass(frozen=True)
+class Trot(Walk):
+    """Walks on four legs from rest to rest: two that are diagonally opposite step together.
+
+    A single support is one by two legs, between which the ZMP rests, and in a double support all
+    stand. Two point feet do not keep the robot from tipping over the line between them: steps are
+    short, and all legs stand often.
+    """
+
+    step_length: float = 0.03
+    step_height: float = 0.03
+    single_supports: int = 24
+    # One of the legs that support first.
+    first_support: str = "front_left"
+    initial_double_support: float = 0.6
+    single_support: float = 0.2
+    double_support: float = 0.2
+    com_height: float = 0.38
+    foot_spacing: float = 0.34
+    wheelbase: float = 0.5
+    zmp_forward: float = 0.0
+    zmp_inward: float = 0.0
+    start: float = 0.0
+
+    def supports(self, stance: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        self._check_side(stance)
+        if len({tuple(sign) for sign in stance.values() if sign.all()}) != 4:
+            raise InputError("a trot takes four legs, at the corners of the trunk; use Walk")
+        hand = np.prod(stance[self.first_support])
+        first = tuple(side for side, sign in stance.items() if np.prod(sign) == hand)
+        return first, tuple(side for side in stance if side not in first)
