@@ -4,7 +4,7 @@ A Kalman filter for gravity feeds an extended Kalman filter on the quaternion.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -82,7 +82,10 @@ class AttitudeConfig:
 
     def add(self, chain: Chain) -> None:
         """Adds `attitude` to a chain that has `sensor_monitor` and `model`."""
-        make = partial(AttitudeEstimator, self, chain.sensors, ImuMount(chain.robot).R_BI)
+        # How a point foot is turned tells nothing.
+        has_points = any(leg.is_point for leg in chain.robot.description.legs.values())
+        config = replace(self, level_feet=0.0) if has_points else self
+        make = partial(AttitudeEstimator, config, chain.sensors, ImuMount(chain.robot).R_BI)
         chain.add("attitude", make, measurements="sensor_monitor", model="model")
 
 

@@ -457,7 +457,8 @@ def _listen_to_foot(
     elapsed: float,
     known: np.ndarray,
 ) -> None:
-    """What a foot that stands tells: where it is, how it is turned, and that it rests.
+    """What a foot that stands tells: where it is, how it is turned, and that it rests. (A point
+    foot may turn, and tells nothing of that.)
 
     Args:
         share: of the weight, that it carries.
@@ -487,17 +488,20 @@ def _listen_to_foot(
         restless[_FOOT_POSITION] * own + sensed,
     )  # fmt: skip
 
-    own, sensed = light * config.foot_orientation**2, turning * angle
-    q_BF = quaternion_of(R_BF)
-    seen = quaternion_product(quaternion(x.orientation), q_BF)
-    z = rotation_vector(quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot]))))
-    noise = _isotropic(own * lasting + sensed)
-    noise[2, 2] += held * own * lasting
-    variance[_FOOT_ORIENTATION] = _update(
-        P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
-        agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
-        restless[_FOOT_ORIENTATION] * own + sensed,
-    )  # fmt: skip
+    if known.is_flat[foot] > 0:
+        own, sensed = light * config.foot_orientation**2, turning * angle
+        q_BF = quaternion_of(R_BF)
+        seen = quaternion_product(quaternion(x.orientation), q_BF)
+        z = rotation_vector(
+            quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot])))
+        )
+        noise = _isotropic(own * lasting + sensed)
+        noise[2, 2] += held * own * lasting
+        variance[_FOOT_ORIENTATION] = _update(
+            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
+            agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
+            restless[_FOOT_ORIENTATION] * own + sensed,
+        )  # fmt: skip
 
     w_F, v_F = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for j in range(6, J.shape[1]):
@@ -515,6 +519,8 @@ def _listen_to_foot(
         restless[_FOOT_VELOCITY] * own + sensed,
     )  # fmt: skip
 
+    if known.is_flat[foot] == 0:
+        return
     own, sensed = light * config.foot_rate**2, turning * rate + gyro
     z = add(w, w_BF)
     noise = _isotropic(own * lasting + sensed)
@@ -646,9 +652,16 @@ def _estimate_base(
 
     Args:
         known: record with the numbers of `InvariantFilter` and `SensorBeliefs`, `mount`, see
+<<<<<<< HEAD
             `ImuMount`, `pads`, see `FootPads`, `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
             sure the first posterior is, `origin`, where the middle of the soles is at the start
             (3,) [m], and the `period` of ticks [s].
+=======
+            `ImuMount`, `pads`, see `FootPads`, `is_flat` (feet,), 1 of a foot that is no point,
+            `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
+            sure the first posterior is, and `origin`, where the middle of the soles is at the start
+            (3,) [m].
+>>>>>>> 26b3ae5 (Estimators take point feet: they may turn, and tell where they are and that they do not move; a quadruped)
     """
     posterior[()] = last[()]
     x, last, measured, model, known = posterior[()], last[()], measured[()], model[()], known[()]
@@ -671,7 +684,8 @@ def _estimate_base(
     mean_wrench = foot_wrenches(mean_force, known.pads.position, known.pads.foot, feet)
     weight = known.mass * 9.81
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
-    rests, rolling = firm_foot_rate(x.foot_standing, wrench, weight, w_now, model)
+    firm = x.foot_standing * known.is_flat
+    rests, rolling = firm_foot_rate(firm, wrench, weight, w_now, model)
     if first:
         _start(x, measured, model, known)
     else:
@@ -932,6 +946,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             sensors=sensors,
             mount=record(**vars(ImuMount(robot))),
             pads=record(position=pads.position, foot=pads.foot),
+            is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
             gravity=plant.gravity_field().gravity_vector(),
             start=record(tilt=0.2, velocity=0.1, acceleration=0.05),

@@ -156,31 +156,42 @@ def no_slip_condition(
     model: np.ndarray,
     attitude: np.ndarray,
     stands: np.ndarray,
+    still_from: np.ndarray,
     gravity: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """J (c, v) and y (c,) of J a = y, eq. (41) with p_m_ddot = 0, for the feet that stand.
 
     The base's acceleration in `a` is its specific force, so a foot at rest accelerates with minus
-    gravity.
+    gravity. A point foot may turn: of its twist only the linear half is ruled.
 
     Args:
         model, attitude: records of the posteriors of `FloatingBaseModel` where the tick began, and
             of `AttitudeEstimator`.
         stands: the feet that stand, shape (feet,), bool.
+        still_from: see `still_rows`, (feet,).
         gravity: in world axes, shape (3,) [m/s^2].
     """
-    J, y = np.empty((6 * stands.sum(), len(model.velocity))), np.empty(6 * stands.sum())
+    rows = (stands * (6 - still_from)).sum()
+    J, y = np.empty((rows, len(model.velocity))), np.empty(rows)
     gravity_B = rotate_back(rotation(attitude.rotation), vector(gravity))
     row = 0
     for foot in range(len(stands)):
         if stands[foot]:
-            J[row : row + 6] = model.foot_jacobian[foot]
-            y[row : row + 6] = -model.foot_bias[foot]
+            first = still_from[foot]
+            end = row + 6 - first
+            J[row:end] = model.foot_jacobian[foot, first:]
+            y[row:end] = -model.foot_bias[foot, first:]
             gravity_F = rotate_back(rotation(model.foot_rotation[foot]), gravity_B)
             for i in range(3):
-                y[row + 3 + i] -= gravity_F[i]
-            row += 6
+                y[end - 3 + i] -= gravity_F[i]
+            row = end
     return J, y
+
+
+def still_rows(robot: Robot) -> np.ndarray:
+    """Of each foot, from which row of its twist [angular, linear] on it is still while it stands,
+    (feet,): 0 of a flat foot, 3 of a point foot."""
+    return np.array([3 if leg.is_point else 0 for leg in robot.description.legs.values()])
 
 
 @njit(cache=True)
@@ -231,7 +242,7 @@ def _foot_variance(
     y: np.ndarray,
     stands: np.ndarray,
     elapsed: float,
-    config: np.ndarray,
+    known: np.ndarray,
 ) -> np.ndarray:
     """Variance of what standing feet accelerate, one for each row of the no-slip condition.
 
@@ -239,7 +250,7 @@ def _foot_variance(
     sinks, it is believed to: by the mean that their noise does not reach, for as many ticks as that
     mean lasts. The running means are filled.
     """
-    keep, row = math.exp(-elapsed / AGREEMENT_TIME), 0
+    keep, row, config = math.exp(-elapsed / AGREEMENT_TIME), 0, known.config
     count = (1.0 + keep) / (1.0 - keep)
     variance = np.empty(len(y))
     for foot in range(len(stands)):
@@ -247,16 +258,21 @@ def _foot_variance(
         agreement[:] = 0.0
         if not stands[foot]:
             continue
-        for i in range(6):
-            innovation = y[row + i]
+        first = known.still_from[foot]
+        start_row = row - first
+        for i in range(first, 6):
+            innovation = y[start_row + i]
             for k in range(len(raw)):
-                innovation -= J[row + i, k] * raw[k]
+                innovation -= J[start_row + i, k] * raw[k]
             agreement[i] = keep * last.agreement[foot, i] + (1.0 - keep) * innovation
         for start, size in ((0, config.foot_angular_acceleration), (3, config.foot_acceleration)):
+            if start < first:
+                continue
             x, y_, z = agreement[start], agreement[start + 1], agreement[start + 2]
             mean_square = (x * x + y_ * y_ + z * z) / 3.0
-            variance[row + start : row + start + 3] = size**2 + count * mean_square
-        row += 6
+            at = start_row + start
+            variance[at : at + 3] = size**2 + count * mean_square
+        row += 6 - first
     return variance
 
 
@@ -274,7 +290,7 @@ def _fuse_accelerations(
 
     Args:
         known: record with the numbers of `JointAccelerationConfig` and `SensorBeliefs`, `mount`,
-            see `ImuMount`, and `gravity` (3,) [m/s^2].
+            see `ImuMount`, `gravity` (3,) [m/s^2] and `still_from`, see `still_rows`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     attitude, model, known = attitude[()], model[()], known[()]
@@ -286,8 +302,8 @@ def _fuse_accelerations(
     variance = np.full(len(raw), 2 * (noise.joint_velocity_noise / elapsed) ** 2)
     variance[:3] = 2 * (noise.angular_velocity_noise / elapsed) ** 2
     variance[3:6] = noise.acceleration_noise**2
-    J, y = no_slip_condition(model, attitude, stands, known.gravity)
-    foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, known.config)
+    J, y = no_slip_condition(model, attitude, stands, known.still_from, known.gravity)
+    foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, known)
     fused, sensitivity, innovation, innovation_variance = fuse(raw, variance, J, y, foot_variance)
     posterior.base_angular_acceleration[:] = fused[:3]
     posterior.base_specific_force[:] = fused[3:6]
@@ -297,10 +313,10 @@ def _fuse_accelerations(
     row = 0
     for foot in range(len(stands)):
         if stands[foot]:
-            for i in range(6):
-                posterior.innovation[foot, i] = innovation[row + i]
-                posterior.innovation_variance[foot, i] = innovation_variance[row + i]
-            row += 6
+            for i in range(known.still_from[foot], 6):
+                posterior.innovation[foot, i] = innovation[row]
+                posterior.innovation_variance[foot, i] = innovation_variance[row]
+                row += 1
 
 
 @njit(cache=True)
@@ -322,7 +338,7 @@ def _no_slip_problem(
     posterior, last, measured = posterior[()], last[()], measured[()]
     attitude, model, known = attitude[()], model[()], known[()]
     stands = standing_feet(measured)
-    J, y = no_slip_condition(model, attitude, stands, known.gravity)
+    J, y = no_slip_condition(model, attitude, stands, known.still_from, known.gravity)
     if not _begin(posterior, elapsed, measured, model, known):
         return False, stands, J, y, np.empty(0)
     acceleration = measured_acceleration(last.rate, measured, attitude, model, elapsed, known)
@@ -352,7 +368,7 @@ class JointAccelerationEstimator(RecursiveEstimator):
                                       do not know the swing leg's
         sensitivity           (v, v)  of these three to what gyro, accelerometer and encoders say
         innovation, innovation_variance  (feet, 6)  of the no-slip condition; zero for a foot that
-                                      swings
+                                      swings, and of a point foot's turning
         agreement             (feet, 6)  running mean of the innovation
         rate                  (3,)    the gyro's reading in base axes [rad/s]
     """
@@ -391,7 +407,10 @@ class JointAccelerationEstimator(RecursiveEstimator):
         self._method = config.method
         mount = record(**vars(ImuMount(robot)))
         gravity = robot.plant.gravity_field().gravity_vector()
-        self._known = record(config=config, sensors=sensors, mount=mount, gravity=gravity)
+        still_from = still_rows(robot)
+        self._known = record(
+            config=config, sensors=sensors, mount=mount, gravity=gravity, still_from=still_from
+        )
         legs = [leg.joints for leg in robot.description.legs.values()]
         self._legs = [np.array([robot.joint_names.index(x) for x in joints]) for joints in legs]
         self._measurements = self._declare_record_input("measurements", measurements)

@@ -67,10 +67,13 @@ def _watch_forces(
         if math.isnan(elapsed) or not known.learns_noise or excess == 0.0:
             posterior.force_noise[foot] = 1.0
             continue
-        share = 0.0
+        share, variance = 0.0, known.wrench_variance[foot]
+        # A point foot has no moment.
+        size = 6.0 * (variance > 0.0).sum()
         for i in range(6):
-            bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
-            share += bend * bend / (36.0 * excess * known.wrench_variance[foot, i])
+            if variance[i] > 0.0:
+                bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
+                share += bend * bend / (size * excess * variance[i])
         learnt = excess * (1.0 + learning * (min(LARGEST_SHARE, share) - 1.0))
         posterior.force_noise[foot] = max(1.0, learnt)
 

@@ -310,7 +310,7 @@ def footprints(
     """Footholds, ZMP and CoM seen from above; the soles are taken to be turned as planned.
 
     Args:
-        outlines: corners of each side's sole in its sole frame, (K, 2) [m]; without them a foothold is a cross.
+        outlines: corners of each side's sole in its sole frame, (K, 2) [m]; of a side without it a foothold is a cross.
         pads: places of each side's pads in its sole frame, (pads, 3) [m]; without them no measured ZMP is drawn.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
@@ -320,7 +320,7 @@ def footprints(
         for side in log.sides if has_feet(log, f"{source}/foot/{{}}/position") else ():
             color = _side_color(log, side) if source == "truth" else PLANNED
             for place, R in _footholds(log, side, f"{source}/foot/{side}/position"):
-                if outlines is None:
+                if outlines is None or side not in outlines:
                     axes.plot(
                         *place,
                         "x" if source == "truth" else "+",
