@@ -236,7 +236,8 @@ class FootCreep(ContactEffect):
     def sole_motion(
         pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        # Velocity (v_x, v_y) of the origin and rate w about z so that the pads' forces -F_n (v + w x p) add up to what they are.
+        # Velocity (v_x, v_y) of the origin and rate w about z so that the pads' forces -F_n (v + w x p) add up to what they are; a
+        # point has no such rate.
         x, y, _ = pad_positions.T
         ones, zeros = np.ones_like(x), np.zeros_like(x)
         motion = np.stack(
@@ -245,7 +246,9 @@ class FootCreep(ContactEffect):
         load = np.maximum(pad_force[:, :, 2], _LEAST_LOAD)
         resistance = np.einsum("np,pia,pib->nab", load, motion, motion)
         push = np.einsum("npi,pia->na", pad_force[:, :, :2], motion)
-        rate = -np.linalg.solve(resistance, push[:, :, None])[:, :, 0]
+        known, rate = 3 if len(x) > 1 else 2, np.zeros_like(push)
+        right = push[:, :known, None]
+        rate[:, :known] = -np.linalg.solve(resistance[:, :known, :known], right)[:, :, 0]
         v_x, v_y, w = np.cumsum(rate * np.diff(time, prepend=time[:1])[:, None], axis=0).T
         zero = np.zeros(len(time))
         return np.stack([zero, zero, w], axis=1)[None], np.stack([v_x, v_y, zero], axis=1)[None]

@@ -478,6 +478,7 @@ def _listen_to_foot(
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
     variance, restless = x.foot_innovation_variance[foot], x.foot_restlessness[foot]
+    is_flat = known.is_flat[foot] > 0
 
     own, sensed = light * config.foot_position**2, moving * angle
     z = subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p))
@@ -488,7 +489,7 @@ def _listen_to_foot(
         restless[_FOOT_POSITION] * own + sensed,
     )  # fmt: skip
 
-    if known.is_flat[foot] > 0:
+    if is_flat:
         own, sensed = light * config.foot_orientation**2, turning * angle
         q_BF = quaternion_of(R_BF)
         seen = quaternion_product(quaternion(x.orientation), q_BF)
@@ -519,23 +520,23 @@ def _listen_to_foot(
         restless[_FOOT_VELOCITY] * own + sensed,
     )  # fmt: skip
 
-    if known.is_flat[foot] == 0:
-        return
-    own, sensed = light * config.foot_rate**2, turning * rate + gyro
-    z = add(w, w_BF)
-    noise = _isotropic(own * lasting + sensed)
-    noise[2, 2] += held * own * lasting
-    variance[_FOOT_RATE] = _update(
-        P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
-        agreement[_FOOT_RATE], innovation[_FOOT_RATE],
-        restless[_FOOT_RATE] * own + sensed,
-    )  # fmt: skip
+    if is_flat:
+        own, sensed = light * config.foot_rate**2, turning * rate + gyro
+        z = add(w, w_BF)
+        noise = _isotropic(own * lasting + sensed)
+        noise[2, 2] += held * own * lasting
+        variance[_FOOT_RATE] = _update(
+            P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
+            agreement[_FOOT_RATE], innovation[_FOOT_RATE],
+            restless[_FOOT_RATE] * own + sensed,
+        )  # fmt: skip
     for told in range(_TOLD):
-        restless[told] = _learned_restlessness(
-            restless[told], vector(innovation[told]), variance[told], elapsed
-        )
+        if is_flat or told in (_FOOT_POSITION, _FOOT_VELOCITY):
+            restless[told] = _learned_restlessness(
+                restless[told], vector(innovation[told]), variance[told], elapsed
+            )
 
-    if config.level_ground > 0.0:
+    if is_flat and config.level_ground > 0.0:
         # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
         n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
         noise = _isotropic(config.level_ground**2 * lasting * light)
@@ -652,16 +653,9 @@ def _estimate_base(
 
     Args:
         known: record with the numbers of `InvariantFilter` and `SensorBeliefs`, `mount`, see
-<<<<<<< HEAD
-            `ImuMount`, `pads`, see `FootPads`, `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
-            sure the first posterior is, `origin`, where the middle of the soles is at the start
-            (3,) [m], and the `period` of ticks [s].
-=======
             `ImuMount`, `pads`, see `FootPads`, `is_flat` (feet,), 1 of a foot that is no point,
-            `mass` [kg], `gravity` (3,) [m/s^2], `start`, how
-            sure the first posterior is, and `origin`, where the middle of the soles is at the start
-            (3,) [m].
->>>>>>> 26b3ae5 (Estimators take point feet: they may turn, and tell where they are and that they do not move; a quadruped)
+            `mass` [kg], `gravity` (3,) [m/s^2], `start`, how sure the first posterior is, `origin`,
+            where the middle of the soles is at the start (3,) [m], and the `period` of ticks [s].
     """
     posterior[()] = last[()]
     x, last, measured, model, known = posterior[()], last[()], measured[()], model[()], known[()]

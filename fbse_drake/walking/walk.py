@@ -346,11 +346,12 @@ class Walk:
 
 @dataclass(frozen=True)
 class Trot(Walk):
-    """Walks on four legs from rest to rest: two that are diagonally opposite step together.
+    """Walks on four legs from rest to rest: two that are diagonally opposite step together. Six legs
+    step as two tripods.
 
-    A single support is one by two legs, between which the ZMP rests, and in a double support all
-    stand. Two point feet do not keep the robot from tipping over the line between them: steps are
-    short, and all legs stand often.
+    A single support is one by half of the legs, between which the ZMP rests, and in a double
+    support all stand. Two point feet do not keep the robot from tipping over the line between them:
+    steps are short, and all legs stand often.
     """
 
     step_length: float = 0.03
@@ -370,8 +371,13 @@ class Trot(Walk):
 
     def supports(self, stance: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         self._check_side(stance)
-        if len({tuple(sign) for sign in stance.values() if sign.all()}) != 4:
-            raise InputError("a trot takes four legs, at the corners of the trunk; use Walk")
-        hand = np.prod(stance[self.first_support])
-        first = tuple(side for side, sign in stance.items() if np.prod(sign) == hand)
+        rows = sorted({ahead for ahead, _ in stance.values()})
+        places = {(ahead, left) for ahead, left in stance.values() if left != 0}
+        if len(rows) < 2 or len(places) != len(stance) or len(stance) != 2 * len(rows):
+            raise InputError("a trot takes pairs of legs, one behind the other; use Walk")
+        # A leg steps with neither the one across nor the one behind.
+        hands = {
+            side: (rows.index(ahead) + (left > 0)) % 2 for side, (ahead, left) in stance.items()
+        }
+        first = tuple(side for side in stance if hands[side] == hands[self.first_support])
         return first, tuple(side for side in stance if side not in first)

@@ -147,7 +147,9 @@ def rate_by_legs(motion: RecordedMotion, at: Instants) -> tuple[np.ndarray, np.n
         angular_acceleration=np.zeros_like(at.angular_acceleration),
     )
     of_soles = motion.equation.residual(still)[:, len(motion.robot.joint_names) + 6 :]
-    standing = motion.equation.standing(at.pad_force)
+    # A point foot may turn while it stands.
+    is_flat = [not leg.is_point for leg in motion.robot.description.legs.values()]
+    standing = motion.equation.standing(at.pad_force) & np.array(is_flat)
     rates = np.zeros((len(standing), 3))
     for foot, R_BF in enumerate(motion.equation.sole_rotations(at)):
         here = standing[:, foot] & ~standing[:, :foot].any(axis=1)

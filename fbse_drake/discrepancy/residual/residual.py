@@ -4,7 +4,8 @@ Per plant step, with the base's origin at rest and the measured specific force i
 
     joint and base rows   S tau - (H v_dot + C v - J_m^T f_m)     torque that the motors gave and the links did not get [Nm];
                                                                   six unactuated rows [Nm, N], which no joint effect can touch
-    kinematic rows        of every standing sole, in its frame: angular velocity, and specific force less that of a level resting sole;
+    kinematic rows        of every standing sole but a point foot's, in its frame: angular velocity, and specific force less that of a
+                          level resting sole;
                           while both feet stand also the velocity of one sole relative to the other
 
 All are averaged over blocks of time. Averages of one and the same window have one group delay, telescope what is differentiated, and leave
@@ -724,10 +725,10 @@ class RecordedMotion:
         known &= ~kinematic | ~settling[:, None]
         around = 2 * round(_ROLLING / (self.length * self.period)) + 1
         at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
-        for foot, side in enumerate(self.robot.description.sides):
-            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= at_rest[
-                :, foot, None
-            ]
+        for foot, (side, leg) in enumerate(self.robot.description.legs.items()):
+            # How a point foot is turned while it stands is not known.
+            still = at_rest[:, foot, None] & (not leg.is_point)
+            known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= still
         known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
         return known
 
