@@ -23,6 +23,7 @@ from fbse_drake.walking.reference import JointSines as JointSines
 from fbse_drake.walking.reference import Recorded as Recorded
 from fbse_drake.walking.stand import Squat as Squat
 from fbse_drake.walking.stand import Sway as Sway
+from fbse_drake.walking.walk import Trot as Trot
 from fbse_drake.walking.walk import Walk as Walk
 
 # Simulate, estimate.

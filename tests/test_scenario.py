@@ -92,7 +92,7 @@ def bomb(begin: str, end: str) -> str:
         ),
         (
             "mine: {reference: !Hop {}}",
-            r"reference: expected one of !Walk, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop",
+            r"reference: expected one of !Walk, !Trot, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop",
         ),
         ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
         ("mine: {duration: .nan}", r"duration: expected a finite number, found nan"),
