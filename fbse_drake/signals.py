@@ -90,6 +90,8 @@ _TABLE: list[Signal] = [
     Signal(r"foot/\w+/wrench", "Nm, N", (6,), "measured_pad_force"),
     Signal("joint/torque_measured", "Nm", ("n",), "measured_torque"),
     Signal("joint/temperature", "degC", ("n",), "measured_temperature"),
+    # [moment, force] of the ground on a fixed base, at its origin in its axes.
+    Signal("base/wrench", "Nm, N", (6,), "measured_base_wrench"),
     Signal("joint/voltage_command", "V", ("n",)),
     # 1 where a motor is driven, 0 where its bridge is open.
     Signal("joint/enabled", "1", ("n",)),
@@ -157,6 +159,8 @@ _TABLE: list[Signal] = [
     _status("friction"),
     estimated("joint/friction_torque", "friction", "friction", "Nm", ("n",)),
     estimated("joint/friction_torque_std", "friction", "friction_std", "Nm", ("n",)),
+    # 1 where an actuator is called faulty.
+    estimated("joint/fault", "friction", "fault", "1", ("n",)),
     _own("friction", "parameters", shape=("n", "m")),
     _own("friction", "parameter_variance", shape=("n", "m")),
     _own("friction", "innovation"),

@@ -3,6 +3,7 @@
 from fbse_drake.estimators import (
     actuator_fault,
     adaptive_friction,
+    base_sensor,
     disturbance_observer,
     disturbance_observers,
     fbse,
@@ -18,6 +19,7 @@ from fbse_drake.estimators import (
 __all__ = [
     "actuator_fault",
     "adaptive_friction",
+    "base_sensor",
     "disturbance_observer",
     "disturbance_observers",
     "fbse",

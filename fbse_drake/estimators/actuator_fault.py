@@ -15,9 +15,6 @@ from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.momentum_balance import Balance, MomentumBalance, add_observer
 from fbse_drake.robot.plant import Robot
-from fbse_drake.signals import Signal, estimated
-
-FAULT = estimated("joint/fault", "friction", "fault", "1", ("n",))
 
 
 @in_library
@@ -35,7 +32,6 @@ class ActuatorFault(Estimator):
     knows: ClassVar[str] = "inertia of all links, noise of the sensors"
     measures: ClassVar[str] = "IMU, foot forces"
     tunable: ClassVar[Mapping[str, tuple[float, float]]] = {"walk": (0.1, 30.0)}
-    signals: ClassVar[tuple[Signal, ...]] = (FAULT,)
 
     # Random walk of a fault [Nm/sqrt(s)], and its standard deviation at first [Nm].
     walk: float = 3.0

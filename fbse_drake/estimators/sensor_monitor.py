@@ -311,7 +311,7 @@ def _watch_sensors(
         doubt: of IMU and feet, see there, (1 + feet,).
         known: record with the values of `SensorMonitorConfig` as `limits` and of `SensorBeliefs` as
             `beliefs`; the mass that the feet carry [kg], 0 where they need not; which foot each pad
-            belongs to; the thresholds of `detect_support`; whether joint velocities are
+            belongs to; whether the robot `has_imu`; the thresholds of `detect_support`; whether joint velocities are
             `counted` or `derived`; and how long a `reading` takes, see `Clock`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
@@ -410,6 +410,8 @@ def _watch_sensors(
         for pad in range(len(known.pad_foot)):
             now, before = posterior.pad_force[pad, i], last.pad_force[pad, i]
             posterior.mean.pad_force[pad, i] = now + share * (before - now)
+    if not known.has_imu:
+        trust[1] = _OK
     posterior.status = trust.max()
     detect_support(
         posterior.support,
@@ -500,6 +502,7 @@ class SensorMonitor(RecursiveEstimator):
             derived=bool(beliefs.joint_velocity_derived),
             reading=clock.reading,
             weighed_mass=mass if checks_load else 0.0,
+            has_imu=robot.has_floating_base or bool(robot.description.imu),
             pad_foot=FootPads(robot).foot,
             thresholds=record(
                 on=measured.on * weight, off=measured.off * weight, debounce=measured.debounce

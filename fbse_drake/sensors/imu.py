@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
@@ -59,6 +60,12 @@ class ImuConfig(Sensor):
     def channels(self, robot: Robot, recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """None of a robot that has no IMU."""
         return super().channels(robot, recorded) if robot.description.imu else {}
+
+    def readings(self, robot: Robot, log: Log) -> dict[str, np.ndarray]:
+        """Zeros of a fixed robot that has no IMU, as nobody needs it."""
+        if robot.description.imu or robot.has_floating_base:
+            return super().readings(robot, log)
+        return {"measured_imu": np.zeros((len(log.time), 6))}
 
 
 def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:
