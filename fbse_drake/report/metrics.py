@@ -197,7 +197,10 @@ def friction_error(log: Log) -> np.ndarray:
 
 
 def friction_rmse(log: Log) -> dict[str, dict[str, float]]:
-    """Root mean square of `friction_error` by phase of the joint's leg (`stance`, `swing`) and joint [Nm]; NaN where it is not known."""
+    """Root mean square of `friction_error` by phase of the joint's leg (`stance`, `swing`) and joint [Nm]; NaN where it is not known.
+
+    A joint of no leg, which nothing stands on, swings.
+    """
     return _friction_figures(log, normalised=False)
 
 
@@ -340,12 +343,12 @@ def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, floa
         return figures
     error, truth = friction_error(log), ended_step(log["truth/joint/friction_torque"])
     stands, rows = stance(log), settled(log)
+    never = np.zeros(len(log.time), dtype=bool)
     for joint, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):
-        if side not in stands:
+        if side is not None and side not in stands:
             continue
-        for phase, counted in zip(
-            _PHASES, (rows & stands[side], rows & ~stands[side]), strict=True
-        ):
+        stand = never if side is None else stands[side]
+        for phase, counted in zip(_PHASES, (rows & stand, rows & ~stand), strict=True):
             rmse = float(_rms(error[counted, joint]))
             size = float(_rms(truth[counted, joint])) if normalised else 1.0
             figures[phase][name] = rmse / size if size > 0 else math.nan
