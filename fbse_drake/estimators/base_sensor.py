@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -132,9 +132,9 @@ class LinkModel:
         for index in {*(body.index() for body in self._bodies), *self._carried}:
             body = plant.get_body(index)
             # Of the body's point that is where the world's origin is.
-            p_BoWo_B = plant.CalcPointsPositions(
-                context, world, np.zeros(3), body.body_frame()
-            ).ravel()
+            origin: Any = np.zeros(3)
+            place = plant.CalcPointsPositions(context, world, origin, body.body_frame())
+            p_BoWo_B: Any = place.ravel()
             J = plant.CalcJacobianSpatialVelocity(
                 context, JacobianWrtVariable.kV, body.body_frame(), p_BoWo_B, world, world
             )
@@ -187,8 +187,8 @@ class BaseSensorTorque(RecursiveEstimator):
         tau_i = s_i . (F_base - sum over the links before i of (change of momentum / T - weight))
 
     with its axis s_i and wrenches about the world's origin, where the tick began. No acceleration
-    is needed. Fields are those of `LinkTorqueEstimator` that a friction filter takes, (n,) each,
-    with `link_torque` (n,) [Nm]; and `momentum` (b, 6), `weight` (b, 6) and `axes` (n, 6) of the
+    is needed. Fields are those of `LinkTorqueEstimator` that a friction filter takes, of the tick
+    that ends now (`late` is 0), with `link_torque` (n,) [Nm]; and `momentum` (b, 6), `weight` (b, 6) and `axes` (n, 6) of the
     links now, `velocity` (n,).
     """
 
@@ -208,8 +208,8 @@ class BaseSensorTorque(RecursiveEstimator):
         """
         self._model, self._robot = LinkModel(robot), robot
         n, b = self._model.before.shape
-        of_joint = ("link_torque", "residual", "torque_variance", "impulse_variance")
-        of_joint += ("own_inertia", "valid", "velocity")
+        torques = ("link_torque", "residual", "torque_variance", "impulse_variance")
+        of_joint = (*torques, "own_inertia", "valid", "velocity")
         kind = record_type(
             time=(),
             status=(),
@@ -217,6 +217,8 @@ class BaseSensorTorque(RecursiveEstimator):
             momentum=(b, 6),
             weight=(b, 6),
             axes=(n, 6),
+            late=(),
+            duration=(),
         )
         super().__init__(kind, clock)
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -226,10 +228,9 @@ class BaseSensorTorque(RecursiveEstimator):
         self._to_origin = np.column_stack([self._model.about_the_origin(e) for e in np.eye(6)])
         self._wrench_variance, self._velocity_variance = noise**2, velocity_noise**2
         # Never computed anew: an entry of the cache is what a context can keep for itself.
+        never: Any = ValueProducer.NoopCalc
         self._workspace = self.DeclareCacheEntry(
-            "workspace",
-            ValueProducer(weakly(self._allocate), ValueProducer.NoopCalc),
-            {self.nothing_ticket()},
+            "workspace", ValueProducer(weakly(self._allocate), never), {self.nothing_ticket()}
         )
         self._declare_posterior()
 
@@ -246,12 +247,13 @@ class BaseSensorTorque(RecursiveEstimator):
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         measured, model = self._measurements.Eval(context), self._model
-        command, wrench = self._torque_command.Eval(context), self._wrench.Eval(context)
+        command: np.ndarray = self._torque_command.Eval(context)
+        wrench: Any = self._wrench.Eval(context)
         posterior[...] = last
         posterior["status"] = measured["trust"][0]
         if not math.isfinite(wrench.dot(wrench) + command.dot(command)):
             posterior["status"] = float(Status.NOT_FINITE)
-        plant_context = self._workspace.Eval(context)
+        plant_context: Any = self._workspace.Eval(context)
         self._robot.set_joint_positions(plant_context, measured["joint_position"])
         links, velocity = model.links(plant_context), measured["joint_velocity"]
         posterior["momentum"] = links.momentum @ velocity
@@ -273,4 +275,4 @@ class BaseSensorTorque(RecursiveEstimator):
         to_velocity = np.diag(rotors) - np.einsum("nk,nkj->nj", axes, before)
         posterior["impulse_variance"] = self._velocity_variance * (to_velocity**2).sum(axis=1)
         posterior["own_inertia"] = np.diag(to_velocity)
-        posterior["valid"] = 1.0
+        posterior["valid"], posterior["duration"] = 1.0, elapsed

@@ -1,7 +1,7 @@
 """A six-axis sensor between a fixed robot's base and what it stands on."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.common.value import Value
@@ -85,11 +85,13 @@ class BaseReaction(LeafSystem):
         self.DeclareVectorOutputPort("wrench", 6, weakly(self._calc), sources)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        F_J = self._reactions.Eval(context)[self._joint]
+        reactions: Any = self._reactions.Eval(context)
+        F_J = reactions[self._joint]
         R, p = self._X_BJ.rotation().matrix(), self._X_BJ.translation()
         force = R @ F_J.translational()
         moment = R @ F_J.rotational() + np.cross(p, force)
-        output.SetFromVector(np.concatenate([moment, force]))
+        wrench: Any = np.concatenate([moment, force])
+        output.SetFromVector(wrench)
 
 
 class BaseWrenchSensor(Diagram):
