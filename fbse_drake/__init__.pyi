@@ -130,6 +130,7 @@ from fbse_drake.sensors.sensor import Sensor as Sensor
 from fbse_drake.sensors.encoders import EncoderConfig as EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig as FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig as ImuConfig
+from fbse_drake.sensors.base_wrench import BaseWrench as BaseWrench
 from fbse_drake.sensors.joint_temperature import JointTemperature as JointTemperature
 from fbse_drake.sensors.joint_torque import JointTorqueConfig as JointTorqueConfig
 
@@ -139,6 +140,7 @@ from fbse_drake.estimators.estimator import NoEstimator as NoEstimator
 from fbse_drake.estimators.beliefs import USUAL_SENSORS as USUAL_SENSORS
 from fbse_drake.estimators.beliefs import SensorBeliefs as SensorBeliefs
 from fbse_drake.estimators.actuator_fault import ActuatorFault as ActuatorFault
+from fbse_drake.estimators.base_sensor import BaseSensor as BaseSensor
 from fbse_drake.estimators.adaptive_friction import AdaptiveFriction as AdaptiveFriction
 from fbse_drake.estimators.attitude import AttitudeEstimator as AttitudeEstimator
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver as DisturbanceObserver
