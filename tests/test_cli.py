@@ -201,6 +201,26 @@ cli.entry()
     assert done.stderr == "fbse: interrupted; no file was left half-written\n"
 
 
+def test_ctrl_c_while_drake_is_imported_shows_no_traceback():
+    """Drake's extension modules make an ImportError of an exception in what they import."""
+    script = """
+import os, signal, sys
+class Interrupter:
+    def find_spec(self, name, *_):
+        if name == "pydrake.common.cpp_param":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupter())
+sys.argv = ["fbse", "reveal", "nowhere"]
+# Where the tests run in the background, it would be ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from fbse_drake import cli
+cli.entry()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == FAILED
+    assert done.stderr == "fbse: interrupted; no file was left half-written\n"
+
+
 @pytest.mark.usefixtures("blank_pictures")
 def test_an_interrupted_report_leaves_no_half_written_file(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
