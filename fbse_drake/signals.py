@@ -240,6 +240,11 @@ def channel_kind(channel: str) -> tuple[str, Shape]:
     raise InputError(f"channel {channel}: not a channel of a log ({hint})")
 
 
+def is_channel(name: str) -> bool:
+    """Is there a channel of this name?"""
+    return any(re.fullmatch(row.channel, name) for row in _TABLE)
+
+
 def channels_of(port: str, values: np.ndarray, joints: int) -> dict[str, np.ndarray]:
     """Channels that a port's recorded values become.
 

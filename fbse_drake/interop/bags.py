@@ -5,22 +5,28 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from fbse_drake.errors import InputError, located
+from fbse_drake.files import from_json
 from fbse_drake.interop.mapping import ChannelMap, LogMap
 from fbse_drake.interop.messages import Layout
 from fbse_drake.interop.tables import Growing, Progress, listed, readable
+from fbse_drake.signals import is_channel
 
 JOINT_STATE, IMU, WRENCH = (
     "sensor_msgs/msg/JointState",
     "sensor_msgs/msg/Imu",
     "geometry_msgs/msg/WrenchStamped",
 )
+# What holds channels that have no standard message, and what our own files say beside their channels.
+ARRAY, METADATA = "std_msgs/msg/Float64MultiArray", "fbse_drake"
 # Channel -> field of the standard message.
 _JOINT_STATE_FIELDS = {
     "joint/position": "position",
@@ -149,6 +155,12 @@ class Bag:
                 )
             elif not (name in mapped and mapped[name].topic):
                 channels[name] = ChannelMap(topic=topic, columns=_WRENCH_FIELDS)
+        for topic, kind in present.items():
+            if kind == ARRAY and is_channel(topic[1:]):
+                channels[topic[1:]] = ChannelMap(topic=topic, columns=["data"])
+                # The wrench of a foot whose pads are known is made of these.
+                if topic.endswith("/pad_force"):
+                    channels.pop(topic[1:].replace("pad_force", "wrench"), None)
         return channels, left_out
 
     def first(self, topic: str) -> Layout:
@@ -310,6 +322,22 @@ def open_bag(path: Path) -> Iterator[Bag]:
             raise InputError("empty")
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield Bag(reader)
+
+
+def own_meta(path: Path) -> dict[str, Any]:
+    """What a log that became this bag said beside its channels; nothing in a bag of others.
+
+    Raises:
+        InputError: a damaged bag.
+    """
+    if path.suffix != ".mcap":
+        return {}
+    with readable(path, "a bag"), path.open("rb") as file:
+        for record in make_reader(file).iter_metadata():
+            if record.name == METADATA:
+                meta = from_json(record.metadata.get("meta", ""))
+                return meta if isinstance(meta, dict) else {}
+    return {}
 
 
 def _side(topic: str) -> str | None:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.interop.bags import is_bag, open_bag
+from fbse_drake.interop.bags import is_bag, open_bag, own_meta
 from fbse_drake.interop.mapping import ChannelMap, LogMap, load_map
 from fbse_drake.interop.tables import Progress, Table, listed, open_table
 from fbse_drake.interop.units import si_factor
@@ -36,6 +36,8 @@ class _Recording:
     channels: dict[str, np.ndarray]
     constants: dict[str, float | str]
     findings: list[str]
+    # What our own log said that became the file.
+    meta: dict[str, Any] = field(default_factory=dict)
 
 
 def read_log(path: Path, log_map: str | Path | None = None) -> Log:
@@ -255,6 +257,7 @@ def _read_bag(path: Path, log_map: LogMap, progress: Progress) -> _Recording:
         made,
         {},
         [*left_out, *foreign],
+        own_meta(path),
     )
 
 
@@ -431,7 +434,7 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
     sides = dict.fromkeys(
         match[1] for name in channels if (match := re.match(r"foot/(\w+)/", name))
     )
-    meta = {
+    meta: dict[str, Any] = {
         "joints": list(first.joints),
         "sides": list(sides),
         "period": log_map.period or float(f"{np.median(np.diff(channels['time'])):.6g}"),
@@ -444,6 +447,12 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
             for finding in r.findings
         ],
     }
+    if first.meta and not several:
+        made = {key: meta[key] for key in ("joints", "sides", "period")}
+        # Its stretches are those of its own time.
+        moved = {"segments": segments} if first.origin else {}
+        left_out = {"findings": first.findings} if first.findings else {}
+        meta = first.meta | made | moved | left_out
     log = Log(channels, meta | ({"pads": log_map.pads} if log_map.pads else {}))
     check_recorded(log)
     return log

@@ -9,11 +9,21 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.files import write_atomically
-from fbse_drake.interop.bags import IMU, JOINT_STATE, WRENCH
+from fbse_drake.files import to_json, write_atomically
+from fbse_drake.interop.bags import ARRAY, IMU, JOINT_STATE, METADATA, WRENCH
 from fbse_drake.interop.messages import Layout
 from fbse_drake.log import Log
 
+# Fields of the standard messages, and the channels that they hold.
+_NAMES = {
+    "/joint_states": {
+        "position": "joint/position",
+        "velocity": "joint/velocity",
+        "effort": "joint/torque_command",
+    },
+    "/imu": {field: f"imu/{field}" for field in ("angular_velocity", "linear_acceleration")},
+}
+_IN_STANDARD_MESSAGES = {"time", *(name for of in _NAMES.values() for name in of.values())}
 # Messages that are made at a time.
 _BLOCK = 4096
 
@@ -33,6 +43,8 @@ def writer_for(path: Path) -> Callable[[Log, Path], None]:
 def write_mcap(log: Log, path: Path) -> None:
     """Writes the sensors' channels as ROS 2 messages: sensor_msgs/JointState on /joint_states (effort is the commanded torque),
     sensor_msgs/Imu on /imu and geometry_msgs/WrenchStamped on /foot/<side>/wrench, at the sole frame `<side>_sole`.
+    Every other channel becomes std_msgs/Float64MultiArray on the topic of its name, as /estimate/com/position.
+    The units are in the metadata of the topics, and what the log says beside its channels in the file's: it can be read back.
 
     Raises:
         InputError: times are negative, or it is not known where a foot's force sensors are.
@@ -57,7 +69,12 @@ def write_mcap(log: Log, path: Path) -> None:
                 )
                 raw = bytes(store.serialize_cdr(message, kind))
                 layout = Layout.of(raw, kind, store.fielddefs, cdr=True)
-                made.append((writer.register_channel(topic, "cdr", schema), layout, raw, fields))
+                units = {field: log.unit(name) for field, name in _NAMES.get(topic, {}).items()}
+                if kind == ARRAY:
+                    units = {"data": log.unit(topic[1:])}
+                channel = writer.register_channel(topic, "cdr", schema, metadata=units)
+                made.append((channel, layout, raw, fields))
+            writer.add_metadata(METADATA, {"meta": to_json(log.meta)})
             for start in range(0, len(stamps), _BLOCK):
                 rows = slice(start, start + _BLOCK)
                 stamp = np.stack(np.divmod(stamps[rows], 10**9), axis=1)
@@ -67,7 +84,7 @@ def write_mcap(log: Log, path: Path) -> None:
                         layout.encode(
                             raw,
                             {
-                                "header.stamp": stamp,
+                                **({"header.stamp": stamp} if layout.width("header.stamp") else {}),
                                 **{name: values[rows] for name, values in fields.items()},
                             },
                         ),
@@ -119,26 +136,14 @@ def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[st
     def zero() -> Any:
         return types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
 
-    joints = {
-        field: log[name]
-        for field, name in (
-            ("position", "joint/position"),
-            ("velocity", "joint/velocity"),
-            ("effort", "joint/torque_command"),
-        )
-        if name in log
-    }
+    joints = {field: log[name] for field, name in _NAMES["/joint_states"].items() if name in log}
     values = [
         np.zeros(len(log.joints) if field in joints else 0)
         for field in ("position", "velocity", "effort")
     ]
     yield "/joint_states", types[JOINT_STATE](header(""), list(log.joints), *values), joints
 
-    imu = {
-        field: log[f"imu/{field}"]
-        for field in ("angular_velocity", "linear_acceleration")
-        if f"imu/{field}" in log
-    }
+    imu = {field: log[name] for field, name in _NAMES["/imu"].items() if name in log}
     if imu:
         # The convention for: no orientation is measured.
         no_orientation = np.array([-1.0, *np.zeros(8)])
@@ -150,6 +155,13 @@ def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[st
             ),
             imu,
         )
+
+    wrenches = {f"foot/{side}/wrench" for side in log.sides}
+    for name, values in log.items():
+        if name not in _IN_STANDARD_MESSAGES and name not in wrenches:
+            rows = values.reshape(len(values), -1)
+            layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
+            yield f"/{name}", types[ARRAY](layout, np.zeros(rows.shape[1])), {"data": rows}
 
     for side in log.sides:
         wrench = _wrench(log, side)
