@@ -250,5 +250,8 @@ def library() -> dict[str, type[Effect]]:
 
 def spaced(name: str) -> str:
     """An effect's class name for reading: `CoulombFriction` -> `Coulomb friction`."""
-    first, *rest = "".join(f" {letter}" if letter.isupper() else letter for letter in name).split()
-    return " ".join(["IMU" if first == "Imu" else first, *(part.lower() for part in rest)])
+    words = "".join(f" {letter}" if letter.isupper() else letter for letter in name).split()
+    first, rest = words[:1], words[1:]
+    return " ".join(
+        ["IMU" if word == "Imu" else word for word in first] + [w.lower() for w in rest]
+    )
