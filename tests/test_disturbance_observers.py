@@ -1,5 +1,6 @@
 """Observers that take friction for a disturbance or a fault, against closed forms."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import cont2discrete
 from scipy.stats import binom, chi2
 
-from fbse_drake import InputError, Log
+from fbse_drake import InputError, Log, build_station
 from fbse_drake.control.compensation import FaultReconfiguration
 from fbse_drake.estimators.actuator_fault import (
     ActuatorFault,
@@ -140,6 +141,18 @@ def test_only_what_a_faulty_actuator_loses_is_compensated():
     for _ in range(200):
         torque = rig.tick(friction_estimate=np.array([0.7, 0.7]), **faults)["torque"]
     np.testing.assert_allclose(torque, [0.7, 0.0], atol=1e-9)
+
+
+def test_reconfiguration_needs_an_estimator_that_isolates_faults():
+    isolating, watching = (
+        dataclasses.replace(
+            scenario("squat"), estimator=estimator, compensation=FaultReconfiguration()
+        )
+        for estimator in (ActuatorFault(), DisturbanceObserver())
+    )
+    assert build_station(isolating)
+    with pytest.raises(InputError, match="compensation: input estimate/joint/fault: there is no"):
+        build_station(watching)
 
 
 def test_gauss_seidel_comes_to_least_squares_and_stays_within_limits():
