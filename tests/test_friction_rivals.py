@@ -11,7 +11,7 @@ from conftest import scenario
 from scipy.stats import t as student
 
 from fbse_drake import Log, build_station, load_scenario
-from fbse_drake.cli import BAD_INPUT, main
+from fbse_drake.cli import BAD_INPUT, DONE, main
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
@@ -256,6 +256,20 @@ def test_runs_tune_watch_and_feed_back(monkeypatch: pytest.MonkeyPatch, tmp_path
     tracking = {who: walk["tracking"] for who, walk in loops.items()}
     assert tracking[sensor.text] != tracking[runs.UNCOMPENSATED]
     assert tracking[sensor.text] == pytest.approx(tracking[runs.ORACLE], rel=0.1)
+
+
+def test_the_command_writes_what_was_compared(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("fbse_drake.rivals.campaign.compare_methods", lambda *_: made_up())
+    assert main(["rivals", "paper_walk", "--seeds", "2", "--out", str(tmp_path)]) == DONE
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written >= {"rivals.json", "metrics.json", "report.html", "scenario.yaml"}
+    content = json.loads((tmp_path / "rivals.json").read_text())
+    assert content["seeds"] == 2
+    assert content["ahead_of_fbse"][0]["joint"] == "hip"
+    told = capsys.readouterr().out
+    assert "!DisturbanceObserver is ahead of !Fbse in hip in stance" in told
 
 
 def test_bad_input_gets_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path):
