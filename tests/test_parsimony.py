@@ -182,17 +182,29 @@ def test_slow_errors_of_the_model_are_no_findings(swing: tuple[Scenario, Log]):
     assert low < 3.0 < high
 
 
+@pytest.mark.parametrize(("size", "named"), [(0.7, {"CoulombFriction"}), (3.0, set())])
+def test_a_law_names_a_row_only_if_it_explains_half_of_it(
+    swing: tuple[Scenario, Log], size: float, named: set[str]
+):
+    """Coulomb friction of 1 Nm beside a vibration that the library does not have."""
+    law, time = coulomb(1.0), swing[1].time
+    diagnosis = diagnosis_of(swing, {LEFT: lambda v: law(v) + size * np.sin(23.0 * time)})
+    assert diagnosis.verdict == "unknown_effect"
+    assert set(found(diagnosis)) == named
+    assert [structure.row for structure in diagnosis.unexplained] == [LEFT]
+
+
 def friction_in_all_joints(
     swing: tuple[Scenario, Log], size: float
 ) -> tuple[Proposals, Explanation]:
-    """Coulomb friction of many sizes beside slow random walks of all torques, and its fit."""
+    """Coulomb friction, so many times slow random walks of the torques of all joints, and its fit."""
     scenario, log = swing
-    random = np.random.default_rng(2)
+    random = np.random.default_rng(3)
     torque = log["joint/torque_command"].copy()
     walks = np.cumsum(random.standard_normal(torque.shape), axis=0)
-    torque += 0.5 * walks / walks.std(axis=0) + NOISE * random.standard_normal(torque.shape)
-    sizes = size * (1.0 + 0.1 * np.arange(torque.shape[1]))
-    torque += sizes * np.tanh(log["joint/velocity"] / 0.01)
+    walks += size * walks.std(axis=0) * np.tanh(log["joint/velocity"] / 0.01)
+    sizes = 0.5 + 0.05 * np.arange(torque.shape[1])
+    torque += sizes * walks / walks.std(axis=0) + NOISE * random.standard_normal(torque.shape)
     log = Log(log.channels | {"joint/torque_command": torque}, log.meta)
     laws = [library()[name] for name in FRICTION[:2]]
     proposals = Proposals(Fits(Dictionary(Predictor(scenario, log), laws)))
@@ -203,14 +215,14 @@ def friction_in_all_joints(
 
 
 def test_joints_prove_together_what_none_proves_alone(swing: tuple[Scenario, Log]):
-    proposals, explanation = friction_in_all_joints(swing, 0.4)
+    proposals, explanation = friction_in_all_joints(swing, 1.3)
     judge = Judge(proposals.fits, explanation)
     for member in explanation.candidates:
         rest = [c for c in explanation.candidates if c is not member]
         assert not judge.pays(proposals.fits.explain(rest), explanation, member)
     kept = frugal(proposals, explanation).candidates
     assert {c.name for c in kept} == {"CoulombFriction"}
-    assert sum(len(c.targets) for c in kept) >= 6
+    assert sum(len(c.targets) for c in kept) >= 4
 
 
 def test_slow_errors_of_all_joints_prove_nothing_together(swing: tuple[Scenario, Log]):

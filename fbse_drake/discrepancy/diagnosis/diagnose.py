@@ -257,7 +257,7 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
     alternatives: dict[int, list[Explanation]] = {}
     try:
         if partial is None and dictionary.inertia is None:
-            path[-1], alternatives = settled(proposals, path[-1])
+            path[-1], alternatives = _settled_and_frugal(proposals, path[-1])
     except Interrupted as stop:
         partial = str(stop)
     final, inertia = consistent(proposals.fits, path[-1])
@@ -272,6 +272,21 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
     return _Search(
         proposals, path, alternatives, first.white.sse, inertia, unexplained, disturbed, partial
     )
+
+
+def _settled_and_frugal(
+    proposals: Proposals, explanation: Explanation
+) -> tuple[Explanation, dict[int, list[Explanation]]]:
+    """A frugal explanation whose members no rival beats, and their rivals.
+
+    What took another's place has to pay as well.
+    """
+    final, found = settled(proposals, explanation)
+    if final is not explanation:
+        smaller = frugal(proposals, final)
+        if smaller is not final:
+            return smaller, rivals(proposals, smaller)
+    return final, found
 
 
 def _steps(path: Sequence[Explanation], before: float) -> tuple[SelectionStep, ...]:

@@ -31,7 +31,8 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 # Level of the region of confidence that must not contain "no effect".
 _CONFIDENCE = 0.95
 # Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what is
-# required speaks for itself.
+# required speaks for itself, unless it leaves more unexplained than it takes: of a row that nobody
+# explains any law takes some.
 _PLAIN = 3.0
 # Share of the upper end of a range from which on a value counts as at its end.
 _AT_THE_END = 0.98
@@ -92,6 +93,10 @@ def _smaller(
     for member in (c for c in by_gain if not pays(c)):
         alike = [c for c in by_gain if _is_one_law(c, member) and not pays(c)]
         if len(alike) < 2 or not judge.pay_together(explanation, alike, without):
+            yield without[member]
+    explained = judge.explained(explanation)
+    for member in by_gain:
+        if not explained[member.signature.rows].any():
             yield without[member]
     yield from _on_fewer_targets(proposals, judge, explanation)
     yield from _reduced(proposals, judge, explanation)
@@ -176,26 +181,45 @@ class Judge:
         """
         gain = self.gain(rest, whole)
         required = self._fits.needed_drop(sum(c.signature.values.shape[2] for c in members))
-        repeated = any(_is_repeated(rest, member) for member in members)
-        return gain >= required and (
-            (gain >= _PLAIN * required and not repeated) or are_more_than_nothing(whole, members)
+        plain = gain >= _PLAIN * required and all(
+            self._stands_out(rest, whole, member.signature.rows, 1.0)
+            and not _is_repeated(rest, member)
+            for member in members
         )
+        return gain >= required and (plain or are_more_than_nothing(whole, members))
 
     def _is_sound(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
         """Does a member worsen no row, stand out in one, and have values that can be?"""
         fits, rows = self._fits, member.signature.rows
         return (
             self.gain_by_row(rest, whole)[rows].min() > -MARGIN
-            and self._stands_out(rest, whole, rows)
+            and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
         )
 
-    def _stands_out(self, rest: Explanation, whole: Explanation, rows: np.ndarray) -> bool:
-        """Is what a member takes off any of its rows large beside what nobody explains there?"""
+    def _stands_out(
+        self, rest: Explanation, whole: Explanation, rows: np.ndarray, share: float
+    ) -> bool:
+        """Is what a member takes off any of its rows this share of what nobody explains there?"""
         taken = (rest.held_out_sse - whole.held_out_sse)[rows]
         left = (whole.held_out_sse - self._fits.white.count)[rows]
-        return bool(np.any((taken > 0) & (taken >= _LEAST_OF_REST * left)))
+        return bool(np.any((taken > 0) & (taken >= share * left)))
+
+    def explained(self, explanation: Explanation) -> np.ndarray:
+        """Of which rows do the members that act on them explain at least half, beyond the noise, (R,)?
+
+        Of a row that stays a riddle any law takes some: what takes less than it leaves is no name for it.
+        """
+        fits, members = self._fits, explanation.candidates
+        result = np.ones(len(fits.white.count), dtype=bool)
+        for row in np.unique(np.concatenate([[], *(c.signature.rows for c in members)])).astype(
+            int
+        ):
+            rest = fits.explain([c for c in members if row not in c.signature.rows])
+            left = explanation.held_out_sse[row]
+            result[row] = rest.held_out_sse[row] - left >= left - fits.white.count[row]
+        return result
 
     def is_as_good(self, smaller: Explanation, explanation: Explanation) -> bool:
         """May chance have brought what an explanation has more than one with fewer parameters?
