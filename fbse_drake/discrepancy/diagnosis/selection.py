@@ -19,6 +19,8 @@ _MOST_EFFECTS = 16
 _MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
+# No more than so many standard deviations of what is believed of it beforehand, if anything is.
+_DISBELIEVED = 3.0
 
 
 def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
@@ -144,6 +146,9 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         widest = max(abs(bound) for bound in plausible)
         if low <= value <= high and abs(value) <= widest:
             continue
+        # What is believed beforehand to be this small is not so large, however sure a fit is.
+        if abs(value) > max(widest, _DISBELIEVED * added.parameters[name].belief):
+            return False
         deviation, (least, most) = wider.fit.deviation[part][k], wider.fit.interval()[part][k]
         allowed = 3 * deviation
         if not issubclass(added.effect, JointTorqueEffect):
