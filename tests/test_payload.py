@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 import yaml
 from pydrake.multibody.tree import MultibodyForces
+from recorded_arm import ARM
 from rig import robot_copy
 
 from fbse_drake import Log, Scenario, load_scenario, resources
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.identify import identify
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.selection import is_significant
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, untrusted_inertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.effects.effect import library
@@ -332,3 +336,19 @@ def test_a_fit_takes_no_more_mass_off_a_body_than_it_has() -> None:
     robot, _ = make_robot("arm")
     assert BodyMass.lowest_values(robot, "link_5").tolist() == [-2.0]
     assert Payload.lowest_values(robot, "link_5")[0] == 0.0
+
+
+def test_a_load_lies_within_reach_of_its_body() -> None:
+    """However well one a body's length away would fit, as it may where feet are measured wrongly."""
+    unsure = dataclasses.replace(ARM, torque_noise=tuple(20 * noise for noise in ARM.torque_noise))
+    predictor = unsure.predictor(unsure.log(unsure.course()))
+    fits = Fits(Dictionary(predictor, [Payload]))
+    base, load = fits.explain([]), fits.fixed_candidates[-1]
+    fitted = fits.explain([load])
+
+    def is_found(x: float) -> bool:
+        fit = dataclasses.replace(fitted.fit, parameters=np.array([2.0, x, 0, 0, 0, 0, 0]))
+        wider = dataclasses.replace(fitted, fit=fit, deviance=base.deviance - 1e4)
+        return is_significant(fits, base, wider, load)
+
+    assert [is_found(x) for x in (0.4, 1.2, 1.51)] == [True, True, False]
