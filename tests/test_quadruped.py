@@ -82,6 +82,21 @@ def test_diagonal_legs_step_together_and_the_zmp_is_between_them(trot: Reference
         np.testing.assert_allclose(plan.zmp[k], (one + other) / 2, atol=1e-9)
 
 
+def test_a_hexapod_is_a_description_and_walks_on_tripods():
+    robot = make_robot("hexapod")[0]
+    walk = Trot(wheelbase=0.7, single_supports=2)
+    plan = make_reference(walk, robot, np.arange(0, 1.5, 0.02)).plan
+    tripods = [set(phase.support) for phase in plan.phases if phase.is_single]
+    assert tripods == [
+        {"front_left", "middle_right", "rear_left"},
+        {"front_right", "middle_left", "rear_right"},
+    ]
+    for side, foot in plan.feet.items():
+        assert foot.position[0, 0] == pytest.approx(
+            {"front": 0.35, "middle": 0.0, "rear": -0.35}[side.split("_")[0]]
+        )
+
+
 def test_feet_are_loaded_and_relieved_smoothly(trot: Reference):
     weights = foot_weights(trot.plan)
     np.testing.assert_allclose(weights.sum(axis=1), 2.0)

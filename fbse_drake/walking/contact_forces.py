@@ -3,15 +3,14 @@
 import numpy as np
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
-from fbse_drake.robot.plant import grasp_map
 from fbse_drake.walking.plan import TaskPlan, smooth_step
 
 # Tangential over normal force that any ground bears on which one walks.
 _CONE = 0.5
 # How much the forces' squares count beside those of the missing wrench [1].
 _SMALLNESS = 1e-4
-# A foot with less than this weight carries nothing.
-_LEAST_WEIGHT = 1e-9
+# A foot with less than this weight carries nothing; less force [N] beyond a cone is none.
+_LEAST_WEIGHT, _LEAST_FORCE = 1e-9, 1e-6
 
 
 def foot_weights(plan: TaskPlan) -> np.ndarray:
@@ -61,16 +60,25 @@ def contact_forces(
     size = np.sqrt(np.einsum("np,npi,npi->n", share, arm, arm))[:, None]
     scaled = wrench.copy()
     scaled[:, :3] = (wrench[:, :3] - np.cross(middle, wrench[:, 3:])) / size
-    result = np.empty_like(points)
-    for k in range(len(points)):
-        A = grasp_map(arm[k] / size[k]) * np.repeat(root[k], 3)
-        normal = A @ A.T + _SMALLNESS * np.eye(6)
-        force = (np.repeat(root[k], 3) * (A.T @ np.linalg.solve(normal, scaled[k]))).reshape(-1, 3)
-        slack = cone * force[:, 2] - np.linalg.norm(force[:, :2], axis=1)
-        if slack.min() < -_LEAST_WEIGHT:
-            force = _in_cones(A, scaled[k], root[k], cone)
-        result[k] = force
+    # Of root times each force: the least squares without cones, which mostly are not in the way.
+    A = _grasp_maps(arm / size[:, :, None], root)
+    A_T = A.transpose(0, 2, 1)
+    dual = np.linalg.solve(A @ A_T + _SMALLNESS * np.eye(6), scaled[:, :, None])
+    result = root[:, :, None] * (A_T @ dual).reshape(points.shape)
+    slack = cone * result[:, :, 2] - np.linalg.norm(result[:, :, :2], axis=2)
+    for k in np.flatnonzero(slack.min(axis=1) < -_LEAST_FORCE):
+        result[k] = _in_cones(A[k], scaled[k], root[k], cone)
     return result
+
+
+def _grasp_maps(arm: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """What the wrench [moment, force] is of forces with these arms (N, points, 3), each times its
+    root (N, points); (N, 6, 3 points)."""
+    maps = np.zeros((len(arm), 6, arm.shape[1], 3))
+    for axis, unit in enumerate(np.eye(3)):
+        maps[:, :3, :, axis] = np.cross(arm, unit).transpose(0, 2, 1)
+        maps[:, 3 + axis, :, axis] = 1.0
+    return (maps * root[:, None, :, None]).reshape(len(arm), 6, -1)
 
 
 def _in_cones(A: np.ndarray, wrench: np.ndarray, root: np.ndarray, cone: float) -> np.ndarray:

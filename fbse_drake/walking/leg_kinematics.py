@@ -174,9 +174,10 @@ class LegKinematics:
         q = np.tile(self.middle, (len(p_BF), 1)) if start is None else start
         for _ in range(_MAX_ITERATIONS):
             R, p, J = self._pose(q)
-            turn = Rotation.from_matrix(R_BF @ R.transpose(0, 2, 1)).as_rotvec()
-            error = np.concatenate([turn, p_BF - p], axis=1)[:, self.ruled]
-            J = J[:, self.ruled]
+            J, error = J[:, self.ruled], p_BF - p
+            if J.shape[1] == 6:
+                turn = Rotation.from_matrix(R_BF @ R.transpose(0, 2, 1)).as_rotvec()
+                error = np.concatenate([turn, error], axis=1)
             size = np.linalg.norm(error, axis=1)
             if size.max() < _POSE_TOLERANCE:
                 return q
