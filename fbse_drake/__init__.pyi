@@ -51,6 +51,7 @@ from fbse_drake.analysis import study as study
 from fbse_drake.discrepancy.diagnosis.compare import Bin as Bin
 from fbse_drake.discrepancy.diagnosis.compare import Channel as Channel
 from fbse_drake.discrepancy.diagnosis.compare import Failure as Failure
+from fbse_drake.discrepancy.diagnosis.compare import words as words
 from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus as EffectStatus
 from fbse_drake.discrepancy.diagnosis.diagnose import Estimate as Estimate
 from fbse_drake.discrepancy.diagnosis.diagnose import Finding as Finding
@@ -172,8 +173,10 @@ from fbse_drake.libraries import estimators_by_name as estimators_by_name
 from fbse_drake.libraries import sensors_by_name as sensors_by_name
 
 # Figures and numbers, each of a log or of a result.
+from fbse_drake.report import discrepancy_figures as discrepancy_figures
 from fbse_drake.report import figures as figures
 from fbse_drake.report import metrics as metrics
+from fbse_drake.report.sentences import parameters_text as parameters_text
 
 # Command line, errors, progress.
 from fbse_drake.cli import main as main

@@ -17,6 +17,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
+from matplotlib.figure import Figure
+
 from fbse_drake.discrepancy.diagnosis import add as addition
 from fbse_drake.discrepancy.diagnosis import compare as comparing
 from fbse_drake.discrepancy.diagnosis import diagnose as diagnosing
@@ -42,18 +44,17 @@ from fbse_drake.interop.export import writer_for
 from fbse_drake.interop.models import write_mjcf, write_urdf
 from fbse_drake.log import Log, joined
 from fbse_drake.progress import Progress, silent
+from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy import (
-    Inputs,
-    compare_outcome,
-    diagnosis_outcome,
+    write_compare_report,
+    write_diagnosis_report,
+    write_study_report,
+)
+from fbse_drake.report.discrepancy_tables import (
     failures_table,
     findings_table,
     spread_tables,
     steps_table,
-    study_outcome,
-    write_compare_report,
-    write_diagnosis_report,
-    write_study_report,
 )
 from fbse_drake.report.html import Table
 from fbse_drake.report.identification import (
@@ -61,6 +62,7 @@ from fbse_drake.report.identification import (
     identification_outcome,
     write_identification_report,
 )
+from fbse_drake.report.sentences import Inputs, compare_outcome, diagnosis_outcome, study_outcome
 from fbse_drake.results import Result, made_folder
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, dump_scenario
@@ -231,6 +233,11 @@ class ComparisonResult(Comparison, AnalysisResult):
     def table(self) -> Table:
         return failures_table(self)
 
+    def picture(self) -> Figure:
+        """The errors on the robot, in its mean posture, and by phase."""
+        posture = self.case.predictor.motion.blocks.joint_position.mean(axis=0)
+        return figures.robot_errors(self.robot, self, posture)
+
     def _json(self) -> dict[str, Any]:
         return comparing.comparison_json(self)
 
@@ -251,6 +258,10 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
 
     def table(self) -> Table:
         return findings_table(self.ranking)
+
+    def picture(self) -> Figure:
+        """What was chosen and its rivals, by the error that they leave."""
+        return figures.ranking(self.ranking)
 
     def further_tables(self) -> list[Table]:
         return spread_tables(self.chosen)
@@ -277,6 +288,10 @@ class StudyResult(Study, AnalysisResult):
 
     def table(self) -> Table:
         return steps_table(self, tested=bool(self.case.tests))
+
+    def picture(self) -> Figure:
+        """The error falling, step by step."""
+        return figures.falling_error(self.steps, figures.small_motions(self.robot))
 
     def _json(self) -> dict[str, Any]:
         return studying.study_json(self)
@@ -305,6 +320,11 @@ class IdentificationResult(Identification, AnalysisResult):
 
     def table(self) -> Table:
         return errors_table(self)
+
+    @property
+    def identifiability(self) -> str:
+        """What the log can say of inertial parameters at all, in two sentences."""
+        return identifying.identifiability_text(self.inertia)
 
     def further_tables(self) -> list[Table]:
         return spread_tables(self.findings)

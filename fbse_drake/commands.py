@@ -39,13 +39,14 @@ from fbse_drake.listing import listing
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, ProgressLines
 from fbse_drake.reference import json_schema
-from fbse_drake.report.discrepancy import Inputs, findings_table, parameter_text
 from fbse_drake.report.discrepancy_figures import targets_text
+from fbse_drake.report.discrepancy_tables import findings_table
 from fbse_drake.report.html import Table as ReportTable
 from fbse_drake.report.html import number, percent
 from fbse_drake.report.identification import base_table
 from fbse_drake.report.metrics import worst_joint
 from fbse_drake.report.run import law_sentence
+from fbse_drake.report.sentences import Inputs, parameter_text
 from fbse_drake.results import RunResult
 from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
 from fbse_drake.simulate import SimulationResult, simulate

@@ -21,7 +21,7 @@ from fbse_drake.discrepancy.diagnosis.validation import batch_length, root_of_ra
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.files import write_text
-from fbse_drake.report.discrepancy import diagnosis_outcome, study_outcome
+from fbse_drake.report.sentences import diagnosis_outcome, study_outcome
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, dump_scenario
 
 NOISE, KNEE = 0.05, "left_knee_pitch"

@@ -774,3 +774,8 @@ def by_effect(findings: Sequence[Finding]) -> dict[str, list[str]]:
         targets = result.setdefault(finding.effect, [])
         targets.extend(target for target in finding.targets if target not in targets)
     return result
+
+
+def small_motions(robot: Robot) -> str:
+    """Unit of small motions of its joints."""
+    return ", ".join(dict.fromkeys("mrad" if unit == "Nm" else "mm" for unit in robot.torque_units))

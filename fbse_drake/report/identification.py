@@ -5,9 +5,10 @@ from pathlib import Path
 from fbse_drake.discrepancy.diagnosis.identify import Identification, identifiability_text
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, BaseParameter
 from fbse_drake.effects.inertia import InertialParameters
-from fbse_drake.report.discrepancy import parameters_text, spread_tables
 from fbse_drake.report.discrepancy_figures import spaced, targets_text
+from fbse_drake.report.discrepancy_tables import spread_tables
 from fbse_drake.report.html import Details, Report, Section, Table, number, write_report
+from fbse_drake.report.sentences import parameters_text
 from fbse_drake.scenario import dump_scenario
 
 BASE_HEADER = ("combination", "unit", "model", "identified", "95 % interval", "known to")

@@ -1,0 +1,412 @@
+"""What was found, in sentences: for the terminal, for notebooks and at the head of reports."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fbse_drake.discrepancy.diagnosis.compare import Comparison, words
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, Estimate, Finding
+from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance
+from fbse_drake.discrepancy.diagnosis.study import Study
+from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
+from fbse_drake.discrepancy.hygiene.hygiene import Hygiene
+from fbse_drake.report import discrepancy_figures as figures
+from fbse_drake.report.discrepancy_figures import (
+    by_effect,
+    spaced,
+    targets_text,
+)
+from fbse_drake.report.html import (
+    number,
+)
+
+# So many rows of a disturbance are named.
+_DISTURBED = 3
+
+_COURSES = {
+    "falls": "the error falls",
+    "rises": "the error rises",
+    "unclear": "the error does not fall beyond doubt",
+}
+
+# Effects that are called after somebody.
+_NAMES = ("Coulomb", "Stribeck", "IMU")
+
+_KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of the soles"}
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What was compared, in the words of the command line, for the commands that a report proposes."""
+
+    # Of the scenario.
+    name: str
+    scenario: str
+    logs: tuple[str, ...]
+    # Folder of the results.
+    out: str
+    # Further logs to test on.
+    tests: tuple[str, ...] = ()
+    # What is remarkable about the log.
+    hygiene: Hygiene = field(default_factory=Hygiene)
+
+
+def compare_outcome(comparison: Comparison) -> str:
+    """The result of a comparison in one sentence."""
+    if not comparison.failures:
+        return f"No failure above the noise: the model's error is {number(comparison.rmse)} times that of the sensors."
+    channels = len({failure.row.name for failure in comparison.failures})
+    return (
+        f"The model's error is {number(comparison.rmse)} times the sensors' noise and stands out in {channels} of "
+        f"{len(comparison.channels)} channels. Worst: {comparison.failures[0].text}."
+    )
+
+
+def diagnosis_outcome(diagnosis: Diagnosis) -> str:
+    """The verdict in one or two sentences."""
+    if diagnosis.partial is not None:
+        return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
+    parts = [_verdict(diagnosis)]
+    parts += [_disturbed(one) for one in diagnosis.disturbances]
+    if _disagreement(diagnosis.chosen):
+        parts.append(_disagreement(diagnosis.chosen))
+    if diagnosis.averaging is not None and diagnosis.averaging.text:
+        parts.append(diagnosis.averaging.text)
+    return _headline(" ".join(parts), diagnosis.set_aside)
+
+
+def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
+    """A result with what it is worth on data that was set aside; if that is nothing, it comes first."""
+    refuted = {name: one for name, one in set_aside.items() if one.course != "falls"}
+    confirmed = {name: one for name, one in set_aside.items() if one.course == "falls"}
+    before = [f"Not confirmed: {_course(name, one)}." for name, one in refuted.items()]
+    after = [f"{as_sentence(_course(name, one))}" for name, one in confirmed.items()]
+    return " ".join([*before, result, *after])
+
+
+def _course(log: str, validation: Validation) -> str:
+    """As `on the rest of the log, which was set aside, the error falls from 4.20 to 0.99 (0.95 to 1.03) times the sensors' noise`."""
+    before, after = validation.before, validation.after
+    text = (
+        f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: from {number(before.value)} to "
+        f"{number(after.value)} ({_between(after, 1.0)}) times the sensors' noise"
+    )
+    if np.isfinite(validation.relative_after.value):
+        shares = validation.relative_before, validation.relative_after
+        text += f", from {number(100 * shares[0].value)} to {number(100 * shares[1].value)} % ({_between(shares[1], 100.0)}) of the torque"
+    return text
+
+
+def _between(measured: Measured, factor: float) -> str:
+    """As `0.95 to 1.03`."""
+    low, high = (factor * bound for bound in measured.interval)
+    return f"{number(low)} to {number(high)}" if np.isfinite(high) else "too short for an interval"
+
+
+def _set_aside_name(log: str) -> str:
+    return f"the {log}" if log == "rest of the log" else log
+
+
+def set_aside_rows(set_aside: Mapping[str, Validation]) -> list[tuple[str, str]]:
+    """What data that was set aside says, as a row of the summary."""
+    if not set_aside:
+        return []
+    texts = [
+        f"{as_sentence(_course(name, one))} That is {number(one.change.value)} ({_between(one.change, 1.0)}) of it."
+        for name, one in set_aside.items()
+    ]
+    return [("On data set aside", " ".join([*texts, "Intervals are 95 %, by batch means."]))]
+
+
+def is_confirmed(set_aside: Mapping[str, Validation]) -> bool:
+    """Is the model better on all data that was set aside?"""
+    return all(one.course == "falls" for one in set_aside.values())
+
+
+def _disturbed(disturbance: Disturbance) -> str:
+    """As `Something acted on left knee pitch from 3.21 to 3.43 s, once; that was left out.`"""
+    rows = _enumerated([words(row) for row in disturbance.rows[:_DISTURBED]])
+    more = len(disturbance.rows) - _DISTURBED
+    return (
+        f"Something acted on {rows}{f' and {more} more rows' if more > 0 else ''} from "
+        f"{disturbance.start:.2f} to {disturbance.end:.2f} s and not again; that was left out of the fit."
+    )
+
+
+def _disagreement(findings: Sequence[Finding]) -> str:
+    """Says of which findings recordings do not agree; empty if they do."""
+    unlike = [f for f in findings if any(s.differs for s in f.spread.values())]
+    return f"The recordings do not agree in {listed_effects(unlike)}." if unlike else ""
+
+
+def too_small_rows(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """What is too small to matter, as a row of the summary."""
+    if not findings:
+        return []
+    return [
+        (
+            "Too small to matter",
+            f"{listed_effects(findings)}: at most {100 * max(f.share for f in findings):.2g} % of what these rows are made of.",
+        )
+    ]
+
+
+def _partly(diagnosis: Diagnosis) -> str:
+    """What is known of a search that ended early."""
+    if not diagnosis.chosen:
+        return "Nothing was found until then; that rules nothing out."
+    return f"Until then it seems that the model lacks {listed_effects(diagnosis.chosen)}; rivals were not compared."
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    found = listed_effects(diagnosis.chosen)
+    if diagnosis.verdict == "effect_found":
+        doubtful = dict.fromkeys(
+            name for finding in diagnosis.chosen for name in finding.confusable_with
+        )
+        return f"The model lacks {found}{f'; this log cannot tell that from {either_effect(doubtful)}' if doubtful else ''}."
+    if diagnosis.verdict == "nothing_missing":
+        return f"Nothing is missing: what the model leaves over is the sensors' noise ({number(diagnosis.held_out_before)} times it)."
+    if diagnosis.verdict == "not_visible":
+        statuses = applicable(diagnosis.effects)
+        hidden = sum(status.verdict == "not_visible" for status in statuses.values())
+        return f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} effects would not show in it."
+    known = f" The model also lacks {found}." if found else ""
+    return f"{_unexplained(diagnosis)}{known}"
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    places = ", ".join(
+        f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained
+    )
+    return f"Something is missing that no effect of the library explains, in {places}."
+
+
+def study_outcome(study: Study) -> str:
+    """The result of a study in one or two sentences."""
+    if study.partial and not study.diagnoses[-1].partial:
+        return f"Partial: {study.stopped_because}. {_study_result(study)}"
+    if study.partial and study.found:
+        return f"Partial: {study.stopped_because} before the search was through. {_study_result(study)}"
+    return _study_result(study)
+
+
+def _study_result(study: Study) -> str:
+    if not study.found:
+        return diagnosis_outcome(study.diagnoses[-1])
+    result = f"The model lacked {listed_effects(study.found)}."
+    if study.set_aside:
+        result = _headline(result, study.set_aside)
+    else:
+        first, last = study.steps[0], study.steps[-1]
+        course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
+        result += (
+            f" With it, the held-out error {course} from {number(first.held_out_rmse)} to {number(last.held_out_rmse)} times "
+            "the sensors' noise; no data was set aside to test that."
+        )
+    if study.diagnoses[-1].verdict == "unknown_effect":
+        result += f" {_unexplained(study.diagnoses[-1])}"
+    return result
+
+
+def how_sure(
+    found: Sequence[Finding], before: float, after: float, train: float, *, partial: bool = False
+) -> str:
+    """What supports a verdict.
+
+    Args:
+        before, after, train: error on blocks held out in turn without and with what was found, and
+            on the data that it was fitted to, in multiples of the sensors' noise.
+        partial: the search ended before it was through.
+    """
+    if found:
+        return (
+            f"On blocks that were held out in turn, the error of all channels falls from {number(before)} to {number(after)} times the "
+            f"sensors' noise ({number(train)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
+        )
+    nothing = (
+        "nothing was found by then" if partial else "no effect makes it smaller on held-out data"
+    )
+    return f"The error of all channels is {number(before)} times the sensors' noise, and {nothing}."
+
+
+def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
+    """What to do, with the command."""
+    steps = _experiments_next(diagnosis, diagnosis.chosen)
+    if diagnosis.chosen:
+        steps.append(
+            f"Add it to the model: fbse add {inputs.scenario} {inputs.out} --out {inputs.name}_completed.yaml"
+        )
+    return (
+        " ".join(steps)
+        or "Nothing. A motion that loads and moves the joints more would show smaller effects."
+    )
+
+
+def step_after_study(study: Study, inputs: Inputs) -> str:
+    """What to do after a study, with the command."""
+    last = study.diagnoses[-1]
+    if not study.found:
+        return next_step(last, inputs)
+    steps = _experiments_next(last, study.found)
+    steps.append(
+        f"Try the completed model on a log that it has not seen: fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
+    )
+    return " ".join(steps)
+
+
+def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[str]:
+    """What to look at and which experiments to make."""
+    statuses = applicable(diagnosis.effects)
+    doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
+    steps = []
+    if diagnosis.partial is not None:
+        steps.append("Let it look for longer: the same command with more time.")
+    elif diagnosis.verdict == "unknown_effect":
+        steps.append(
+            "Look at the pictures of the channels that are left, and register an effect of your own that looks like them."
+        )
+    if doubtful:
+        steps.append(f"To tell them apart: {_experiments(doubtful)}")
+    if diagnosis.partial is None and diagnosis.verdict == "not_visible":
+        hidden = {
+            name: status for name, status in statuses.items() if status.verdict == "not_visible"
+        }
+        steps.append(f"Record a motion that shows more: {_experiments(hidden)}")
+    return steps
+
+
+def parameter_text(name: str, estimate: Estimate) -> str:
+    """As `coulomb 1.02 Nm (0.98 to 1.06)`."""
+    low, high = estimate.interval
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return f"{words(name)} {estimate.value:.3g}{unit} ({low:.3g} to {high:.3g})"
+
+
+def parameters_text(finding: Finding) -> str:
+    """All parameters with their 95 % intervals."""
+    return ", ".join(
+        parameter_text(name, estimate) for name, estimate in finding.parameters.items()
+    )
+
+
+def times_noise(value: float) -> str:
+    """As `2.31 times the sensors' noise`."""
+    return f"{number(value)} times the sensors' noise"
+
+
+def as_sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def listed_effects(findings: Sequence[Finding]) -> str:
+    """Effects and where, as `Coulomb friction and torque bias in left knee pitch and body mass in trunk`; for the inside of a sentence."""
+    by_place: dict[tuple[str, ...], list[str]] = {}
+    for effect, targets in by_effect(findings).items():
+        by_place.setdefault(tuple(targets), []).append(effect)
+    return _enumerated([_effects_in(effects, targets) for targets, effects in by_place.items()])
+
+
+def _enumerated(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
+
+
+def _effects_in(effects: Sequence[str], targets: Sequence[str]) -> str:
+    names = _enumerated([_inside(effect) for effect in effects])
+    return (
+        names if list(targets) == ["robot"] else f"{names} in {targets_text(targets, effects[0])}"
+    )
+
+
+def _inside(effect: str) -> str:
+    """An effect's name inside a sentence."""
+    name = spaced(effect)
+    return name if name.startswith(_NAMES) else name[0].lower() + name[1:]
+
+
+def either_effect(effects: Iterable[str]) -> str:
+    """Effects for reading, as `Coulomb friction or torque bias`."""
+    return " or ".join(_inside(effect) for effect in effects)
+
+
+def what_else(found: Sequence[Finding], *, partial: bool) -> str:
+    """What explains the log as well."""
+    if partial:
+        return "The search ended before other effects of the library were compared."
+    equal: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in found:
+        equal.setdefault(finding.confusable_with, []).append(finding)
+    told = [
+        f"{as_sentence(either_effect(names))[:-1]} explains this log as well as {listed_effects(findings)}."
+        for names, findings in equal.items()
+        if names
+    ]
+    if told:
+        return " ".join(told)
+    if not found:
+        return "Nothing else in the library: an effect smaller than the sizes below would not have shown."
+    return "No other effect of the library explains this log as well."
+
+
+def _experiments(statuses: dict[str, EffectStatus]) -> str:
+    """What would show effects, each experiment once."""
+    texts: dict[str, list[str]] = {}
+    for name, status in statuses.items():
+        command = f" ({status.command})" if status.command else ""
+        texts.setdefault(f"{status.experiment.rstrip('.')}{command}.", []).append(spaced(name))
+    return " ".join(f"{text} [{', '.join(names)}]" for text, names in texts.items())
+
+
+def kinds_of_failures(comparison: Comparison) -> str:
+    """How many channels of each kind stand out from the noise."""
+    failing = {failure.row.name for failure in comparison.failures}
+    counts = {
+        kind: [c.row.name in failing for c in comparison.channels if c.row.kind == kind]
+        for kind in _KINDS
+    }
+    return (
+        "In "
+        + ", ".join(
+            f"{sum(fails)} of {len(fails)} {_KINDS[kind]}"
+            for kind, fails in counts.items()
+            if fails
+        )
+        + "."
+    )
+
+
+def applicable(statuses: Mapping[str, EffectStatus]) -> dict[str, EffectStatus]:
+    """Effects that there is a place for on this robot: an arm has no feet."""
+    return {name: status for name, status in statuses.items() if status.smallest_detectable}
+
+
+def statuses_of(study: Study) -> dict[str, EffectStatus]:
+    """What all rounds together say of every effect: the last one, but for what was found before and what stood for it as well."""
+    found = {finding.effect for finding in study.found}
+    equal = {name for finding in study.found for name in finding.confusable_with}
+    return {
+        name: replace(
+            status,
+            verdict="present"
+            if name in found
+            else "confusable"
+            if name in equal
+            else status.verdict,
+        )
+        for name, status in applicable(study.diagnoses[-1].effects).items()
+    }
+
+
+def verdicts_text(statuses: Mapping[str, EffectStatus]) -> str:
+    """How many effects of the library have each verdict."""
+    if not statuses:
+        return "The search ended before it could say what else there is."
+    verdicts = [status.verdict for status in statuses.values()]
+    counts = ", ".join(
+        f"{verdicts.count(name)} {words(name)}"
+        for name in figures.VERDICT_COLORS
+        if name in verdicts
+    )
+    return f"{len(verdicts)} effects: {counts}. Absent means that it would have been seen."
