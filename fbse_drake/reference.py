@@ -135,7 +135,9 @@ def _comments(config: type) -> dict[str, str]:
                 comment = [*([] if ended else comment), line.removeprefix("    # ")]
                 ended = False
             elif match := _FIELD.match(line):
-                found[match[1]] = " ".join(comment)
+                # What it has no comment of its own for, it has inherited, or shares with the last.
+                if not ended or match[1] not in found:
+                    found[match[1]] = " ".join(comment)
                 ended = True
             elif not line.strip():
                 comment = []
