@@ -76,6 +76,8 @@ def test_stored_content(path):
     assert notebook.metadata.kernelspec.name == "python3"
     assert errors(notebook) == []
     assert [cell.id for cell in notebook.cells if "pydrake.all" in cell.source] == []
+    # What a reader copies is public.
+    assert [cell.id for cell in notebook.cells if "from fbse_drake." in cell.source] == []
     assert path.stat().st_size < 1.5e6
 
 
