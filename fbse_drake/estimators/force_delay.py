@@ -17,19 +17,22 @@ _LEAST = 0.5
 # By how much of itself a tick may be longer or shorter for its velocities' difference to be an
 # acceleration that is worth comparing, and for its number to be a time.
 _UNEVEN = 0.01
+# Time constant by which readings are smoothed before they are compared [s].
+_SMOOTHING = 0.005
 # How much of the way in which forces change the other sensors must explain to tell their delay.
-_EXPLAINED = 0.5
+_EXPLAINED = 0.9
 # By how much more likely another delay must be, as the logarithm of the ratio, before it counts,
 # and for how long [s]: noise that begins reaches the sensors of some ticks ago last, which looks
 # better until it does.
-_EVIDENCE, _LASTING = 30.0, 2.0 * _LONGEST
+_EVIDENCE, _LASTING = 5.0, 2.0 * _LONGEST
 
 
 def force_delay_type(clock: Clock) -> np.dtype:
     """What `watch_force_delay` remembers, of delays of 0, 1, ... ticks.
 
-    `shown` (delays, 3), how the centre of mass accelerated so many ticks ago [m/s^2]; `filled`, how
-    many of these are known; sums over the last time, of these, `total` (delays, 3), of their
+    `smooth` (2, 3), smoothed readings of how the centre of mass accelerates, by the other sensors
+    and by the forces; `shown` (delays, 3), the former so many ticks ago [m/s^2]; `filled`, how many
+    of these are known; sums over the last time, of these, `total` (delays, 3), of their
     `square` and of their product `cross` with the forces, (delays,), and of the forces,
     `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `contradicted`, for
     how long another delay has been better [s]; and the `delay` [s].
@@ -37,7 +40,7 @@ def force_delay_type(clock: Clock) -> np.dtype:
     delays = delays_of(clock)
     shapes = {"shown": (delays, 3), "total": (delays, 3), "square": (delays,), "cross": (delays,)}
     numbers = ("push_square", "filled", "count", "contradicted", "delay")
-    return record_type(**shapes, push_total=(3,), **dict.fromkeys(numbers, ()))
+    return record_type(**shapes, smooth=(2, 3), push_total=(3,), **dict.fromkeys(numbers, ()))
 
 
 def delays_of(clock: Clock) -> int:
@@ -94,6 +97,12 @@ def watch_force_delay(
     if abs(elapsed - period) > _UNEVEN * period:
         forget_force_delay(x)
         return
+    # Accelerations are differences of velocities, whose noise averages out fast.
+    blend = 1.0 - math.exp(-elapsed / _SMOOTHING) if x.filled > 0 else 1.0
+    for i in range(3):
+        x.smooth[0, i] += blend * (acceleration[i] - x.smooth[0, i])
+        x.smooth[1, i] += blend * (push[i] - x.smooth[1, i])
+    acceleration, push = vector(x.smooth[0]), vector(x.smooth[1])
     for age in range(len(x.shown) - 1, 0, -1):
         x.shown[age] = x.shown[age - 1]
     put(x.shown[0], acceleration)
@@ -119,10 +128,13 @@ def watch_force_delay(
         if mismatch[late] < mismatch[best]:
             best = late
     variance = max(noise**2, mismatch[best] / (3.0 * x.count))
-    is_known = x.count * elapsed > _LEAST * _MEMORY
+    # At the longest delay the true one may be longer.
+    is_known = x.count * elapsed > _LEAST * _MEMORY and best < len(mismatch) - 1
     is_explained = mismatch[best] < (1.0 - _EXPLAINED) * push_square
     gained = mismatch[round(x.delay / period)] - mismatch[best]
-    is_better = is_known and is_explained and gained > 2.0 * _EVIDENCE * variance
+    # Of the smoothed readings so many are as good as one.
+    alike = 1.0 + 2.0 * _SMOOTHING / period
+    is_better = is_known and is_explained and gained > 2.0 * _EVIDENCE * variance * alike
     x.contradicted = x.contradicted + elapsed if is_better else 0.0
     if x.contradicted > _LASTING:
         x.delay, x.contradicted = best * period, 0.0
