@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.rivals import fitted
@@ -159,3 +160,9 @@ def test_a_rival_is_compared_where_it_fits(crooked: Predictor) -> None:
     assert there.deviance < at_zero.deviance - 3 * MARGIN
     errors = np.abs(there.fit.parameters - [0.02, -0.028, 0.0])
     assert np.all(errors < 3 * there.fit.deviation + 1e-4)
+
+
+def test_experiments_of_an_arm_are_planned() -> None:
+    """Another scenario's estimator may need sensors that the arm does not have."""
+    experiments = Experiments(ARM.scenario)
+    assert experiments.that_shows(library()["CoulombFriction"]) is not None

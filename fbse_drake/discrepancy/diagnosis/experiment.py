@@ -63,9 +63,10 @@ def planned_log(scenario: Scenario) -> Log:
 
     def sampled(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
-        return np.stack([np.interp(fine, coarse, column) for column in flat.T], axis=1).reshape(
-            len(fine), *values.shape[1:]
-        )
+        result = np.empty((len(fine), flat.shape[1]))
+        for k, column in enumerate(flat.T):
+            result[:, k] = np.interp(fine, coarse, column)
+        return result.reshape(len(fine), *values.shape[1:])
 
     channels = {
         "time": fine,
@@ -127,8 +128,15 @@ class Experiments:
         found = {}
         for name, other in _motions(self._scenario).items():
             model = replace(self._scenario.believed, gantry_height=other.robot.gantry_height)
-            wanted = replace(other, model=model, sensors=self._scenario.sensors)
             try:
+                # With our sensors, to which the other's estimator need not fit.
+                wanted = replace(
+                    other,
+                    model=model,
+                    sensors=self._scenario.sensors,
+                    estimator=self._scenario.estimator,
+                    compensation=self._scenario.compensation,
+                )
                 found[name] = Predictor(wanted, planned_log(wanted))
             except InputError:
                 continue  # A motion that this robot cannot make shows nothing.
