@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.fuzz import mutations
 from benchmarks.fuzz.files import KINDS, Kind
 from fbse_drake.cli import BAD_INPUT
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, on_one_line
 from fbse_drake.log import Log
 from fbse_drake.schema import load_tree
 
@@ -100,8 +100,9 @@ def _judged(verdict: Verdict, kind: Kind, *, drawn: bool) -> Verdict:
         with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()), picture:
             try:
                 status = kind.run(verdict.command)
-            except InputError as error:
-                print(f"fbse: {error}", file=sys.stderr)
+            # As the command line does.
+            except (InputError, OSError) as error:
+                print(f"fbse: {on_one_line(str(error))}", file=sys.stderr)
                 status = BAD_INPUT
     except TimeLimit:
         problem, details = "hang", traceback.format_exc()
