@@ -26,7 +26,7 @@ from fbse_drake import Log, Scenario, build_station, load_scenario, simulate
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sampling import state_views
 from fbse_drake.sensors.errors import held_signal
-from fbse_drake.simulate import add_record, recorded_ports
+from fbse_drake.simulation import add_record, recorded_ports
 
 # Of the motion, as much as this [s].
 _DURATION = 6.0

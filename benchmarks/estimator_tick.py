@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from fbse_drake import Log, Scenario, load_scenario, simulate
-from fbse_drake.estimate import Replay
+from fbse_drake.estimation import Replay
 from fbse_drake.estimators.recursive import RecursiveEstimator
 from fbse_drake.robot.plant import make_robot
 

@@ -36,7 +36,7 @@ from scipy.signal import lfilter
 
 from benchmarks.console import print_table
 from fbse_drake import Log, Scenario, load_scenario, simulate
-from fbse_drake.estimate import Replay
+from fbse_drake.estimation import Replay
 from fbse_drake.estimators.estimator import EstimatorDiagram, NoEstimator
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Table

@@ -24,7 +24,7 @@ from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, schema, simulate
 from fbse_drake.campaign.steps import Material
 from fbse_drake.effects.friction import CoulombViscousFriction
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.identification import identify
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Report, Section, Table, write_report

@@ -26,7 +26,7 @@ from benchmarks.console import print_table
 from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.campaign.steps import Material
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.files import write_json

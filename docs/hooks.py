@@ -122,7 +122,7 @@ def api() -> str:
     """Every public name, in the groups of the stub."""
     stub = ROOT / "fbse_drake/__init__.pyi"
     places = {
-        statement.lineno: (statement.module, alias.name, alias.asname)
+        statement.lineno: (f"fbse_drake.{statement.module}", alias.name, alias.asname)
         for statement in ast.parse(stub.read_text()).body
         if isinstance(statement, ast.ImportFrom)
         for alias in statement.names

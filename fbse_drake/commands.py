@@ -30,7 +30,7 @@ from fbse_drake.discrepancy.exercises.hidden import make_exercise, seal
 from fbse_drake.effects.effect import spaced
 from fbse_drake.effects.user import require_trusted
 from fbse_drake.errors import InputError, located, on_one_line
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.files import origin, read_json, to_json, write_atomically, write_json, write_text
 from fbse_drake.init_robot import init_robot
 from fbse_drake.interop.convert import read_log, read_logs
@@ -49,7 +49,7 @@ from fbse_drake.report.run import law_sentence
 from fbse_drake.report.sentences import Inputs, parameter_text
 from fbse_drake.results import RunResult
 from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
-from fbse_drake.simulate import SimulationResult, simulate
+from fbse_drake.simulation import SimulationResult, simulate
 
 # Failures and findings that are printed.
 _SHOWN = 8

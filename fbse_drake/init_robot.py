@@ -19,7 +19,7 @@ from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.robot.proposal import propose
 from fbse_drake.scenario import load_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 from fbse_drake.walking.reference import Reference, make_reference
 from fbse_drake.walking.stand import Squat
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.framework import System
 
 from fbse_drake import Log, Scenario, resources
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.estimator import Estimator, EstimatorDiagram, make_estimator
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.records import as_record, size_of

@@ -12,7 +12,7 @@ from rig import BENT, CLOCK, TICK, Base, Replay, Rig, diagram, inputs_of, number
 from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log, load_scenario
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
 from fbse_drake.estimators.base_state import (
     AdaptiveLipm,

@@ -18,7 +18,7 @@ from fbse_drake.cli import BAD_INPUT, DONE, main
 from fbse_drake.discrepancy.diagnosis.study import study
 from fbse_drake.discrepancy.exercises.hidden import make_exercise
 from fbse_drake.errors import InputError
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.report.metrics import run_metrics
 
 pytest.importorskip("distributed")

@@ -21,7 +21,7 @@ from fbse_drake.console import Console
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.user import require_trusted
 from fbse_drake.schema import load_tree
-from fbse_drake.simulate import fall_reason
+from fbse_drake.simulation import fall_reason
 
 FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
 # One foot swings from 0.5 s on.
@@ -171,7 +171,7 @@ def test_an_interrupted_run_keeps_what_was_recorded(
         os.kill(os.getpid(), signal.SIGINT)
         return fall_reason(*arguments)
 
-    monkeypatch.setattr(import_module("fbse_drake.simulate"), "fall_reason", interrupted)
+    monkeypatch.setattr(import_module("fbse_drake.simulation"), "fall_reason", interrupted)
     assert main(["simulate", "squat", "--out", str(tmp_path), "--quiet"]) == FAILED
     message = capsys.readouterr().err
     assert "interrupted" in message

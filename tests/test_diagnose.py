@@ -32,7 +32,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted
 from fbse_drake.scenario import IdentifyConfig, Scenario, load_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 
 # Effects that look alike, and some that do not; the whole library is tried by `make hidden`.
 NAMES = (

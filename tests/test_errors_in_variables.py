@@ -20,7 +20,7 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 from fbse_drake.walking.reference import JointSines
 
 # As large as the torque's own deviation, which is what a current sensor gives of a light joint [Nm].

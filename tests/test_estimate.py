@@ -8,7 +8,7 @@ import pytest
 from conftest import scenario
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import NoEstimator, make_estimator
 from fbse_drake.estimators.fbse import Fbse

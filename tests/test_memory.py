@@ -21,7 +21,7 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.residual.residual import EquationOfMotion
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.wiring import release
 
 _PAGE = 4096 / 2**20

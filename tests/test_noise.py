@@ -17,7 +17,7 @@ from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 from fbse_drake.walking.reference import JointSines
 
 TORQUE_NOISE, VELOCITY_NOISE = 0.03, 1e-3

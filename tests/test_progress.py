@@ -69,12 +69,3 @@ def test_help_waits_for_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "diagnose" in done.stdout
-
-
-def test_the_package_offers_functions_also_after_modules_of_their_names_are_imported() -> None:
-    code = (
-        "import fbse_drake.simulate, fbse_drake.estimate\n"
-        "from fbse_drake import simulate, estimate\nprint(callable(simulate), callable(estimate))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "True"]

@@ -17,7 +17,7 @@ from fbse_drake.discrepancy.residual.residual import rms
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.sensor import FootForceGain, FootForceLag, FootForceMisalignment
 from fbse_drake.errors import InputError
-from fbse_drake.estimate import EstimationResult, estimate
+from fbse_drake.estimation import EstimationResult, estimate
 from fbse_drake.interop.convert import read_log
 from fbse_drake.log import Log
 from fbse_drake.resources import folder

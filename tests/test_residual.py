@@ -14,7 +14,7 @@ from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, R
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 
 
 def believed(scenario: Scenario) -> Scenario:

@@ -33,7 +33,7 @@ from fbse_drake.effects.sensor import (
     SensorSignals,
     TransmissionElasticity,
 )
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.robot.plant import Ground, PointMass, Robot, make_robot
 from fbse_drake.scenario import RobotConfig, build_robot
 

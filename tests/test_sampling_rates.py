@@ -8,7 +8,7 @@ from conftest import scenario
 from rig import rms
 
 from fbse_drake import Log, simulate
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.recursive import start_share
 
 Run = Callable[..., Log]

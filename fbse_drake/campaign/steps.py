@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 from fbse_drake.campaign.columns import Column, run_columns, run_figures
 from fbse_drake.discrepancy.exercises.sizes import Size
 from fbse_drake.errors import InputError
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.interop.convert import read_log
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.robot.description import load_description
 from fbse_drake.scenario import Scenario, ScenarioTree
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 
 if TYPE_CHECKING:
     from fbse_drake.discrepancy.exercises.hidden import Answer

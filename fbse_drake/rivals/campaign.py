@@ -7,7 +7,7 @@ from typing import Any
 
 from fbse_drake.campaign.campaign import Run
 from fbse_drake.campaign.results import StoredRuns
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.resources import package_checksum
@@ -15,7 +15,7 @@ from fbse_drake.rivals import runs
 from fbse_drake.rivals.comparison import Comparison
 from fbse_drake.rivals.methods import measured, methods, tuning_walk
 from fbse_drake.scenario import Scenario, dump_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 
 
 @dataclass(frozen=True)

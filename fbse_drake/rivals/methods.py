@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from fbse_drake import schema
 from fbse_drake.errors import InputError
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.estimator import Estimator, library, make_estimator
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import friction_nrmse

@@ -16,7 +16,7 @@ from pydrake.common.yaml import yaml_load
 
 from fbse_drake.campaign.steps import Material
 from fbse_drake.control.compensation import IntegralCompensation, NoCompensation
-from fbse_drake.estimate import estimate
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.estimators.true_friction import TrueFriction
 from fbse_drake.log import Log
@@ -25,7 +25,7 @@ from fbse_drake.resources import package_checksum
 from fbse_drake.rivals.cases import CASES, without_friction
 from fbse_drake.rivals.methods import Method, Tuned, counted, measured, tune, tuning_walk
 from fbse_drake.scenario import Scenario, ScenarioTree
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 
 # Walks that no method is in, beside which those with one are seen.
 UNCOMPENSATED, ORACLE, FRICTIONLESS = "no compensation", "true friction", "no friction"

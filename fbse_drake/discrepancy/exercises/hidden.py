@@ -22,7 +22,7 @@ from fbse_drake.log import Log
 from fbse_drake.results import made_folder
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, dump_scenario
-from fbse_drake.simulate import simulate
+from fbse_drake.simulation import simulate
 from fbse_drake.walking.reference import Reference, make_reference
 
 Kind = Literal["library", "decoy", "stranger"]

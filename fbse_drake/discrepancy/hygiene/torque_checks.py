@@ -92,8 +92,10 @@ def _test(evidence: Evidence, torques: JointTorques, k: int, found: _Found) -> N
         as_recorded = torques.as_recorded(k, columns)
         if torque.std() < _DEAD * needed and is_better(torques.nothing(k), as_recorded):
             return "dead"
-        scaled = torques.scaled(k, columns)
-        if is_better(torques.scaled(k, columns, sign=-1.0), scaled):
+        scaled, turned = torques.scaled(k, columns), torques.scaled(k, columns, sign=-1.0)
+        # The other sign is that of what the model needs, not of a spring that moves alike.
+        shown = turned.amounts[-1] * needed > _DEAD * torque.std()
+        if shown and is_better(turned, scaled):
             return "reversed"
         if _has_one_sign(raw) and is_better(torques.without_sign(k, columns), scaled):
             return "lost"

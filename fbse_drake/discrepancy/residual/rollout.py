@@ -21,7 +21,7 @@ from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RobotConfig, Scenario
 from fbse_drake.signals import channels_of
-from fbse_drake.simulate import INTERRUPTED, add_record, simulate
+from fbse_drake.simulation import INTERRUPTED, add_record, simulate
 from fbse_drake.station import build_station
 from fbse_drake.walking.reference import Recorded, RecordedReference
 from fbse_drake.wiring import release
