@@ -157,6 +157,18 @@ def _name(run: Run) -> str:
     return ", ".join(filter(None, (run.scenario, f"seed={run.seed}", *values)))
 
 
+def local_cluster(workers: int | None = None) -> LocalCluster:
+    """A cluster of this machine's cores, or of so many workers; each is a process with a thread."""
+    # Samples of what a worker does cost its thread some 5 %, and nobody reads them.
+    with dask.config.set({"distributed.worker.profile.enabled": False}):
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address="localhost:0",
+            silence_logs=logging.CRITICAL,
+        )
+
+
 @contextmanager
 def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
     """A client of the scheduler, or of one that is started with workers for as long."""
@@ -170,15 +182,5 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
         with client:
             yield client
         return
-    with (
-        # Its samples of what a worker does cost the worker's thread some 5 %, and nobody reads them.
-        dask.config.set({"distributed.worker.profile.enabled": False}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address="localhost:0",
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
+    with local_cluster(workers) as cluster, Client(cluster, set_as_default=False) as client:
         yield client
