@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 from fbse_drake import signals
 from fbse_drake.cli import _parser
 from fbse_drake.libraries import effects_by_name, estimators_by_name, sensors_by_name
-from fbse_drake.reference import keys, mappings, parts_of
+from fbse_drake.scenario_keys import keys, mappings, parts_of
 
 ROOT = Path(__file__).resolve().parent.parent
 

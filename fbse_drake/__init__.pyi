@@ -145,8 +145,8 @@ from .estimators.base_sensor import BaseSensor as BaseSensor
 from .estimators.adaptive_friction import AdaptiveFriction as AdaptiveFriction
 from .estimators.attitude import AttitudeEstimator as AttitudeEstimator
 from .estimators.disturbance_observer import DisturbanceObserver as DisturbanceObserver
-from .estimators.disturbance_observers import ExtendedState as ExtendedState
-from .estimators.disturbance_observers import FilteredDisturbance as FilteredDisturbance
+from .estimators.extended_state import ExtendedState as ExtendedState
+from .estimators.q_filter import FilteredDisturbance as FilteredDisturbance
 from .estimators.fbse import Fbse as Fbse
 from .estimators.filtered_model import FilteredModel as FilteredModel
 from .estimators.fixed_friction import FixedFriction as FixedFriction

@@ -38,7 +38,6 @@ from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
 from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, ProgressLines
-from fbse_drake.reference import json_schema
 from fbse_drake.report.discrepancy_figures import targets_text
 from fbse_drake.report.discrepancy_tables import findings_table
 from fbse_drake.report.html import Table as ReportTable
@@ -49,6 +48,7 @@ from fbse_drake.report.run import law_sentence
 from fbse_drake.report.sentences import Inputs, parameter_text
 from fbse_drake.results import RunResult
 from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
+from fbse_drake.scenario_keys import json_schema
 from fbse_drake.simulation import SimulationResult, simulate
 
 # Failures and findings that are printed.

@@ -199,7 +199,7 @@ _Dumper.add_representer(_Tagged, lambda dumper, value: dumper.represent_mapping(
 def _tree(schema: Any, value: Any) -> Any:
     """The plain tree of a value: what is None is left out, alternatives are tagged."""
     origin, args = typing.get_origin(schema), typing.get_args(schema)
-    if origin in (typing.Union, types.UnionType) or _alternatives(schema):
+    if origin in (typing.Union, types.UnionType) or alternatives_of(schema):
         tree = _tree(type(value), value)
         optional = len(args) == 2 and type(None) in args
         return tree if optional else _Tagged(f"!{type(value).__name__}", tree)
@@ -211,7 +211,7 @@ def _tree(schema: Any, value: Any) -> Any:
         return _tagged(value)
     if schema in _SCALARS or origin is typing.Literal:
         return value
-    fields = {name: (kind, getattr(value, name)) for name, kind in _fields(schema).items()}
+    fields = {name: (kind, getattr(value, name)) for name, kind in fields_of(schema).items()}
     return {name: _tree(kind, item) for name, (kind, item) in fields.items() if item is not None}
 
 
@@ -233,7 +233,7 @@ def _known_part(schema: Any, value: Any) -> Any:
     if origin is dict and isinstance(value, dict):
         return {key: _known_part(args[1], item) for key, item in value.items()}
     if dataclasses.is_dataclass(schema) and isinstance(value, dict):
-        fields = _fields(schema)
+        fields = fields_of(schema)
         return {k: _known_part(fields[k], item) for k, item in value.items() if k in fields}
     return value
 
@@ -251,8 +251,8 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
             allowed = ", ".join(map(str, args))
             raise InputError(f"{file}{key}: expected one of {allowed}; found {describe(value)}")
         return value
-    if _alternatives(schema):
-        return _alternative(_alternatives(schema), value, default, file, key)
+    if alternatives_of(schema):
+        return _alternative(alternatives_of(schema), value, default, file, key)
     if origin is list:
         if not isinstance(value, (list, tuple)):
             raise InputError(f"{file}{key}: expected a list, found {describe(value)}")
@@ -270,7 +270,7 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
     return _mapping(schema, value, default, file, key)
 
 
-def _alternatives(schema: Any) -> tuple[Any, ...]:
+def alternatives_of(schema: Any) -> tuple[Any, ...]:
     """What an open class can be: its own static method `alternatives` says so. A union says it by itself."""
     return schema.alternatives() if "alternatives" in vars(schema) else ()
 
@@ -317,7 +317,7 @@ def _alternative(options: tuple[Any, ...], value: Any, default: Any, file: str, 
 def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
     if not isinstance(value, collections.abc.Mapping):
         raise InputError(f"{file}{key}: expected a mapping, found {describe(value)}")
-    fields = _fields(schema)
+    fields = fields_of(schema)
     content = {k: v for k, v in value.items() if k != "_tag"}
     prefix = f"{key}." if key else ""
     for name in content:
@@ -327,7 +327,7 @@ def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
             raise InputError(
                 f"{file}{prefix}{name}: unknown key{hint} (allowed: {', '.join(fields)})"
             )
-    defaults = _defaults(schema)
+    defaults = defaults_of(schema)
     if default is not None:
         defaults = {name: getattr(default, name) for name in fields}
     missing = [name for name in fields if name not in defaults and name not in content]
@@ -342,12 +342,12 @@ def _mapping(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
         raise InputError(f"{file}{prefix}{error}") from None
 
 
-def _defaults(schema: Any) -> dict[str, Any]:
+def defaults_of(schema: Any) -> dict[str, Any]:
     """Values of the fields that have a default, as they are before an object is made of them: it
     may make others of those that it was not given."""
     if not dataclasses.is_dataclass(schema):
         usual = schema()
-        return {name: getattr(usual, name) for name in _fields(schema)}
+        return {name: getattr(usual, name) for name in fields_of(schema)}
     defaults = {}
     for field in dataclasses.fields(schema):
         if field.default is not dataclasses.MISSING:
@@ -357,7 +357,8 @@ def _defaults(schema: Any) -> dict[str, Any]:
     return defaults
 
 
-def _fields(schema: Any) -> dict[str, Any]:
+def fields_of(schema: Any) -> dict[str, Any]:
+    """The fields of a dataclass, or of one of Drake's serialisable classes, with their types."""
     if dataclasses.is_dataclass(schema):
         hints = typing.get_type_hints(schema)
         return {field.name: hints[field.name] for field in dataclasses.fields(schema)}

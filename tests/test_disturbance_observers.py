@@ -20,13 +20,9 @@ from fbse_drake.estimators.actuator_fault import (
     without_fault,
 )
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
-from fbse_drake.estimators.disturbance_observers import (
-    ExtendedState,
-    FilteredDisturbance,
-    extended_state,
-    second_order_low_pass,
-)
+from fbse_drake.estimators.extended_state import ExtendedState, extended_state
 from fbse_drake.estimators.filtered_model import gauss_seidel
+from fbse_drake.estimators.q_filter import FilteredDisturbance, second_order_low_pass
 from fbse_drake.robot.plant import make_robot
 
 Run = Callable[..., Log]

@@ -1,37 +1,30 @@
 """Friction by a disturbance observer on the momentum, to be compared with FBSE."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from fbse_drake.errors import require_positive
 from fbse_drake.estimators.chain import Chain
-from fbse_drake.estimators.estimator import Estimator, in_library
-from fbse_drake.estimators.momentum_balance import Balance, MomentumBalance, add_observer
+from fbse_drake.estimators.estimator import in_library
+from fbse_drake.estimators.momentum_balance import (
+    Balance,
+    BandwidthObserver,
+    MomentumBalance,
+    add_observer,
+)
 from fbse_drake.robot.plant import Robot
 
 
 @in_library
 @dataclass(frozen=True)
-class DisturbanceObserver(Estimator):
+class DisturbanceObserver(BandwidthObserver):
     """Momentum-based disturbance observer of a floating-base robot (De Luca et al. 2006).
 
     It has the contact wrenches from the foot sensors.
     """
-
-    knows: ClassVar[str] = "inertia of all links"
-    measures: ClassVar[str] = "IMU, foot forces"
-    tunable: ClassVar[Mapping[str, tuple[float, float]]] = {"bandwidth": (1.0, 100.0)}
-
-    # Bandwidth of the observer [Hz].
-    bandwidth: float = 20.0
-
-    def __post_init__(self) -> None:
-        require_positive(self, "bandwidth")
 
     def add(self, chain: Chain) -> None:
         self.add_observer(chain, "friction")
@@ -52,10 +45,10 @@ class MomentumObserver(MomentumBalance):
     def __init__(self, config: DisturbanceObserver, robot: Robot, **arguments: Any):
         """Declares ports and state; arguments as of `MomentumBalance`."""
         super().__init__(robot, **arguments)
-        self._gain = 2 * math.pi * config.bandwidth
+        self._pole = config.pole
 
     def _observe(
         self, balance: Balance, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
-        keep = math.exp(-self._gain * elapsed)
+        keep = math.exp(-self._pole * elapsed)
         posterior["friction"] = keep * last["friction"] + (1 - keep) * balance.remainder

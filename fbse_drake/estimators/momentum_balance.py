@@ -2,13 +2,16 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context
 
+from fbse_drake.errors import require_positive
 from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.records import record_type
@@ -42,6 +45,26 @@ class Balance(NamedTuple):
     inertia: np.ndarray
     # Joint columns of the feet's Jacobians there, (6 feet, n), in the sole frames.
     foot_jacobian: np.ndarray
+
+
+@dataclass(frozen=True)
+class BandwidthObserver(Estimator):
+    """Base of the settings of an observer on the balance that has a bandwidth."""
+
+    knows: ClassVar[str] = "inertia of all links"
+    measures: ClassVar[str] = "IMU, foot forces"
+    tunable: ClassVar[Mapping[str, tuple[float, float]]] = {"bandwidth": (1.0, 100.0)}
+
+    # Of the observer [Hz].
+    bandwidth: float = 20.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, "bandwidth")
+
+    @property
+    def pole(self) -> float:
+        """Absolute value of the observer's poles [rad/s]."""
+        return 2 * math.pi * self.bandwidth
 
 
 class MomentumBalance(RecursiveEstimator):

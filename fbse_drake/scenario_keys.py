@@ -10,7 +10,7 @@ from typing import Any
 
 from fbse_drake.effects.effect import Effect
 from fbse_drake.scenario import Scenario
-from fbse_drake.schema import _alternatives, _defaults, _fields
+from fbse_drake.schema import alternatives_of, defaults_of, fields_of
 
 _SCALARS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 # A field of a dataclass as it stands in a source file.
@@ -31,7 +31,7 @@ class Key:
 
 def keys(config: type) -> list[Key]:
     """The keys of a mapping that becomes an object of this class."""
-    defaults, texts = _defaults(config), _comments(config)
+    defaults, texts = defaults_of(config), _comments(config)
     return [
         Key(
             name,
@@ -39,7 +39,7 @@ def keys(config: type) -> list[Key]:
             repr(defaults[name]) if name in defaults else None,
             texts.get(name, "") or _usual_text(config, name, kind),
         )
-        for name, kind in _fields(config).items()
+        for name, kind in fields_of(config).items()
     ]
 
 
@@ -64,15 +64,15 @@ def mappings() -> list[type]:
         kind = waiting.pop(0)
         if isinstance(kind, type) and _is_mapping(kind) and kind not in found:
             found[kind] = None
-            waiting += _fields(kind).values()
+            waiting += fields_of(kind).values()
         waiting += parts_of(kind)
     return list(found)
 
 
 def parts_of(kind: Any) -> tuple[Any, ...]:
     """What stands for a type in a file: its alternatives, or what it holds."""
-    if isinstance(kind, type) and _alternatives(kind):
-        return _alternatives(kind)
+    if isinstance(kind, type) and alternatives_of(kind):
+        return alternatives_of(kind)
     return tuple(part for part in typing.get_args(kind) if not isinstance(part, str))
 
 
@@ -119,7 +119,7 @@ def _schema_of(kind: Any) -> dict[str, Any]:
 
 def _is_mapping(kind: Any) -> bool:
     known = dataclasses.is_dataclass(kind) or hasattr(kind, "__fields__")
-    return known and not _alternatives(kind)
+    return known and not alternatives_of(kind)
 
 
 def _comments(config: type) -> dict[str, str]:
