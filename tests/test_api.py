@@ -101,7 +101,7 @@ def test_an_effect_of_ones_own_is_pickled_with_its_scenario():
     assert pickle.loads(pickle.dumps(own)).robot.effects["own"] == Sticky(grip={KNEE: 1.5})
 
 
-@fd.in_library
+# Not in the library, where the diagnoses of other tests would find it.
 @dataclass(frozen=True)
 class Sticky(fd.JointTorqueEffect):
     """An effect that is written with public names alone."""

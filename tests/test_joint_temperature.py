@@ -139,7 +139,7 @@ def test_a_scenario_says_it_and_reads_it_back(tmp_path: Path):
         ),
         (
             "{a: !EncoderConfig {}}",
-            r"more\.a: expected one of !JointTemperature, found the tag !EncoderConfig",
+            r"more\.a: expected one of .*!JointTemperature, found the tag !EncoderConfig",
         ),
         ("{imu: !JointTemperature {}}", r"more\.imu: there is a sensor of this name already"),
         (
@@ -160,7 +160,7 @@ def test_a_scenario_says_it_and_reads_it_back(tmp_path: Path):
         ),
         (
             "{a: !Thermometer {}}",
-            r"sensors\.more\.a: expected one of !JointTemperature, found the tag !Thermometer",
+            r"sensors\.more\.a: expected one of .*!JointTemperature, found the tag !Thermometer",
         ),
     ],
 )
