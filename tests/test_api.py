@@ -96,12 +96,14 @@ def test_a_built_scenario_survives_pickling_and_yaml(tmp_path: Path):
     assert again.robot == scenario.robot
 
 
-def test_an_effect_of_ones_own_is_pickled_with_its_scenario():
+def test_an_effect_of_ones_own_is_pickled_with_its_scenario(monkeypatch: pytest.MonkeyPatch):
+    # In a library of its own: the diagnoses of other tests would find it.
+    monkeypatch.setattr("fbse_drake.effects.effect._LIBRARY", fd.effects_by_name())
+    fd.in_library(Sticky)
     own = built(robot=fd.RobotConfig(gantry_height=1.2, effects={"own": Sticky(grip={KNEE: 1.5})}))
     assert pickle.loads(pickle.dumps(own)).robot.effects["own"] == Sticky(grip={KNEE: 1.5})
 
 
-# Not in the library, where the diagnoses of other tests would find it.
 @dataclass(frozen=True)
 class Sticky(fd.JointTorqueEffect):
     """An effect that is written with public names alone."""
