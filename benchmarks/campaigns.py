@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing import get_context
+from multiprocessing.pool import Pool
 from pathlib import Path
 
 import numpy as np
@@ -93,11 +94,22 @@ def main() -> None:
         if outcome.done < len(group) or outcome.failed:
             raise SystemExit(f"campaign: {outcome}")
 
-    with local_cluster(1) as one, local_cluster(2) as two, get_context("spawn").Pool(2) as pair:
+    spawn = get_context("spawn")
+    with (
+        local_cluster(1) as one,
+        local_cluster(2) as two,
+        # This process has two schedulers to look after.
+        spawn.Pool(1) as alone,
+        spawn.Pool(2) as pair,
+    ):
+
+        def in_loops(group: Sequence[int], loops: Pool) -> None:
+            loops.starmap(walk, [(seed, duration) for seed in group], chunksize=1)
+
         ways: dict[str, Callable[[Sequence[int]], object]] = {
-            "loop": lambda group: [walk(seed, duration) for seed in group],
+            "loop": lambda group: in_loops(group, alone),
             "one worker": lambda group: as_campaign(group, one),
-            "two loops": lambda group: pair.starmap(walk, [(s, duration) for s in group], 1),
+            "two loops": lambda group: in_loops(group, pair),
             "two workers": lambda group: as_campaign(group, two),
         }
         for way in ways.values():
