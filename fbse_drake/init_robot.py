@@ -194,18 +194,14 @@ def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
             "zmp_margin",
         )
     )
-    return _SCENARIO.format(
+    return _scenario(
+        name,
+        "squat",
+        kp,
         what="both feet stand, the body goes up and down",
-        file=f"{name}_squat.yaml",
-        name=f"{name}_squat",
         title=f"{name} squats.",
-        duration=_DURATION,
         reference=f"!Squat {{{words}}}",
-        robot=name,
         hanging="",
-        inertia=kp / _BANDWIDTH**2,
-        kp=kp,
-        kd=_DAMPING * kp,
     )
 
 
@@ -236,18 +232,28 @@ def _swing(robot: Robot, name: str) -> str:
         default_flow_style=True,
         width=1000,
     ).strip()
-    return _SCENARIO.format(
+    return _scenario(
+        name,
+        "swing",
+        kp,
         what="the base is held, every joint swings",
-        file=f"{name}_swing.yaml",
-        name=f"{name}_swing",
         title=f"{name} swings its joints; its base is held.",
-        duration=_DURATION,
         reference=f"!JointSines {reference}",
-        robot=name,
         hanging=f"\n    gantry_height: {2 * reach:.2f}",
+    )
+
+
+def _scenario(robot: str, motion: str, kp: float, **words: str) -> str:
+    """A scenario file of a robot whose position loops have this gain [Nm/rad]."""
+    return _SCENARIO.format(
+        file=f"{robot}_{motion}.yaml",
+        name=f"{robot}_{motion}",
+        robot=robot,
+        duration=_DURATION,
         inertia=kp / _BANDWIDTH**2,
         kp=kp,
         kd=_DAMPING * kp,
+        **words,
     )
 
 

@@ -7,7 +7,8 @@ from functools import lru_cache
 import pytest
 
 from fbse_drake import Log, Scenario, load_scenario, simulate
-from fbse_drake.scenario import SensorsConfig
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -46,3 +47,13 @@ def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:
     """A shipped scenario, without sensor errors if so wished."""
     result = load_scenario(name, overrides=overrides)
     return result if noise else dataclasses.replace(result, sensors=SensorsConfig())
+
+
+def swinging_legs(duration: float, noise: float) -> tuple[Scenario, Log]:
+    """Legs that swing in a gantry without any friction, as planned; believed to be noisy [Nm]."""
+    overrides = [f"duration={duration}", "log.period=0.01"]
+    scenario = load_scenario("leg_swing_gantry", overrides=overrides)
+    bare = dataclasses.replace(scenario.robot, effects={})
+    believed = dataclasses.replace(scenario, robot=bare, model=bare)
+    recording = RecordingConfig(rows="instantaneous", block=0.02, torque_noise={"all": noise})
+    return dataclasses.replace(believed, recording=recording), planned_log(believed)

@@ -3,17 +3,16 @@
 Truth comes from planned motions and from torques that are added to them here, by formulas of this file.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
+from conftest import swinging_legs
 from scipy.optimize import minimize
 
-from fbse_drake import Log, Scenario, load_scenario
+from fbse_drake import Log, Scenario
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
-from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge, blocks_per_sample, frugal
@@ -26,7 +25,6 @@ from fbse_drake.effects.joint_torque import (
     Reduction,
     basis_over_time,
 )
-from fbse_drake.scenario import RecordingConfig
 
 NOISE = 0.05
 LEFT, RIGHT = "left_knee_pitch", "right_knee_pitch"
@@ -36,14 +34,7 @@ Law = Callable[[np.ndarray], np.ndarray]
 
 @pytest.fixture(scope="module")
 def swing() -> tuple[Scenario, Log]:
-    """Legs that swing in a gantry without any friction, as planned."""
-    scenario = load_scenario("leg_swing_gantry", overrides=["duration=12", "log.period=0.01"])
-    bare = dataclasses.replace(scenario.robot, effects={})
-    believed = dataclasses.replace(scenario, robot=bare, model=bare)
-    return dataclasses.replace(
-        believed,
-        recording=RecordingConfig(rows="instantaneous", block=0.02, torque_noise={"all": NOISE}),
-    ), planned_log(believed)
+    return swinging_legs(12, NOISE)
 
 
 def diagnosis_of(

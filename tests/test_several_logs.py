@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import swinging_legs
 
-from fbse_drake import Log, Scenario, load_scenario
+from fbse_drake import Log, Scenario
 from fbse_drake.cli import main
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
-from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.spread import spread_of
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.errors import InputError
 from fbse_drake.log import joined
-from fbse_drake.scenario import RecordingConfig, dump_scenario
+from fbse_drake.scenario import dump_scenario
 
 NOISE = 0.05
 KNEE = "left_knee_pitch"
@@ -28,14 +28,7 @@ KNEE = "left_knee_pitch"
 
 @pytest.fixture(scope="module")
 def swing() -> tuple[Scenario, Log]:
-    """Legs that swing in a gantry without any friction, as planned."""
-    scenario = load_scenario("leg_swing_gantry", overrides=["duration=6", "log.period=0.01"])
-    bare = dataclasses.replace(scenario.robot, effects={})
-    believed = dataclasses.replace(scenario, robot=bare, model=bare)
-    return dataclasses.replace(
-        believed,
-        recording=RecordingConfig(rows="instantaneous", block=0.02, torque_noise={"all": NOISE}),
-    ), planned_log(believed)
+    return swinging_legs(6, NOISE)
 
 
 def with_friction(log: Log, coulomb: float, seed: int) -> Log:
