@@ -25,9 +25,10 @@ from distributed import LocalCluster
 
 from fbse_drake import load_scenario, simulate
 from fbse_drake.campaign.campaign import Campaign, dump_campaign
-from fbse_drake.campaign.cluster import local_cluster, run_campaign
+from fbse_drake.campaign.cluster import run_campaign
 from fbse_drake.campaign.design import Listed
 from fbse_drake.campaign.steps import Simulate
+from fbse_drake.campaign.workers import local_cluster
 from fbse_drake.report.metrics import run_metrics
 
 _SCENARIO = "paper_walk"

@@ -39,6 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Matrices are small here: more threads of the linear algebra wait for each other, at three times the cost.
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(name, "1")
+        if "workers" in options and not getattr(options, "scheduler", None):
+            from fbse_drake.campaign.workers import begin_to_import
+
+            begin_to_import()
         # What the commands need takes seconds to import: `fbse --help` must not wait for it.
         from fbse_drake.commands import COMMANDS
 

@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -38,6 +39,7 @@ from fbse_drake.campaign.design import Choice, Grid, Listed, LogUniform, Normal,
 from fbse_drake.campaign.rows import Folder, units_of
 from fbse_drake.campaign.steps import Call, Estimate, Hide, Simulate, Study
 from fbse_drake.campaign.table import Summary, groups, picture, usual_groups
+from fbse_drake.campaign.workers import local_cluster
 
 STEPS = """
 import time
@@ -178,9 +180,11 @@ def test_a_killed_worker_loses_what_it_was_doing_and_nothing_else(
     campaign = squares(tmp_path, Grid({"side": [2.0]}, seeds=7), pause=0.05)
     clusters, before = [], []
 
-    def cluster(**options: object) -> LocalCluster:
-        clusters.append(LocalCluster(**options))
-        return clusters[-1]
+    @contextmanager
+    def cluster(workers: int | None) -> Iterator[LocalCluster]:
+        with local_cluster(workers) as made:
+            clusters.append(made)
+            yield made
 
     def kill_once(text: str, share: float = 0.0) -> None:  # noqa: ARG001
         rows = list((tmp_path / "out/rows").glob("*.parquet"))
@@ -189,7 +193,7 @@ def test_a_killed_worker_loses_what_it_was_doing_and_nothing_else(
             (nanny,) = clusters[0].workers.values()
             os.kill(nanny.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(campaign_cluster, "LocalCluster", cluster)
+    monkeypatch.setattr(campaign_cluster, "local_cluster", cluster)
     outcome = run_campaign(campaign, str(tmp_path / "out"), workers=1, progress=kill_once)
     assert before
     assert outcome.done == 7

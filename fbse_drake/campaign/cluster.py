@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-import dask
-from distributed import Client, Future, LocalCluster
+from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
 from fbse_drake.campaign.campaign import Campaign, Run, dump_campaign
 from fbse_drake.campaign.rows import Folder, schema_of
 from fbse_drake.campaign.work import Job, cells, work
+from fbse_drake.campaign.workers import local_cluster
 from fbse_drake.errors import InputError
 from fbse_drake.progress import Interrupted, Progress, silent
 
@@ -155,18 +155,6 @@ def _name(run: Run) -> str:
     """A run in words."""
     values = [f"{key}={value}" for key, value in run.values.items()]
     return ", ".join(filter(None, (run.scenario, f"seed={run.seed}", *values)))
-
-
-def local_cluster(workers: int | None = None) -> LocalCluster:
-    """A cluster of this machine's cores, or of so many workers; each is a process with a thread."""
-    # Samples of what a worker does cost its thread some 5 %, and nobody reads them.
-    with dask.config.set({"distributed.worker.profile.enabled": False}):
-        return LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address="localhost:0",
-            silence_logs=logging.CRITICAL,
-        )
 
 
 @contextmanager
