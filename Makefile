@@ -29,10 +29,11 @@ format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-# The documentation, strictly: a broken link is an error.
+# The documentation, strictly: a broken link is an error. Its tests run here too, for some need MkDocs.
 docs: $(INSTALLED)
 	$(VENV)/bin/pip install --quiet --editable ".[dev,docs]" --constraint constraints.txt
 	$(VENV)/bin/mkdocs build
+	$(VENV)/bin/pytest tests/test_docs.py
 
 bench: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.closed_loop

@@ -3,6 +3,7 @@
 import argparse
 import ast
 import inspect
+import re
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,13 +11,33 @@ from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
+from signatures import signature
 
 from fbse_drake import signals
 from fbse_drake.cli import _parser
+from fbse_drake.effects.effect import Effect, spaced
+from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.libraries import effects_by_name, estimators_by_name, sensors_by_name
 from fbse_drake.scenario_keys import keys, mappings, parts_of
 
 ROOT = Path(__file__).resolve().parent.parent
+
+LIBRARY = """\
+# Effect library
+
+Each effect is one class: it is simulated, predicted and identified by the same lines. A scenario
+gives it to the robot (`effects`) or to the model that is believed (`model: {effects}`), and the
+diagnosis looks for all of them.
+
+Pictures of joint effects show the torque that is lost in one joint that swings fast and slowly
+under a load that comes in steps, over time, velocity, angle and commanded torque: where the points
+lie on one line, the effect depends on nothing else. Those of all other effects show what the
+effect adds to the [residual](../missing_physics.md) of a walk of 3.5 s, in its three strongest
+rows, as multiples of the sensors' noise there. Linear parameters are a tenth of the largest
+plausible ones, others as usual. The pictures are drawn by the effects' own code when these pages
+are built.
+"""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -33,7 +54,25 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     }
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
+    for name, effect in effects_by_name().items():
+        picture = File.generated(config, _picture(name), content=signature(effect))
+        files.append(picture)
+    for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        for path, content in tutorial(notebook):
+            files.append(File.generated(config, path, content=content))
     return files
+
+
+def tutorial(notebook: Path) -> Iterator[tuple[str, str | bytes]]:
+    """Path and content of a notebook's page and of its pictures, as it was run last."""
+    text, resources = MarkdownExporter().from_filename(str(notebook))
+    text = re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", text)
+    # Files of the repository are no pages.
+    text = re.sub(r"\[([^]]+)\]\(\.\./[^)]+\)", r"\1", text)
+    for name, content in resources["outputs"].items():
+        text = text.replace(f"({name})", f"({notebook.stem}/{name})")
+        yield f"tutorials/{notebook.stem}/{name}", content
+    yield f"tutorials/{notebook.stem}.md", text
 
 
 def commands() -> str:
@@ -71,30 +110,51 @@ def scenario() -> str:
 
 
 def effects() -> str:
-    """The library of effects."""
-    lines = ["# Effect library", ""]
+    """The library of effects: joint torques first, then by how many there are of a kind."""
+    by_module: dict[str, dict[str, type[Effect]]] = {}
     for name, effect in effects_by_name().items():
-        lines += [f"## {name}", "", effect.description, "", _text(effect), ""]
-        rows = [
-            (
-                f"`{key}`",
-                parameter.unit,
-                "{:g} to {:g}".format(*parameter.plausible),
-                "linear" if parameter.linear else "searched",
-            )
-            for key, parameter in effect.parameters.items()
-        ]
-        lines += _table(("parameter", "unit", "plausible", "identified"), rows)
-        lines += [
-            "",
-            f"**In data:** {effect.signature}",
-            "",
-            f"**Experiment:** {effect.experiment}",
-            "",
-            f"Acts on: {effect.acts_on}. Written in `{effect.__module__}`.",
-            "",
-        ]
-    return "\n".join(lines)
+        by_module.setdefault(effect.__module__, {})[name] = effect
+
+    def rank(found: dict[str, type[Effect]]) -> tuple[bool, int]:
+        return not issubclass(next(iter(found.values())), JointTorqueEffect), -len(found)
+
+    contents, sections = [], []
+    for found in sorted(by_module.values(), key=rank):
+        module = inspect.getmodule(next(iter(found.values())))
+        title = (inspect.getdoc(module) or "").splitlines()[0].partition(":")[0].rstrip(".")
+        links = ", ".join(f"[{spaced(name)}](#{name.lower()})" for name in found)
+        contents += [f"* **{title}**: {links}"]
+        sections += ["", f"## {title}"]
+        for name, effect in found.items():
+            sections += ["", *_effect(name, effect)]
+    return "\n".join([LIBRARY, *contents, *sections])
+
+
+def _effect(name: str, effect: type[Effect]) -> Iterator[str]:
+    yield from (f"### {name}", "", effect.description, "", "**Law.** " + _law(effect), "")
+    yield from (f"![{effect.signature}]({Path(_picture(name)).name})" + "{ .signature }", "")
+    yield from (f"**In data.** {effect.signature}", "", f"**Experiment.** {effect.experiment}", "")
+    rows = [
+        (
+            f"`{key}`",
+            parameter.unit,
+            "{:g} to {:g}".format(*parameter.plausible),
+            "linear" if parameter.linear else "searched",
+        )
+        for key, parameter in effect.parameters.items()
+    ]
+    yield from _table(("parameter", "unit", "plausible", "identified"), rows)
+    yield from ("", f"Given by {effect.acts_on}; `{effect.__module__}`.")
+
+
+def _law(effect: type[Effect]) -> str:
+    """What its docstring says, formulas as code."""
+    formula = r"(?<![`\w])(u = .+?)(?=,\s+[a-z]|\. |[.:;]?$)"
+    return re.sub(formula, r"`\1`", _text(effect), flags=re.MULTILINE)
+
+
+def _picture(name: str) -> str:
+    return f"reference/{name}.svg"
 
 
 def estimators() -> str:

@@ -1,4 +1,4 @@
-"""Torques that the motor does not give although they are commanded, or gives although they are not."""
+"""Motors and drives: torques that are commanded and not given, or given and not commanded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
