@@ -17,8 +17,9 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
 
+# A file's tests share its runs, so they stay on one worker.
 test: lint
-	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadgroup --no-loadscope-reorder
+	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .

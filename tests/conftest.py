@@ -12,15 +12,8 @@ from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A file's tests share its runs, so they stay on one worker; notebooks share nothing.
-
-    They come first: each takes long, and one that starts last would keep a single worker busy. And
-    while one of the first compiles the estimators, the other one needs none.
-    """
+    """Notebooks come first: one that starts last would keep a single worker busy."""
     items.sort(key=lambda item: item.path.stem != "test_notebooks")
-    for item in items:
-        if item.path.stem != "test_notebooks":
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.fixture(scope="session")
