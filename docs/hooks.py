@@ -5,7 +5,7 @@ import ast
 import inspect
 import re
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from fbse_drake.libraries import effects_by_name, estimators_by_name, sensors_by
 from fbse_drake.scenario_keys import keys, mappings, parts_of
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# Of code on a page.
+_WIDTH = 80
 
 LIBRARY = """\
 # Effect library
@@ -201,8 +204,7 @@ def _described(module: str, name: str) -> Iterator[str]:
     value = getattr(__import__(module, fromlist=[name]), name)
     # An exception's is that of Python.
     if callable(value) and not (inspect.isclass(value) and issubclass(value, Exception)):
-        signature = str(inspect.signature(value)).replace("fbse_drake.", "")
-        yield f"```python\n{name}{signature}\n```\n"
+        yield f"```python\n{_call(name, value)}\n```\n"
     doc = inspect.getdoc(value) or ""
     yield "\n".join(_markdown(doc.splitlines()))
     if inspect.isclass(value):
@@ -213,14 +215,50 @@ def _described(module: str, name: str) -> Iterator[str]:
             and (inspect.isfunction(found) or isinstance(found, property))
             and (found.fget if isinstance(found, property) else found).__module__ == module
         ]
-        yield "\n".join(f"- `{member}`: {_first(text)}" for member, text in members if text)
+        yield ""
+        yield from (f"- `{member}`: {_first(text)}" for member, text in members if text)
+
+
+def _call(name: str, value: Callable) -> str:
+    """How it is called, one argument a line where they do not fit into one."""
+    signature = inspect.signature(value)
+    end = ")"
+    # Classes are said to return None.
+    if not inspect.isclass(value) and signature.return_annotation is not signature.empty:
+        end += f" -> {_short(inspect.formatannotation(signature.return_annotation))}"
+    arguments = [_short(argument) for argument in _arguments(signature)]
+    line = f"{name}({', '.join(arguments)}{end}"
+    if len(line) <= _WIDTH:
+        return line
+    return "\n".join([f"{name}(", *(f"    {argument}," for argument in arguments), end])
+
+
+def _short(text: str) -> str:
+    """Types without their modules, and defaults that are made without saying how."""
+    return re.sub(r"\b(?:[a-z_]\w*\.)+(?=[A-Z])", "", text).replace("<factory>", "...")
+
+
+def _arguments(signature: inspect.Signature) -> Iterator[str]:
+    starred = False
+    for argument in signature.parameters.values():
+        starred |= argument.kind is argument.VAR_POSITIONAL
+        if argument.kind is argument.KEYWORD_ONLY and not starred:
+            starred = True
+            yield "*"
+        yield str(argument)
 
 
 def _markdown(lines: list[str]) -> Iterator[str]:
-    """Sections of a docstring, as lists."""
-    inside = False
+    """Sections of a docstring as lists, its examples as code."""
+    inside = example = False
     for line in lines:
-        if line in ("Args:", "Returns:", "Raises:"):
+        if line.startswith(">>>") and not example:
+            example = True
+            yield "```pycon"
+        if example:
+            example = bool(line)
+            yield line or "```\n"
+        elif line in ("Args:", "Returns:", "Raises:"):
             inside = True
             yield f"\n**{line[:-1]}**\n"
         elif inside and line.startswith("    ") and not line.startswith("     "):
@@ -228,6 +266,8 @@ def _markdown(lines: list[str]) -> Iterator[str]:
             yield f"- `{name}`: {text}" if text else f"- {line.strip()}"
         else:
             yield line.strip() if inside else line
+    if example:
+        yield "```"
 
 
 def _first(text: str) -> str:
