@@ -3,33 +3,17 @@
 The robot is looked at in its zero posture, which for most legged robots is standing upright.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-)
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.description import AddedFrame, Leg, RobotDescription
-from fbse_drake.robot.plant import bare_urdf
-from fbse_drake.robot.shapes import link_points
+from fbse_drake.robot.urdf_model import Chain, UrdfModel, words
 
-# The instance that holds the robot: the first after Drake's own two.
-_MODEL = ModelInstanceIndex(2)
-# A leg ends no higher above the lowest end than this share of the robot's height.
-_LOW = 0.15
 # A sole is what of a foot is within this of its lowest point [m].
 _FLAT = 0.004
 # A frame is in the sole if it is no further from its plane [m], and its axes are along the base's.
@@ -46,102 +30,6 @@ class Proposal:
     remarks: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Chain:
-    """Joints from the base to an end that carries nothing that moves."""
-
-    joints: list[Joint]
-    foot: RigidBody
-    # Of the foot's lowest point in the base's frame, [m].
-    height: float
-    # Of its first joint.
-    hip: np.ndarray
-
-
-class _Model:
-    """A URDF's bodies and joints in the zero posture."""
-
-    def __init__(self, urdf: Path):
-        self.urdf, self.plant = urdf, MultibodyPlant(0.0)
-        try:
-            self.links = {
-                link.get("name", ""): link for link in ElementTree.parse(urdf).iter("link")
-            }
-            Parser(self.plant).AddModelsFromString(bare_urdf(urdf), "urdf")
-        except OSError as error:
-            raise InputError(f"{urdf}: {error.strerror}") from None
-        except (RuntimeError, ValueError, ElementTree.ParseError) as error:
-            raise InputError(f"{urdf}: not a URDF: {str(error).splitlines()[0]}") from None
-        self.plant.Finalize()
-        self.context = self.plant.CreateDefaultContext()
-        joints = [self.plant.get_joint(index) for index in self.plant.GetJointIndices(_MODEL)]
-        one = (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)
-        self.joints = [joint for joint in joints if joint.type_name() in one]
-        free = [body for body in self._bodies() if body.is_floating_base_body()]
-        if not free:
-            raise InputError(f"{urdf}: no body is free, so there is no base")
-        self.base = free[0]
-
-    def _bodies(self) -> list[RigidBody]:
-        return [self.plant.get_body(index) for index in self.plant.GetBodyIndices(_MODEL)]
-
-    def pose(self, body: RigidBody) -> np.ndarray:
-        """Of a body in the base's frame, (4, 4)."""
-        return body.body_frame().CalcPose(self.context, self.base.body_frame()).GetAsMatrix4()
-
-    def fixed_to(self, body: RigidBody) -> list[RigidBody]:
-        """A body and those that do not move against it."""
-        return list(self.plant.GetBodiesWeldedTo(body))
-
-    def points(self, body: RigidBody) -> np.ndarray:
-        """Of the shapes of a body and what is fixed to it, in the base's frame, (N, 3) [m]."""
-        parts = [np.empty((0, 3))]
-        for part in self.fixed_to(body):
-            X_BP = self.pose(part)
-            local = link_points(self.links[part.name()], self.urdf)
-            parts.append(local @ X_BP[:3, :3].T + X_BP[:3, 3])
-        return np.vstack(parts)
-
-    def chains(self) -> list[_Chain]:
-        """From the base to every end, those that share a joint with none other."""
-        above = {joint.child_body().index(): joint for joint in self.joints}
-        fixed = {
-            body.index(): {other.index() for other in self.fixed_to(body)}
-            for body in self._bodies()
-        }
-        carrying = set().union(*(fixed[joint.parent_body().index()] for joint in self.joints))
-        found = []
-        for joint in self.joints:
-            if joint.child_body().index() in carrying:
-                continue
-            chain, body = [joint], joint.parent_body()
-            while not fixed[body.index()] & fixed[self.base.index()]:
-                (inner,) = (above[index] for index in fixed[body.index()] if index in above)
-                chain.append(inner)
-                body = inner.parent_body()
-            lowest = min(self.pose(other)[2, 3] for other in self.fixed_to(joint.child_body()))
-            hip = self.pose(chain[-1].child_body())[:3, 3]
-            found.append(_Chain(chain[::-1], joint.child_body(), float(lowest), hip))
-        counts: dict[str, int] = {}
-        for one in found:
-            for joint in one.joints:
-                counts[joint.name()] = counts.get(joint.name(), 0) + 1
-        return [c for c in found if all(counts[joint.name()] == 1 for joint in c.joints)]
-
-    def legs(self) -> list[_Chain]:
-        """Chains of equal length that end lowest; none if there is one alone."""
-        chains = self.chains()
-        if not chains:
-            return []
-        heights = [self.pose(body)[2, 3] for body in self._bodies()]
-        limit = min(chain.height for chain in chains) + _LOW * float(np.ptp(heights))
-        low = [chain for chain in chains if chain.height <= limit]
-        lengths = [len(chain.joints) for chain in low]
-        common = max(set(lengths), key=lengths.count)
-        legs = [chain for chain in low if len(chain.joints) == common]
-        return legs if len(legs) > 1 and common > 1 else []
-
-
 def propose(urdf: Path, file: str) -> Proposal:
     """A description of the robot of a URDF.
 
@@ -154,7 +42,7 @@ def propose(urdf: Path, file: str) -> Proposal:
     Raises:
         InputError: no URDF, or a foot of which nothing says where it meets the ground.
     """
-    model = _Model(urdf)
+    model = UrdfModel(urdf)
     if not model.joints:
         raise InputError(f"{urdf}: no joint turns or slides")
     legs, imu = model.legs(), _imu(model)
@@ -194,13 +82,13 @@ def propose(urdf: Path, file: str) -> Proposal:
     return Proposal(description, remarks)
 
 
-def _named_side(leg: _Chain) -> int:
+def _named_side(leg: Chain) -> int:
     """-1 if the names of a leg's joints say left, 1 if right, 0 if nothing."""
-    words = set(_words(leg.joints[0].name()))
-    return bool(words & {"r", "right"}) - bool(words & {"l", "left"})
+    said = set(words(leg.joints[0].name()))
+    return bool(said & {"r", "right"}) - bool(said & {"l", "left"})
 
 
-def _imu(model: _Model) -> str:
+def _imu(model: UrdfModel) -> str:
     """The frame of an IMU that is fixed to the base, or nothing."""
     names = [body.name() for body in model.fixed_to(model.base)]
     for part in _IMU_NAMES:
@@ -211,7 +99,7 @@ def _imu(model: _Model) -> str:
 
 
 def _sole(
-    model: _Model, leg: _Chain, side: str
+    model: UrdfModel, leg: Chain, side: str
 ) -> tuple[str, AddedFrame | None, list[list[float]]]:
     """Name of a sole's frame, the frame if it must be added, and the corners in it."""
     points = model.points(leg.foot)
@@ -238,7 +126,7 @@ def _sole(
 
 
 def _sole_frame(
-    model: _Model, leg: _Chain, side: str, ground: float
+    model: UrdfModel, leg: Chain, side: str, ground: float
 ) -> tuple[str, np.ndarray, AddedFrame | None]:
     for body in model.fixed_to(leg.foot):
         X_BS = model.pose(body)
@@ -264,14 +152,9 @@ def _roles(legs: Sequence[Sequence[str]]) -> list[str]:
     """What the joints of all legs have in common in their names; numbers where that is nothing."""
     roles = []
     for names in zip(*legs, strict=True):
-        first, *others = (_words(name) for name in names)
+        first, *others = (words(name) for name in names)
         common = [word for word in first if all(word in other for other in others)]
         roles.append("_".join(word for word in common if word != "joint"))
     unique = len(set(roles)) == len(roles) and all(roles)
     safe = not set(roles) & {name for leg in legs for name in leg}
     return roles if unique and safe else [f"joint_{k + 1}" for k in range(len(roles))]
-
-
-def _words(name: str) -> list[str]:
-    """As `LHipYaw_joint` -> l, hip, yaw, joint."""
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
