@@ -286,7 +286,7 @@ def walk_model(scenario: Scenario, log: Log, prior: FrictionPrior) -> WalkModel:
     force = [log[f"truth/foot/{side}/pad_force"] for side in sides]
     wrench_noise = []
     for side, G, on_pads in zip(sides, robot.grasp_maps, force, strict=True):
-        if robot.description.legs[side].corners:
+        if robot.description.legs[side].has_six_axes:
             deviations = (sensors.foot_force.moment_noise, sensors.foot_force.noise)
             G, touches = np.diag(np.repeat(deviations, 3)), on_pads.any(axis=(1, 2))[:, None]
         else:

@@ -483,8 +483,8 @@ def _parser() -> argparse.ArgumentParser:
         "init",
         help="make a robot of yours ready: description, scenario, map, picture",
         description="Proposes what must be said of a robot from its URDF, writes it with a "
-        "scenario that runs, and tries that. A robot on two legs of six joints squats; of any "
-        "other the joints swing.",
+        "scenario that runs, and tries that. A robot on two legs of six joints squats, and so does "
+        "one on two or three pairs of legs of three; of any other the joints swing.",
         examples=("fbse init my_robot.urdf", "fbse init robots/g1.urdf --name g1 --out g1"),
     )
     run.add_argument("urdf", metavar="URDF", type=Path, help="the robot's model")

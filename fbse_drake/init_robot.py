@@ -25,6 +25,8 @@ from fbse_drake.walking.stand import Squat
 
 # How far below its height with straight legs the centre of mass is tried to stand.
 _HEIGHTS = np.arange(0.98, 0.7, -0.02)
+# The same of one on point feet, of its height in the posture in which it is proposed to stand.
+_SHARES = np.arange(1.02, 0.8, -0.04)
 # One deeper than the highest that is possible leaves the knees room to move.
 _DEEPER = 0.02
 # Amplitude of the squat over the height of the centre of mass; how often and how long.
@@ -110,30 +112,41 @@ def _standing(robot: Robot) -> tuple[Squat, Reference] | None:
             forbid it; says what is in the way at the last one that was tried.
     """
     context = robot.plant.CreateDefaultContext()
-    robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
+    names = robot.description
+    robot.set_joint_positions(context, names.per_joint(names.stance, key="stance", default=0.0))
     soles = {
         side: robot.sole(side).CalcPose(context, robot.base.body_frame()).translation()
         for side in robot.description.sides
     }
     com = robot.plant.CalcCenterOfMassPositionInWorld(context)
     base = robot.plant.EvalBodyPoseInWorld(context, robot.base).translation()
-    straight = float((com - base)[2] - min(place[2] for place in soles.values()))
-    left, right = soles.values()
-    centres = [robot.pad_positions(side)[:, 0] for side in robot.description.sides]
+    places = np.array(list(soles.values()))
+    height = float((com - base)[2] - places[:, 2].min())
+    pads = {side: robot.pad_positions(side) for side in soles}
+    x = np.concatenate([soles[side][0] + pads[side][:, 0] for side in soles])
+    on_points = any(leg.is_point for leg in robot.description.legs.values())
+    extent = np.ptp(places, axis=0)
+    if on_points:
+        # Below the hips, wherever the centre of mass is between them.
+        forward, margin, shares = float((com - base)[0] - x.mean()), 0.2 * extent[:2].min(), _SHARES
+    else:
+        centres = [pad[:, 0] for pad in pads.values()]
+        forward = float(np.mean([0.5 * (x.min() + x.max()) for x in centres]))
+        margin, shares = 0.2 * min(float(np.ptp(x)) for x in centres), _HEIGHTS
     squat = Squat(
-        amplitude=round(_AMPLITUDE * straight, 4),
+        amplitude=round(_AMPLITUDE * height, 4),
         frequency=_FREQUENCY,
         ramp=1.0,
-        foot_spacing=round(float(abs(left[1] - right[1])), 4),
-        zmp_forward=round(float(np.mean([0.5 * (x.min() + x.max()) for x in centres])), 4),
-        zmp_margin=round(0.2 * min(float(np.ptp(x)) for x in centres), 4),
+        foot_spacing=round(float(extent[1]), 4),
+        wheelbase=round(float(extent[0]), 4) if on_points else 0.0,
+        zmp_forward=round(forward, 4),
+        zmp_margin=round(float(margin), 4),
     )
     time = np.arange(0.0, _DURATION, 0.05)
     reason: InputError | None = None
-    for share in _HEIGHTS:
+    for share in shares:
         higher, lower = (
-            replace(squat, com_height=round(straight * float(s), 3))
-            for s in (share, share - _DEEPER)
+            replace(squat, com_height=round(height * float(s), 3)) for s in (share, share - _DEEPER)
         )
         try:
             make_reference(higher, robot, time)
@@ -190,6 +203,7 @@ def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
             "ramp",
             "com_height",
             "foot_spacing",
+            "wheelbase",
             "zmp_forward",
             "zmp_margin",
         )
@@ -198,7 +212,7 @@ def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
         name,
         "squat",
         kp,
-        what="both feet stand, the body goes up and down",
+        what="all feet stand, the body goes up and down",
         title=f"{name} squats.",
         reference=f"!Squat {{{words}}}",
         hanging="",
@@ -274,9 +288,10 @@ def _tried(path: Path) -> tuple[list[str], list[str]]:
 
 
 def _weight_text(log: Log) -> str:
-    loads = {side: log[f"foot/{side}/wrench"][1:, 5].mean() for side in log.sides}
+    forces = {side: log[f"truth/foot/{side}/pad_force"][1:, :, 2] for side in log.sides}
+    loads = {side: force.sum(axis=1).mean() for side, force in forces.items()}
     return "It stands: " + ", ".join(
-        f"{load:.0f} N on the {side} foot" for side, load in loads.items()
+        f"{load:.0f} N on the {side.replace('_', ' ')} foot" for side, load in loads.items()
     )
 
 
@@ -318,9 +333,12 @@ def _map_text(robot: Robot) -> str:
     if robot.description.legs:
         channels["imu/linear_acceleration"] = channel("acc", "xyz", "m/s^2")
         channels["imu/angular_velocity"] = channel("gyro", "xyz", "rad/s")
-    six = ("mx", "my", "mz", "fx", "fy", "fz")
-    for side in robot.description.sides:
-        channels[f"foot/{side}/wrench"] = {"columns": [f"{side}_{axis}" for axis in six]}
+    three = ("fx", "fy", "fz")
+    for side, leg in robot.description.legs.items():
+        kind, axes = (
+            ("pad_force", three) if leg.is_point else ("wrench", ("mx", "my", "mz", *three))
+        )
+        channels[f"foot/{side}/{kind}"] = {"columns": [f"{side}_{axis}" for axis in axes]}
     tree = {
         "joints": joints,
         "time": {"column": "time", "unit": "s"},

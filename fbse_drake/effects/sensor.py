@@ -214,7 +214,7 @@ class FootForceBias(SensorEffect):
         values: ResolvedEffect,
         robot: Robot,
     ) -> SensorSignals:
-        has_pads = np.array([bool(leg.pads) for leg in robot.description.legs.values()])
+        has_pads = np.array([not leg.has_six_axes for leg in robot.description.legs.values()])
         signals = replace(
             signals, pad_force=signals.pad_force + _pads_of(has_pads * values.linear, robot).T
         )

@@ -93,7 +93,9 @@ class ActuatorFaultObserver(MomentumBalance):
         moment, force = _square(sensors.moment_noise), _square(sensors.force_noise)
         self._wrench_variance = np.concatenate(
             [
-                np.repeat([moment, force], 3) if leg.corners else force * (grasp**2).sum(axis=1)
+                np.repeat([moment, force], 3)
+                if leg.has_six_axes
+                else force * (grasp**2).sum(axis=1)
                 for leg, grasp in zip(legs.values(), robot.grasp_maps, strict=True)
             ]
         )

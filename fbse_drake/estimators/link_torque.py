@@ -176,7 +176,7 @@ def _estimate_link_torque(
 
 def _wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
     """Of the noise in a foot's measured wrench [moment, force], (6,) [(Nm)^2, N^2]."""
-    if robot.description.legs[side].corners:
+    if robot.description.legs[side].has_six_axes:
         return np.repeat([sensors.moment_noise**2, sensors.force_noise**2], 3)
     return sensors.force_noise**2 * (grasp_map(robot.pad_positions(side)) ** 2).sum(axis=1)
 

@@ -30,7 +30,15 @@ def robot_figure(robot: Robot, posture: np.ndarray) -> Figure:
         for number, points in enumerate(soles.values()):
             closed = points[[0, 1, 3, 2, 0]] if len(points) == 4 else points
             label = "soles" if number == 0 else None
-            axes.plot(closed[:, axis], closed[:, 2] - ground, color=_SOLE, linewidth=4, label=label)
+            marker = "o" if len(points) == 1 else None
+            axes.plot(
+                closed[:, axis],
+                closed[:, 2] - ground,
+                color=_SOLE,
+                linewidth=4,
+                marker=marker,
+                label=label,
+            )
         axes.plot(
             com[axis], com[2] - ground, "X", color=_MASS, markersize=10, label="centre of mass"
         )

@@ -25,6 +25,7 @@ class Leg:
     # foot, which may turn while it stands.
     pads: list[str] = field(default_factory=list)
     # A foot with a six-axis sensor instead: where it meets the ground, points in the sole frame [m].
+    # One alone, the origin, makes a point foot with a three-axis sensor.
     corners: list[list[float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -35,13 +36,24 @@ class Leg:
         for point in self.corners:
             if len(point) != 3:
                 raise InputError(f"corners: expected points of three coordinates, found {point}")
-        if self.corners and np.linalg.matrix_rank(np.diff(self.corners, axis=0), tol=1e-4) < 2:
+        if len(self.corners) == 1:
+            if np.any(self.corners[0]):
+                raise InputError(
+                    "corners: expected the origin, [0, 0, 0], as the only one of a point foot, "
+                    f"found {self.corners[0]}"
+                )
+        elif self.corners and np.linalg.matrix_rank(np.diff(self.corners, axis=0), tol=1e-4) < 2:
             raise InputError("corners: expected at least three points that are not in one line")
 
     @property
     def points(self) -> int:
         """At how many places the ground's force is known."""
         return len(self.pads) or len(self.corners)
+
+    @property
+    def has_six_axes(self) -> bool:
+        """Is its sensor one of six axes, rather than one of three at each point?"""
+        return len(self.corners) > 1
 
     @property
     def is_point(self) -> bool:
@@ -86,6 +98,9 @@ class RobotDescription:
     legs: dict[str, Leg] = field(default_factory=dict)
     # Further joints: of arms, of a torso, of a machine that has no legs.
     joints: list[str] = field(default_factory=list)
+    # Angles near which the legs stand [rad], by joint or by what it is called in `leg_joints`: they say
+    # which way knees bend. By default the middle of the joints' ranges.
+    stance: dict[str, float] = field(default_factory=dict)
     # Angles [rad] (or places [m]) of joints that are not named above; 0 by default.
     held: dict[str, float] = field(default_factory=dict)
     # Frames that the model lacks, by name, as those of soles.

@@ -46,7 +46,7 @@ _MODEL = ModelInstanceIndex(2)
 _NAMED = 12
 # Between a body's name and the number in the names of the bodies that carry its point masses.
 _POINT_MASS = "_point_mass_"
-# A corner of a foot with a six-axis sensor touches the ground in one point, and is far stiffer than any ground.
+# A corner of a foot touches the ground in one point, and is far stiffer than any ground.
 _CORNER_RADIUS, _CORNER_STIFFNESS = 1e-9, 1e12
 
 
@@ -631,7 +631,7 @@ def _corner_joints(side: str, leg: Leg) -> list[str]:
 
 
 def _add_corners(plant: MultibodyPlant, side: str, leg: Leg, ground: Ground) -> None:
-    """Lets a foot with a six-axis sensor meet the ground: each corner is a massless body, as the pads of other feet are."""
+    """Lets a foot that has no pads meet the ground: each corner is a massless body, as the pads of other feet are."""
     properties = ProximityProperties()
     AddContactMaterial(
         properties=properties,

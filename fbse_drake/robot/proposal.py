@@ -12,12 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
 from fbse_drake.robot.description import AddedFrame, Leg, RobotDescription
+from fbse_drake.robot.point_feet import NoStanceError, propose_stance
 from fbse_drake.robot.urdf_model import Chain, UrdfModel, words
 
 # A sole is what of a foot is within this of its lowest point [m].
 _FLAT = 0.004
 # A frame is in the sole if it is no further from its plane [m], and its axes are along the base's.
 _IN_SOLE, _PARALLEL = 0.003, 1e-3
+# How many legs stand on points, and the joints that each has.
+_ON_POINTS = ((4, 3), (6, 3))
+# Angles that differ by less are the same [rad].
+_SAME_ANGLE = 0.01
 # Parts of an IMU frame's name, the better ones first.
 _IMU_NAMES = ("imu", "gyro", "accelerometer")
 
@@ -33,7 +38,8 @@ class Proposal:
 def propose(urdf: Path, file: str) -> Proposal:
     """A description of the robot of a URDF.
 
-    Two legs of six joints become legs with soles; of every other robot all joints become `joints`.
+    Two legs of six joints become legs with soles, two or three pairs of legs of three joints legs on
+    point feet; of every other robot all joints become `joints`.
 
     Args:
         urdf: its file.
@@ -47,15 +53,41 @@ def propose(urdf: Path, file: str) -> Proposal:
         raise InputError(f"{urdf}: no joint turns or slides")
     legs, imu = model.legs(), _imu(model)
     remarks = [f"IMU: {imu}." if imu else "No frame is called IMU: it measures in the base's axes."]
-    if len(legs) != 2 or len(legs[0].joints) != 6:
-        found = f"{len(legs)} legs of {len(legs[0].joints)} joints" if legs else "no legs"
-        remarks.insert(0, f"{found} were found; a robot on two legs of six would stand.")
-        names = [joint.name() for joint in model.joints]
-        return Proposal(RobotDescription(model.base.name(), urdf=file, joints=names), remarks)
+    imu = imu or (model.base.name() if legs else "")
+    kind = (len(legs), len(legs[0].joints)) if legs else None
+    found: list[str]
+    try:
+        if kind == (2, 6):
+            description, found = _on_soles(model, legs, file, imu)
+        elif kind in _ON_POINTS:
+            description, found = _on_points(model, legs, file, imu)
+        else:
+            text = f"{kind[0]} legs of {kind[1]} joints" if kind else "no legs"
+            needed = "a robot on two legs of six, or four of three, would stand"
+            description, found = _swinging(model, file), [f"{text} were found; {needed}."]
+    except NoStanceError as error:
+        description, found = _swinging(model, file), [f"It only swings: {error}."]
+    remarks += found
+    held = len(model.joints) - len(description.joint_names)
+    if held:
+        remarks.append(f"{held} joints that are no leg's are held at 0 (see `held`).")
+    return Proposal(description, remarks)
+
+
+def _swinging(model: UrdfModel, file: str) -> RobotDescription:
+    """Of a robot of which all joints are alike."""
+    names = [joint.name() for joint in model.joints]
+    return RobotDescription(model.base.name(), urdf=file, joints=names)
+
+
+def _on_soles(
+    model: UrdfModel, legs: list[Chain], file: str, imu: str
+) -> tuple[RobotDescription, list[str]]:
+    """Of a robot on two flat feet; with what its reader should know."""
     legs.sort(key=lambda leg: (_named_side(leg), -leg.hip[1]))
     if legs[0].hip[1] < legs[1].hip[1]:
         raise InputError(
-            f"{urdf}: {legs[0].joints[0].name()} is on the right of {model.base.name()}, whose axes "
+            f"{model.urdf}: {legs[0].joints[0].name()} is on the right of {model.base.name()}, whose axes "
             "must point forwards (x) and up (z): fix a frame with such axes to it and make it the root"
         )
     sides = ("left", "right")
@@ -71,15 +103,51 @@ def propose(urdf: Path, file: str) -> Proposal:
         },
         frames={name: frame for name, frame, _ in soles if frame is not None},
     )
+    remarks = []
     for side, (name, frame, corners) in zip(sides, soles, strict=True):
         size = np.ptp(corners, axis=0)
         kind = "a frame was added" if frame else f"its frame is {name}"
         text = f"{side} sole: {1e3 * size[0]:.0f} by {1e3 * size[1]:.0f} mm; {kind}."
         remarks.append(text)
-    held = len(model.joints) - len(description.joint_names)
-    if held:
-        remarks.append(f"{held} joints that are no leg's are held at 0 (see `held`).")
-    return Proposal(description, remarks)
+    return description, remarks
+
+
+def _on_points(
+    model: UrdfModel, legs: list[Chain], file: str, imu: str
+) -> tuple[RobotDescription, list[str]]:
+    """The same of one on point feet."""
+    stance = propose_stance(model, legs)
+    names = {side: [j.name() for j in leg.joints] for side, leg in stance.legs.items()}
+    roles = _roles(list(names.values()))
+    # What is the same in all legs is said once.
+    angles = np.round(list(stance.angles.values()), 4)
+    by_joint = {
+        name: float(angle)
+        for leg, row in zip(names.values(), angles, strict=True)
+        for name, angle in zip(leg, row, strict=True)
+    }
+    common = dict(zip(roles, angles[0].tolist(), strict=True))
+    is_common = np.ptp(angles, axis=0).max() < _SAME_ANGLE
+    frames = {}
+    for side, leg in stance.legs.items():
+        X_BS = np.eye(4)
+        X_BS[:3, 3] = stance.points[side]
+        frames[f"{side}_foot_point"] = _added_frame(model, leg, X_BS)
+    description = RobotDescription(
+        model.base.name(),
+        urdf=file,
+        imu=imu,
+        leg_joints=roles,
+        legs={
+            side: Leg(names[side], leg.foot.name(), point, corners=[[0.0, 0.0, 0.0]])
+            for (side, leg), point in zip(stance.legs.items(), frames, strict=True)
+        },
+        stance=common if is_common else by_joint,
+        frames=frames,
+    )
+    size = np.ptp(list(stance.points.values()), axis=0)
+    text = f"{len(legs)} point feet, {size[0]:.3f} m from front to rear, {size[1]:.3f} m across."
+    return description, [text, *stance.remarks]
 
 
 def _named_side(leg: Chain) -> int:
@@ -135,17 +203,20 @@ def _sole_frame(
         ):
             return body.name(), X_BS, None
     # Below the ankle, with the axes of the base.
-    X_BF = model.pose(leg.foot)
     X_BS = np.eye(4)
-    X_BS[:3, 3] = [*X_BF[:2, 3], ground]
-    X_FS = np.linalg.inv(X_BF) @ X_BS
+    X_BS[:3, 3] = [*model.pose(leg.foot)[:2, 3], ground]
+    return f"{side}_sole", X_BS, _added_frame(model, leg, X_BS)
+
+
+def _added_frame(model: UrdfModel, leg: Chain, X_BS: np.ndarray) -> AddedFrame:
+    """A frame on a foot that is at this pose in the base's axes."""
+    X_FS = np.linalg.inv(model.pose(leg.foot)) @ X_BS
     angles = Rotation.from_matrix(X_FS[:3, :3]).as_euler("xyz")
-    frame = AddedFrame(
+    return AddedFrame(
         leg.foot.name(),
         [round(float(x), 6) + 0.0 for x in X_FS[:3, 3]],
         [round(float(angle), 9) + 0.0 for angle in angles],
     )
-    return f"{side}_sole", X_BS, frame
 
 
 def _roles(legs: Sequence[Sequence[str]]) -> list[str]:

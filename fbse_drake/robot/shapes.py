@@ -10,12 +10,14 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from fbse_drake.errors import InputError
 
 
-def link_points(link: Element, urdf: Path) -> np.ndarray:
-    """Outermost points of a link's collision shapes, or else of its visual ones, in its frame.
+def link_points(link: Element, kind: str, urdf: Path, axes: np.ndarray) -> np.ndarray:
+    """Outermost points of a link's shapes, in its frame.
 
     Args:
         link: of a URDF.
+        kind: of its shapes, collision or visual.
         urdf: its file, near which meshes are looked for.
+        axes: of the directions in which a sphere's points are taken, columns in the link's frame, (3, 3).
 
     Returns:
         Shape (N, 3) [m]; N is 0 for a link without shapes.
@@ -23,26 +25,25 @@ def link_points(link: Element, urdf: Path) -> np.ndarray:
     Raises:
         InputError: a mesh that is needed cannot be read.
     """
-    for kind in ("collision", "visual"):
-        parts = [_points(shape, urdf) for shape in link.findall(kind)]
-        if parts:
-            return np.vstack(parts)
-    return np.empty((0, 3))
+    parts = [_points(shape, urdf, axes) for shape in link.findall(kind)]
+    return np.vstack([np.empty((0, 3)), *parts])
 
 
-def _points(shape: Element, urdf: Path) -> np.ndarray:
+def _points(shape: Element, urdf: Path, axes: np.ndarray) -> np.ndarray:
     geometry = shape.find("geometry")
     if geometry is None or not len(geometry):
         return np.empty((0, 3))
-    return _pose(shape.find("origin")).multiply(_shape_points(geometry[0], urdf).T).T
+    X_LG = _pose(shape.find("origin"))
+    axes = X_LG.rotation().matrix().T @ axes
+    return X_LG.multiply(_shape_points(geometry[0], urdf, axes).T).T
 
 
-def _shape_points(shape: Element, urdf: Path) -> np.ndarray:
+def _shape_points(shape: Element, urdf: Path, axes: np.ndarray) -> np.ndarray:
     if shape.tag == "box":
         return _box(0.5 * np.array(_numbers(shape.get("size", ""))))
     if shape.tag == "sphere":
         radius = float(shape.get("radius", "0"))
-        return radius * np.vstack([np.eye(3), -np.eye(3)])
+        return radius * np.vstack([axes.T, -axes.T])
     if shape.tag in ("cylinder", "capsule"):
         radius, half = float(shape.get("radius", "0")), 0.5 * float(shape.get("length", "0"))
         angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)

@@ -78,13 +78,18 @@ class UrdfModel:
         return list(self.plant.GetBodiesWeldedTo(body))
 
     def points(self, body: RigidBody) -> np.ndarray:
-        """Of the shapes of a body and what is fixed to it, in the base's frame, (N, 3) [m]."""
-        parts = [np.empty((0, 3))]
-        for part in self.fixed_to(body):
-            X_BP = self.pose(part)
-            local = link_points(self.links[part.name()], self.urdf)
-            parts.append(local @ X_BP[:3, :3].T + X_BP[:3, 3])
-        return np.vstack(parts)
+        """Of the collision shapes of a body and what is fixed to it, or else of the visual ones, in
+        the base's frame, (N, 3) [m]."""
+        for kind in ("collision", "visual"):
+            parts = [np.empty((0, 3))]
+            for part in self.fixed_to(body):
+                X_BP = self.pose(part)
+                local = link_points(self.links[part.name()], kind, self.urdf, X_BP[:3, :3].T)
+                parts.append(local @ X_BP[:3, :3].T + X_BP[:3, 3])
+            points = np.vstack(parts)
+            if len(points):
+                break
+        return points
 
     def chains(self) -> list[Chain]:
         """From the base to every end, those that share a joint with none other."""

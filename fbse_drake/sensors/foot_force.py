@@ -101,7 +101,7 @@ def _by_foot(
     wrenches = {
         side: force.reshape(len(force), -1) @ G.T
         for (side, force), G in zip(forces.items(), robot.grasp_maps, strict=True)
-        if robot.description.legs[side].corners
+        if robot.description.legs[side].has_six_axes
     }
     return forces, wrenches
 
@@ -111,7 +111,7 @@ def wrench_deviations(config: FootForceConfig, robot: Robot) -> list[np.ndarray]
     six_axis = np.repeat([config.moment_noise, config.noise], 3)
     legs = robot.description.legs.values()
     return [
-        six_axis if leg.corners else config.noise * np.linalg.norm(G, axis=1)
+        six_axis if leg.has_six_axes else config.noise * np.linalg.norm(G, axis=1)
         for leg, G in zip(legs, robot.grasp_maps, strict=True)
     ]
 
@@ -126,7 +126,7 @@ def force_noise(
     for leg, G, deviation in zip(
         legs, robot.grasp_maps, wrench_deviations(config, robot), strict=True
     ):
-        if leg.corners:
+        if leg.has_six_axes:
             wrench = deviation * random.standard_normal((samples, 6))
             noise[:, first : first + leg.points] = (wrench @ np.linalg.pinv(G).T).reshape(
                 samples, -1, 3
@@ -225,15 +225,15 @@ class FootForceSensors(Diagram):
         builder = DiagramBuilder()
         true = builder.AddNamedSystem("true", PadForces(robot))
         legs = list(robot.description.legs.values())
-        has_six_axes = any(leg.corners for leg in legs)
+        has_six_axes = any(leg.has_six_axes for leg in legs)
         # What the sensors of each foot read of the forces at its pads or corners.
         maps = [
-            np.eye(3 * leg.points) if leg.pads else G
+            G if leg.has_six_axes else np.eye(3 * leg.points)
             for leg, G in zip(legs, robot.grasp_maps, strict=True)
         ]
         is_force = np.concatenate(
             [
-                np.ones(len(G), dtype=bool) if leg.pads else np.arange(6) >= 3
+                np.arange(6) >= 3 if leg.has_six_axes else np.ones(len(G), dtype=bool)
                 for leg, G in zip(legs, maps, strict=True)
             ]
         )

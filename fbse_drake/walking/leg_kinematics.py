@@ -15,6 +15,7 @@ from pydrake.multibody.tree import RevoluteJoint
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError
+from fbse_drake.robot.description import Leg
 from fbse_drake.robot.plant import Robot
 
 # Axes of the leg with a closed inverse.
@@ -64,8 +65,8 @@ class LegKinematics:
     # Mass that moves with each joint but not the next [kg], (n,), and its centre from the joint, (n, 3) [m].
     masses: np.ndarray
     centers: np.ndarray
-    # The middle of each joint's range, where it has one [rad], shape (n,): which way a knee bends.
-    middle: np.ndarray
+    # Near which it stands [rad], shape (n,): which way a knee bends.
+    stance: np.ndarray
     # Which of a twist [angular, linear] of the sole its joints determine: all of a flat foot, what is linear of a point foot.
     ruled: slice
 
@@ -120,12 +121,6 @@ class LegKinematics:
             )
             masses.append(mass)
             centers.append(moment / mass - origin if mass > 0 else np.zeros(3))
-        middle = np.array(
-            [
-                0.5 * (joint.position_lower_limit() + joint.position_upper_limit())
-                for joint in joints
-            ]
-        )
         return cls(
             # An axis along one of the base's is exactly so.
             np.where(np.abs(axes - axes.round()) < _AXIS_TOLERANCE, axes.round() + 0.0, axes),
@@ -133,7 +128,7 @@ class LegKinematics:
             sole.rotation().matrix(),
             np.array(masses),
             np.array(centers),
-            np.nan_to_num(middle, posinf=0.0, neginf=0.0),
+            _stance(robot, leg),
             ruled,
         )
 
@@ -159,7 +154,7 @@ class LegKinematics:
 
         Args:
             R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m]; how a point foot is turned does not matter.
-            start: angles near the solution, shape (N, n) [rad], if known; by default the middle of the joints' ranges.
+            start: angles near the solution, shape (N, n) [rad], if known; by default the description's `stance`.
 
         Returns:
             Angles from hip to foot, shape (N, n) [rad].
@@ -171,7 +166,7 @@ class LegKinematics:
             return self._closed_inverse(R_BF, p_BF)
         # Levenberg-Marquardt, damped by the error itself: robust far away, quadratic near the solution (Sugihara 2011, IEEE
         # Transactions on Robotics 27(5)).
-        q = np.tile(self.middle, (len(p_BF), 1)) if start is None else start
+        q = np.tile(self.stance, (len(p_BF), 1)) if start is None else start
         for _ in range(_MAX_ITERATIONS):
             R, p, J = self._pose(q)
             J, error = J[:, self.ruled], p_BF - p
@@ -291,6 +286,18 @@ class LegKinematics:
             J_moment,
             bias_moment,
         )
+
+
+def _stance(robot: Robot, leg: Leg) -> np.ndarray:
+    """Angles near which a leg stands, (n,) [rad]: the description's, else the middle of a range."""
+    names = robot.description
+    known = names.per_joint(names.stance, key="stance", default=np.nan)
+    given = dict(zip(names.joint_names, known, strict=True))
+    joints = [robot.plant.GetJointByName(name) for name in leg.joints]
+    middle = [0.5 * (j.position_lower_limit() + j.position_upper_limit()) for j in joints]
+    stance = [given[name] for name in leg.joints]
+    chosen = np.where(np.isnan(stance), middle, stance)
+    return np.nan_to_num(chosen, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _jacobian(axes: list[np.ndarray], origins: list[np.ndarray], point: np.ndarray) -> np.ndarray:
