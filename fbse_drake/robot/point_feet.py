@@ -57,7 +57,8 @@ def propose_stance(model: UrdfModel, legs: Sequence[Chain]) -> Stance:
         InputError: legs that are not in pairs, or a base whose axes do not point forwards and up.
         NoStanceError: there is no posture with level feet below the hips.
     """
-    by_side, remarks = _sides(model, legs), []
+    by_side = _sides(model, legs)
+    remarks: list[str] = []
     tips = {side: _lowest(model, leg, side, remarks) for side, leg in by_side.items()}
     remarks = list(dict.fromkeys(remarks))
     angles = _angles(model, by_side, tips)
