@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
 from fbse_drake.report import figures
+from fbse_drake.report.figures import consistency, friction, joints, panels, walk
+from fbse_drake.report.figures.kind import FigureKind
 from fbse_drake.report.html import (
     Details,
     FigureBlock,
@@ -132,6 +134,13 @@ def line(figure: Figure, panel: int, label: str) -> np.ndarray:
     return found.get_xydata()
 
 
+def with_pads(**pads: np.ndarray) -> Log:
+    """`walking_log` that knows where the pads are."""
+    log = walking_log()
+    places = {side: of_side.tolist() for side, of_side in pads.items()}
+    return dataclasses.replace(log, meta=log.meta | {"pads": places})
+
+
 class _Page(HTMLParser):
     """Collects the tags and what they refer to."""
 
@@ -226,7 +235,7 @@ def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_re
 
 def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
     log = log_with_law(0.0, 0.25, 0.5, 0.02)
-    figure = figures.friction(log)
+    figure = friction.friction(log)
     drawn = {
         axes.get_title(loc="left"): line.get_xydata()[:, 1]
         for axes in figure.axes
@@ -235,7 +244,7 @@ def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
     }
     assert list(drawn) == ["right hip"]
     np.testing.assert_array_equal(drawn["right hip"], log["truth/joint/friction_law_torque"][:, 2])
-    followed = figures.friction(log_with_law(0.0, 0.0, 0.005, 0.0))
+    followed = friction.friction(log_with_law(0.0, 0.0, 0.005, 0.0))
     assert all(len(axes.get_lines()) == 1 for axes in followed.axes)
 
 
@@ -273,21 +282,20 @@ def test_feet_in_the_air_have_no_force_figure():
 
 def test_a_panel_for_each_joint_of_any_robot():
     for log in (walking_log(), joints_only_log()):
-        panels = [axes.get_title(loc="left") for axes in figures.joint_angles(log).axes]
+        panels = [axes.get_title(loc="left") for axes in joints.joint_angles(log).axes]
         assert sorted(panels) == sorted(name.replace("_", " ") for name in log.joints)
 
 
 def test_phases_are_named_as_in_the_paper():
-    phases = figures.support_phases(walking_log())
+    phases = panels.support_phases(walking_log())
     assert [phase.label for phase in phases] == ["DS", "LS", "DS", "RS"]
     assert [phase.start for phase in phases] == pytest.approx([0.0, 1.0, 2.0, 3.0])
     assert phases[-1].end == pytest.approx(3.99)
-    assert figures.support_phases(joints_only_log()) == []
+    assert panels.support_phases(joints_only_log()) == []
 
 
 def test_measured_zmp_is_the_centre_of_the_pad_forces():
-    log = walking_log()
-    figure = figures.footprints(log, pads=dict.fromkeys(log.sides, PADS))
+    figure = walk.footprints(with_pads(left=PADS, right=PADS))
     expected = np.array([[0.6, 0.0], [0.6, 0.1], [0.6, 0.0], [0.6, -0.1]]).repeat(
         SAMPLES // 4, axis=0
     )
@@ -296,11 +304,20 @@ def test_measured_zmp_is_the_centre_of_the_pad_forces():
 
 
 def test_soles_are_drawn_where_the_feet_stand():
-    log = walking_log()
-    axes = figures.footprints(log, outlines={"left": PADS[:, :2], "right": 2 * PADS[:, :2]}).axes[0]
+    axes = walk.footprints(with_pads(left=PADS, right=2 * PADS)).axes[0]
     soles = [patch.get_xy()[:4] for patch in axes.patches if patch.get_label() == "right foot"]
     # The right foot stands twice.
-    np.testing.assert_allclose(soles, [[0.5, -0.1] + 2 * PADS[:, :2]] * 2)
+    expected = [0.5, -0.1] + 2 * PADS[:, :2]
+    assert len(soles) == 2
+    for sole in soles:
+        np.testing.assert_allclose(sorted(sole.tolist()), sorted(expected.tolist()))
+
+
+def test_feet_whose_pads_are_in_one_line_are_crosses():
+    axes = walk.footprints(with_pads(left=PADS * [1, 0, 0], right=PADS)).axes[0]
+    assert {patch.get_label() for patch in axes.patches} == {"right foot", "planned foothold"}
+    crosses = [line for line in axes.get_lines() if line.get_label() == "left foot"]
+    assert {line.get_marker() for line in crosses} == {"x"}
 
 
 def test_long_series_are_thinned_without_losing_a_spike():
@@ -308,7 +325,7 @@ def test_long_series_are_thinned_without_losing_a_spike():
     torque = np.zeros((40_003, 4))
     torque[23_456, 0] = 77.0
     torque[40_002, 0] = -5.0
-    figure = figures.torques(Log(log.channels | {"joint/torque_command": torque}, log.meta))
+    figure = joints.torques(Log(log.channels | {"joint/torque_command": torque}, log.meta))
     points = figure.axes[0].get_lines()[0].get_xydata()
     assert points[:, 1].max() == 77.0
     assert points[points[:, 1].argmax(), 0] == pytest.approx(234.56)
@@ -319,8 +336,8 @@ def test_long_series_are_thinned_without_losing_a_spike():
 
 def test_drawing_leaves_matplotlib_as_it_was():
     before = dict(mpl.rcParams)
-    figures.joint_angles(walking_log())
-    figures.footprints(walking_log())
+    joints.joint_angles(walking_log())
+    walk.footprints(walking_log())
     assert dict(mpl.rcParams) == before
 
 
@@ -436,12 +453,7 @@ def test_a_log_that_ends_before_the_filters_have_settled_has_all_figures(samples
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """All figures are empty, which saves the time to draw them."""
-    for name, function in vars(figures).items():
-        if (
-            not name.startswith("_")
-            and getattr(function, "__annotations__", {}).get("return") is Figure
-        ):
-            monkeypatch.setattr(figures, name, lambda *_, **__: Figure())
+    monkeypatch.setattr(FigureKind, "block", lambda kind, _: FigureBlock(kind.title, "", Figure()))
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -476,22 +488,22 @@ def test_figures_of_estimates_follow_the_channels():
 
 def test_estimate_and_truth_are_drawn_at_the_end_of_the_same_step():
     log = estimated_log()
-    figure = figures.estimated_friction(log)
+    figure = friction.estimated_friction(log)
     estimate, truth = line(figure, 0, "estimated, left"), line(figure, 0, "true friction")
     np.testing.assert_allclose(estimate[1:], truth[1:] * [1.0, 1.1])
-    error = figures.friction_errors(log)
+    error = friction.friction_errors(log)
     assert error.axes[0].get_title(loc="right") == "RMS 0.10 Nm"
     known = without(log, "truth/")
     assert [
         label
-        for label in figures.estimated_friction(known).axes[0].get_legend_handles_labels()[1]
+        for label in friction.estimated_friction(known).axes[0].get_legend_handles_labels()[1]
         if "true" in label
     ] == []
 
 
 def test_swings_of_the_joints_own_leg_are_shaded():
     for log in (estimated_log(), without(estimated_log(), "reference/")):
-        panels = figures.estimated_friction(log).axes
+        panels = friction.estimated_friction(log).axes
         spans = {
             axes.get_title(loc="left"): [patch.get_extents() for patch in axes.patches]
             for axes in panels
@@ -509,7 +521,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     log = estimated_log()
     spiky = log["estimate/joint/friction_torque"].copy()
     spiky[200, 0] = 500.0
-    axes = figures.estimated_friction(
+    axes = friction.estimated_friction(
         Log(log.channels | {"estimate/joint/friction_torque": spiky}, log.meta)
     ).axes[0]
     low, high = axes.get_ylim()
@@ -519,7 +531,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     true_spike = log["truth/joint/friction_torque"].copy()
     true_spike[200, 0] = 50.0
     assert (
-        figures.estimated_friction(
+        friction.estimated_friction(
             Log(log.channels | {"truth/joint/friction_torque": true_spike}, log.meta)
         )
         .axes[0]
@@ -542,7 +554,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     ],
 )
 def test_parameters_are_named_by_the_scenarios_friction_model(scenario, titles, bands):
-    figure = figures.friction_parameters(estimated_log(scenario))
+    figure = friction.friction_parameters(estimated_log(scenario))
     assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == titles
     found = [
         collection.get_paths()[0].vertices[:, 1]
@@ -558,7 +570,7 @@ def test_nis_is_averaged_over_half_a_second():
     log = estimated_log()
     innovation = np.ones((SAMPLES, 4)) * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
     innovation[200:, 0] *= 2.0
-    figure = figures.friction_consistency(
+    figure = consistency.friction_consistency(
         Log(log.channels | {"estimate/friction/innovation": innovation}, log.meta)
     )
     time, nis = line(figure, 0, "NIS, left").T
@@ -581,7 +593,7 @@ def test_status_is_shown_only_if_something_was_not_trusted():
 
 
 def test_status_is_drawn_by_sensor_and_estimator():
-    figure = figures.statuses(stuck_imu())
+    figure = consistency.statuses(stuck_imu())
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert names[:5] == ["joints", "IMU", "left foot", "right foot", "attitude"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ok", "stuck"]

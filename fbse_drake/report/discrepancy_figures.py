@@ -23,7 +23,7 @@ from fbse_drake.discrepancy.diagnosis.study import StudyStep
 from fbse_drake.discrepancy.residual.residual import Residual, Row
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.effects.effect import library, spaced
-from fbse_drake.report.figures import (
+from fbse_drake.report.figures.style import (
     ESTIMATE,
     PLANNED,
     SIDE_COLORS,

@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from fbse_drake.report.figures import ESTIMATE, SIDE_COLORS, WIDTH, add_legend, decorate
+from fbse_drake.report.figures.style import ESTIMATE, SIDE_COLORS, WIDTH, add_legend, decorate
 from fbse_drake.report.html import (
     Details,
     FigureBlock,

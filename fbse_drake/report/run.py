@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from fbse_drake.log import Log
 from fbse_drake.report.figures import run_figures
@@ -35,17 +34,7 @@ def write_run_report(
         metrics: contents of metrics.json, see `run_metrics`.
         name: what the scenario is called.
     """
-    pads = {side: np.array(places) for side, places in log.meta.get("pads", {}).items() if places}
-    # A sole reaches at least as far as its pads; those in one line have no outline.
-    outlines = {
-        side: places[ConvexHull(places[:, :2]).vertices, :2]
-        for side, places in pads.items()
-        if np.linalg.matrix_rank(np.diff(places[:, :2], axis=0)) == 2
-    }
-    figures = {
-        topic: tuple(blocks)
-        for topic, blocks in run_figures(log, outlines=outlines or None, pads=pads or None).items()
-    }
+    figures = {topic: tuple(blocks) for topic, blocks in run_figures(log).items()}
     sections = [
         Section("Summary", log.meta.get("title", ""), tables=(key_figures(metrics),)),
         Section("Motion", figures=figures["walk"]),
