@@ -140,13 +140,14 @@ def _effect(name: str, effect: type[Effect]) -> Iterator[str]:
     rows = [
         (
             f"`{key}`",
+            parameter.meaning,
             parameter.unit,
             "{:g} to {:g}".format(*parameter.plausible),
             "linear" if parameter.linear else "searched",
         )
         for key, parameter in effect.parameters.items()
     ]
-    yield from _table(("parameter", "unit", "plausible", "identified"), rows)
+    yield from _table(("parameter", "what it is", "unit", "plausible", "identified"), rows)
     yield from ("", f"Given by {effect.acts_on}; `{effect.__module__}`.")
 
 

@@ -337,7 +337,7 @@ class IdentificationResult(Identification, AnalysisResult):
         return self.scenario
 
     def _report(self, path: Path, inputs: Inputs) -> None:
-        write_identification_report(path, self, inputs.name)
+        write_identification_report(path, self, inputs)
 
 
 def compare(scenario: Scenario, log: Log, *, name: str = "scenario") -> ComparisonResult:

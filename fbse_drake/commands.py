@@ -44,7 +44,7 @@ from fbse_drake.report.html import Table as ReportTable
 from fbse_drake.report.html import number, percent
 from fbse_drake.report.identification import base_table
 from fbse_drake.report.metrics import worst_joint
-from fbse_drake.report.run import law_sentence
+from fbse_drake.report.run import law_step
 from fbse_drake.report.sentences import Inputs, parameter_text
 from fbse_drake.results import RunResult
 from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
@@ -577,8 +577,8 @@ def _write_run(console: Console, out: Path, result: RunResult) -> None:
     with console.status("writing the report"):
         result.save(out)
     console.print(_summary(result.name, result.metrics))
-    if sentence := law_sentence(result.metrics["friction_law_error"]):
-        console.print(sentence, soft_wrap=True)
+    if step := law_step(result.metrics["friction_law_error"]):
+        console.print(Text(str(step)), soft_wrap=True)
     console.print(f"Report: {out / 'report.html'}", soft_wrap=True)
 
 

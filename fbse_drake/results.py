@@ -81,12 +81,16 @@ class RunResult(Result):
             InputError: the folder cannot be made.
             OSError: a file cannot be written; none is half-written.
         """
+        from fbse_drake.report.run import write_run_report
+
         out = made_folder(folder)
         self.log.save(out / "log.npz")
         write_text(out / "scenario.yaml", dump_scenario(self.scenario, self.name))
         made_of = origin([out / "log.npz"], out / "scenario.yaml")
         write_json(out / "metrics.json", made_of | self.metrics)
-        self.report(out / "report.html")
+        write_run_report(
+            out / "report.html", self.log, self.metrics, name=self.name, folder=Path(folder)
+        )
 
 
 def made_folder(folder: str | Path) -> Path:

@@ -3,16 +3,19 @@
 import base64
 import dataclasses
 import math
+import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
 from fbse_drake.report import figures
-from fbse_drake.report.figures import consistency, friction, joints, panels, walk
+from fbse_drake.report.figures import base, consistency, friction, joints, panels, walk
 from fbse_drake.report.figures.kind import FigureKind
 from fbse_drake.report.html import (
     Details,
@@ -160,6 +163,11 @@ class _Page(HTMLParser):
         self.titles += [attributes["alt"]] if tag == "img" else []
 
 
+def page_text(path: Path) -> str:
+    """Of a report, without the labels that phones show in its cells."""
+    return re.sub(r' data-label="[^"]*"', "", path.read_text(encoding="utf-8"))
+
+
 def titles(log: Log) -> list[str]:
     return [block.title for blocks in figures.run_figures(log).values() for block in blocks]
 
@@ -214,7 +222,7 @@ def log_with_law(*shares: float) -> Log:
 def test_report_says_where_a_law_is_not_followed(tmp_path):
     log = log_with_law(0.001, 0.25, 0.0, 0.02)
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = page_text(tmp_path / "report.html")
     assert 'worst joint (left knee)</td><td class="number">25.0</td><td>% of law</td>' in text
     assert "in left knee (25.0 %), right knee (2.0 %). A smaller plant step" in text
     assert "--set plant.time_step=" in text
@@ -225,7 +233,7 @@ def test_report_says_where_a_law_is_not_followed(tmp_path):
 def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_report):
     log = log_with_law(0.001, 0.009, 0.0, 0.0)
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = page_text(tmp_path / "report.html")
     assert 'worst joint (left knee)</td><td class="number">0.900</td><td>% of law</td>' in text
     for words in ("A smaller plant step", "Thin: the law"):
         assert words not in text
@@ -255,7 +263,7 @@ def test_fall_and_scenario_are_escaped_text(tmp_path, monkeypatch):
     log = walking_log(fell=True)
     log = dataclasses.replace(log, meta=log.meta | {"scenario": "title: <script>alert(1)</script>"})
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="<b>")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = page_text(tmp_path / "report.html")
     assert "The run ended early at t = 3.990 s: fell: &lt;tilted&gt;." in text
     assert 'class="outcome failed"' in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
@@ -334,6 +342,61 @@ def test_long_series_are_thinned_without_losing_a_spike():
     assert (np.diff(points[:, 0]) >= 0).all()
 
 
+# As people see colours who lack the red, green or blue cones (Machado, Oliveira and Fernandes 2009,
+# severity 1), for linear RGB.
+_SIGHT = {
+    "all cones": np.eye(3),
+    "no red cones": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "no green cones": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "no blue cones": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}
+_XYZ_OF_RGB = [
+    [0.4124564, 0.3575761, 0.1804375],
+    [0.2126729, 0.7151522, 0.0721750],
+    [0.0193339, 0.1191920, 0.9503041],
+]
+
+
+def difference(first: str, second: str, sight: str) -> float:
+    """CIE 1976 colour difference, of which about 2 can just be seen."""
+    places = []
+    for color in (first, second):
+        rgb = np.array(to_rgb(color))
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        seen = np.clip(_SIGHT[sight] @ linear, 0.0, 1.0)
+        x, y, z = np.cbrt(_XYZ_OF_RGB @ seen / [0.95047, 1.0, 1.08883])
+        places.append(np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)]))
+    return float(np.linalg.norm(places[0] - places[1]))
+
+
+@pytest.mark.parametrize("sight", _SIGHT)
+def test_nobody_takes_the_truth_for_an_estimate(sight: str):
+    log = estimated_log()
+    compared = 0
+    for kind in (friction.estimated_friction, base.base_attitude, base.base_velocity, walk.com):
+        for axes in kind(log).axes:
+            lines = {line.get_label().split(",")[0]: line for line in axes.get_lines()}
+            if true := lines.get("true friction", lines.get("true")):
+                color = lines["estimated"].get_color()
+                assert difference(true.get_color(), color, sight) > 30.0
+                compared += 1
+    assert compared == 4 + 2 + 3 + 2
+    # What was found wanting: red over orange.
+    assert difference("#c81e1e", "#d65f1a", sight) < 30.0
+
+
 def test_drawing_leaves_matplotlib_as_it_was():
     before = dict(mpl.rcParams)
     joints.joint_angles(walking_log())
@@ -403,7 +466,7 @@ def test_report_of_estimates_tells_their_errors(tmp_path):
         run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)),
         name="a_walk",
     )
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = page_text(tmp_path / "report.html")
     assert len(_Page(text).titles) == 17
     # Friction of 1 Nm, estimated as 1.1 Nm, in stance and in swing.
     numbers = "".join(
@@ -434,7 +497,7 @@ def test_report_of_a_recording_tells_what_is_known(tmp_path):
         run_metrics(log, 2.0, np.full(SAMPLES, 0.0006)),
         name="a_robot",
     )
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = page_text(tmp_path / "report.html")
     assert "A recording of 3.99 s." in text
     assert "YAML of the estimator that ran over the log" in text
     assert "Joint tracking error" not in text

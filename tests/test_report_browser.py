@@ -1,6 +1,7 @@
 """Reports and recordings of runs in a real browser, headless Chromium: they need nothing outside themselves, and show all they hold."""
 
 import io
+import math
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -33,6 +34,8 @@ playwright = pytest.importorskip(
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Containers run as root and without a graphics card.
 _OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"]
+# Widths [px] and colour schemes.
+VIEWS = ((390, "light"), (390, "dark"), (820, "light"), (1600, "dark"))
 # The order of a lab report.
 SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN = (
     "Summary",
@@ -57,9 +60,17 @@ class Visit:
     pictures: list[tuple[int, int]] = field(default_factory=list)
     # By how much the page is wider than the window [px].
     overflow: int = 0
+    # Texts and pictures that reach beyond the window.
+    cut_off: list[str] = field(default_factory=list)
+    # Mean brightness of the first picture, 0 to 1.
+    brightness: float = math.nan
+    # Whether the contents can be seen at the end of the page.
+    contents: bool = False
     # Of the window, (height, width, 3).
     screenshot: np.ndarray = field(default_factory=lambda: np.empty(0))
 
+
+Visitor = Callable[..., list[Visit]]
 
 _LOOK = """() => {
   document.querySelectorAll("details").forEach(details => { details.open = true; });
@@ -69,59 +80,83 @@ _LOOK = """() => {
     pictures: [...document.querySelectorAll("img, svg")].map(
       picture => [picture.naturalWidth ?? picture.clientWidth, picture.clientWidth]),
     overflow: page.scrollWidth - page.clientWidth,
+    cut_off: [...document.querySelectorAll("h1, h2, h3, p, li, th, td, summary, img")]
+      .filter(one => one.getBoundingClientRect().right > page.clientWidth + 0.5)
+      .map(one => one.textContent || one.alt),
   };
+}"""
+
+_CONTENTS_AT_THE_END = """() => {
+  window.scrollTo(0, document.body.scrollHeight);
+  const link = document.querySelector("nav a")?.getBoundingClientRect();
+  return Boolean(link) && link.top >= 0 && link.bottom <= window.innerHeight;
 }"""
 
 
 @pytest.fixture(scope="module")
-def visit() -> Iterator[Callable[..., Visit]]:
-    """Opens a file without a network: visit(path, width=1280)."""
+def visit() -> Iterator[Visitor]:
+    """Opens a file without a network: visit(path, (width, scheme), ...), a visit for each view."""
     executable = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if executable is None:
         pytest.skip(f"no browser is installed (looked for {', '.join(_BROWSERS)})")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=executable, args=_OPTIONS)
 
-        def opened(path: Path, width: int = 1280) -> Visit:
-            result = Visit()
-            context = browser.new_context(viewport={"width": width, "height": 800}, offline=True)
+        def opened(path: Path, *views: tuple[int, str]) -> list[Visit]:
+            requests: list[str] = []
+            errors: list[str] = []
+            context = browser.new_context(offline=True)
             page, own = context.new_page(), path.as_uri()
             inside = (own, "data:", "blob:")
             page.on(
                 "request",
-                lambda request: result.requests.extend(
+                lambda request: requests.extend(
                     [request.url] * (not request.url.startswith(inside))
                 ),
             )
-            page.on("websocket", lambda socket: result.requests.append(socket.url))
+            page.on("websocket", lambda socket: requests.append(socket.url))
             page.on(
                 "console",
-                lambda message: result.errors.extend([message.text] * (message.type == "error")),
+                lambda message: errors.extend([message.text] * (message.type == "error")),
             )
-            page.on("pageerror", lambda error: result.errors.append(str(error)))
-            page.goto(own, wait_until="networkidle")
-            for name, value in page.evaluate(_LOOK).items():
-                setattr(result, name, value)
-            result.screenshot = matplotlib.image.imread(
-                io.BytesIO(page.screenshot()), format="png"
-            )[..., :3]
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            found = []
+            for width, scheme in views:
+                page.set_viewport_size({"width": width, "height": 800})
+                page.emulate_media(color_scheme=scheme)
+                if not found:
+                    page.goto(own, wait_until="networkidle")
+                seen = Visit(requests, errors, **page.evaluate(_LOOK))
+                seen.screenshot = _pixels(page.screenshot())
+                if picture := page.query_selector("figure img"):
+                    seen.brightness = float(_pixels(picture.screenshot()).mean())
+                seen.contents = page.evaluate(_CONTENTS_AT_THE_END)
+                found.append(seen)
             context.close()
-            return result
+            return found
 
         yield opened
         browser.close()
 
 
-def check(visit: Callable[..., Visit], path: Path, headings: list[str], pictures: int) -> None:
-    """The file is whole by itself, at the width of a screen and of half a one."""
-    for width in (1280, 800):
-        seen = visit(path, width)
+def _pixels(png: bytes) -> np.ndarray:
+    return matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
+
+
+def check(visit: Visitor, path: Path, headings: list[str], pictures: int) -> None:
+    """The file is whole by itself, on a phone, a tablet and a desk, in a light and a dark room."""
+    for view, seen in zip(VIEWS, visit(path, *VIEWS), strict=True):
+        width, scheme = view
         assert seen.requests == []
         assert seen.errors == []
         assert seen.headings == headings
         assert len(seen.pictures) == pictures
         assert all(natural > 0 and 300 < shown <= width for natural, shown in seen.pictures)
-        assert seen.overflow <= 0
+        assert seen.overflow <= 0, view
+        assert seen.cut_off == [], view
+        assert seen.contents, view
+        # Mostly paper.
+        assert (seen.brightness > 0.75) if scheme == "light" else (seen.brightness < 0.3), view
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +164,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reports")
 
 
-def test_study_of_a_walk_is_a_lab_report(
-    visit: Callable[..., Visit], run: Callable[..., Log], folder: Path
-):
+def test_study_of_a_walk_is_a_lab_report(visit: Visitor, run: Callable[..., Log], folder: Path):
     predictor = Predictor(load_scenario("paper_walk"), run("paper_walk", "duration=3"))
     whole = (predictor, compare(predictor))
     rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
@@ -147,9 +180,7 @@ def test_study_of_a_walk_is_a_lab_report(
     check(visit, folder / "study.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 10)
 
 
-def test_reports_of_a_machine_without_legs_are_lab_reports(
-    visit: Callable[..., Visit], folder: Path
-):
+def test_reports_of_a_machine_without_legs_are_lab_reports(visit: Visitor, folder: Path):
     """A revolute and a prismatic joint: no feet, no phases."""
     (folder / "crane.urdf").write_text(CRANE)
     scenario = crane(
@@ -187,7 +218,7 @@ def test_reports_of_a_machine_without_legs_are_lab_reports(
     assert not re.findall(r"\b(?:foot|feet|soles?|accelerometer|support)\b", said)
 
 
-def test_report_of_a_run(visit: Callable[..., Visit], run: Callable[..., Log], folder: Path):
+def test_report_of_a_run(visit: Visitor, run: Callable[..., Log], folder: Path):
     log = run("paper_walk", "duration=3")
     write_run_report(folder / "run.html", log, run_metrics(log, 1.0), name="a_walk")
     check(
@@ -198,12 +229,12 @@ def test_report_of_a_run(visit: Callable[..., Visit], run: Callable[..., Log], f
     )
 
 
-def test_recording_of_a_run_shows_the_robot(visit: Callable[..., Visit], folder: Path):
+def test_recording_of_a_run_shows_the_robot(visit: Visitor, folder: Path):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     simulate(load_scenario("squat", overrides=["duration=0.1"]), meshcat=meshcat)
     meshcat.SetCameraPose([2.2, -2.2, 1.3], [0.2, 0.0, 0.5])
     (folder / "meshcat.html").write_text(meshcat.StaticHtml())
-    seen = visit(folder / "meshcat.html")
+    (seen,) = visit(folder / "meshcat.html", (1280, "light"))
     assert seen.requests == []
     assert seen.errors == []
     assert seen.overflow <= 0
@@ -214,22 +245,26 @@ def test_recording_of_a_run_shows_the_robot(visit: Callable[..., Visit], folder:
     assert ((np.abs(red - blue) < 0.1) & (np.abs(red - green) < 0.1)).mean() > 0.5
 
 
-def test_what_is_wrong_with_a_page_is_seen(visit: Callable[..., Visit], tmp_path: Path):
+def test_what_is_wrong_with_a_page_is_seen(visit: Visitor, tmp_path: Path):
     (tmp_path / "bad.html").write_text(
         "<h2>a</h2><img src='http://localhost:1/picture.png'><img src='data:image/png;base64,broken'>"
         "<script>new WebSocket('ws://localhost:1'); throw new Error('thrown')</script><div style='width: 2000px'>wide</div>"
     )
-    seen = visit(tmp_path / "bad.html")
+    (seen,) = visit(tmp_path / "bad.html", (1280, "light"))
     assert {"http://localhost:1/picture.png", "ws://localhost:1/"} <= set(seen.requests)
     assert any("thrown" in error for error in seen.errors)
     assert [natural for natural, _ in seen.pictures] == [0, 0]
     assert seen.overflow > 700
 
 
-def test_a_wide_table_scrolls_by_itself(visit: Callable[..., Visit], tmp_path: Path):
+def test_a_wide_table_scrolls_by_itself(visit: Visitor, tmp_path: Path):
     header = tuple(f"a long name of column {k}" for k in range(30))
     table = Table(header, (tuple(float(k) for k in range(30)),), "Wide.")
     write_report(
         tmp_path / "report.html", Report("wide", True, "done", (Section("s", tables=(table,)),))
     )
-    assert visit(tmp_path / "report.html", 800).overflow <= 0
+    desk, phone = visit(tmp_path / "report.html", (1280, "light"), (390, "light"))
+    assert desk.overflow <= 0
+    assert any("column 29" in text for text in desk.cut_off)
+    # Where each row is a card, nothing needs to scroll.
+    assert phone.cut_off == []

@@ -61,6 +61,8 @@ class Parameter:
     belief: float = np.inf
     # For a nonlinear one: is what would lie beyond its plausible range something else?
     closed: bool = False
+    # What it is, where its name does not say it.
+    meaning: str = ""
 
     @property
     def lever_factor(self) -> float:

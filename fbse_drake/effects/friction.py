@@ -139,12 +139,34 @@ class StribeckFriction(JointTorqueEffect):
     )
     of_velocity_alone: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "gamma1": Parameter("Nm", linear=True, plausible=(0.0, 20.0)),
-        "gamma2": Parameter("s/rad", linear=False, plausible=(50.0, 500.0)),
-        "gamma3": Parameter("s/rad", linear=False, plausible=(1.0, 25.0)),
-        "gamma4": Parameter("Nm", linear=True, plausible=(0.0, 50.0)),
-        "gamma5": Parameter("s/rad", linear=False, plausible=(20.0, 500.0)),
-        "gamma6": Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0)),
+        "gamma1": Parameter(
+            "Nm",
+            linear=True,
+            plausible=(0.0, 20.0),
+            meaning="friction at the start of a motion in excess of Coulomb friction",
+        ),
+        "gamma2": Parameter(
+            "s/rad",
+            linear=False,
+            plausible=(50.0, 500.0),
+            meaning="how steeply that excess rises with speed",
+        ),
+        "gamma3": Parameter(
+            "s/rad",
+            linear=False,
+            plausible=(1.0, 25.0),
+            meaning="how fast it falls again with more speed (Stribeck effect)",
+        ),
+        "gamma4": Parameter("Nm", linear=True, plausible=(0.0, 50.0), meaning="Coulomb friction"),
+        "gamma5": Parameter(
+            "s/rad",
+            linear=False,
+            plausible=(20.0, 500.0),
+            meaning="how steeply Coulomb friction rises with speed",
+        ),
+        "gamma6": Parameter(
+            "Nm s/rad", linear=True, plausible=(0.0, 30.0), meaning="viscous friction"
+        ),
     }
     reductions: ClassVar[tuple[Reduction, ...]] = (
         Reduction({"gamma1": 0.0, "gamma6": 0.0}, (CoulombFriction,)),

@@ -39,6 +39,7 @@ from fbse_drake.report.html import (
     FigureBlock,
     Report,
     Section,
+    Step,
     Table,
     number,
     write_report,
@@ -52,10 +53,11 @@ from fbse_drake.report.sentences import (
     how_sure,
     is_confirmed,
     kinds_of_failures,
-    next_step,
     set_aside_rows,
     statuses_of,
-    step_after_study,
+    steps_after_compare,
+    steps_after_diagnosis,
+    steps_after_study,
     study_outcome,
     times_noise,
     too_small_rows,
@@ -82,7 +84,10 @@ _METHOD = (
     "explain; it stands beside the noise that the sensors must put into it."
 )
 
-_RATIOS = "Root mean square of what the equation of motion leaves over, in multiples of the sensors' noise: about 1 is noise alone."
+_RATIOS = (
+    "Root mean square of what the equation of motion leaves over, in multiples of the sensors' "
+    "noise: about 1 is noise alone."
+)
 
 _BY_PHASE = (
     f"{_RATIOS} No joint effect can show in the base's channels: what does is mass, foot sensor, IMU or contact. The soles' channels "
@@ -104,12 +109,6 @@ def write_compare_report(
             f"A constant taken off every channel leaves {times_noise(comparison.held_out_rmse)} on held-out data.",
         ),
         ("Where it fails", kinds_of_failures(comparison)),
-        (
-            "What to do next",
-            f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)}"
-            if comparison.failures
-            else "Nothing: there is nothing to explain.",
-        ),
     )
     sections = [
         _summary(rows),
@@ -120,7 +119,11 @@ def write_compare_report(
     write_report(
         path,
         Report(
-            f"{inputs.name}: model against log", not comparison.failures, outcome, tuple(sections)
+            f"{inputs.name}: model against log",
+            not comparison.failures,
+            outcome,
+            tuple(sections),
+            steps_after_compare(comparison, inputs),
         ),
     )
 
@@ -159,7 +162,6 @@ def write_diagnosis_report(
         ),
         *too_small_rows(diagnosis.too_small),
         ("What was looked for", verdicts_text(statuses)),
-        ("What to do next", next_step(diagnosis, inputs)),
     )
     sections = [
         _summary(rows),
@@ -177,7 +179,13 @@ def write_diagnosis_report(
     )
     write_report(
         path,
-        Report(f"{inputs.name}: what is missing in the model", passed, outcome, tuple(sections)),
+        Report(
+            f"{inputs.name}: what is missing in the model",
+            passed,
+            outcome,
+            tuple(sections),
+            steps_after_diagnosis(diagnosis, inputs),
+        ),
     )
 
 
@@ -213,7 +221,6 @@ def write_study_report(
         ("What else it could be", what_else(study.found, partial=study.partial)),
         *too_small_rows(study.diagnoses[-1].too_small),
         ("What was looked for", verdicts_text(statuses)),
-        ("What to do next", step_after_study(study, inputs)),
     )
     completed = dump_scenario(study.scenario, inputs.name) if study.found else None
     sections = [
@@ -241,6 +248,7 @@ def write_study_report(
             passed,
             inputs.hygiene.before(study_outcome(study)),
             tuple(sections),
+            steps_after_study(study, inputs),
         ),
     )
 
@@ -319,8 +327,10 @@ def _why(
         )
     if chosen or others:
         caption = (
-            "Error on held-out data of the channels that an effect moves, without it and with it, everything else being equal. "
-            "The broken line is the sensors' noise. An alternative stands in the place of what was chosen."
+            "Error on held-out data of all the channels that an effect moves, taken together, "
+            "without it and with it, everything else being equal; as everywhere in this report in "
+            "multiples of the sensors' noise (root mean squares). The broken line is that noise. "
+            "An alternative stands in the place of what was chosen."
         )
         names = [
             f"{finding_name(f)}{when}"
@@ -355,7 +365,7 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
     for name, status in statuses.items():
         reach = f"{words(status.parameter)} {reach_text(status, name)}"
         does = known[name].description if name in known else ""
-        show = f"{status.experiment} ({status.command})" if status.command else status.experiment
+        show = Step(status.experiment, status.command or "")
         rows.append((spaced(name), words(status.verdict), reach, does, show))
     header = (
         "Effect",

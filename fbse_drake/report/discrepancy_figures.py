@@ -24,10 +24,10 @@ from fbse_drake.discrepancy.residual.residual import Residual, Row
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.effects.effect import library, spaced
 from fbse_drake.report.figures.style import (
+    ERROR,
     ESTIMATE,
     PLANNED,
     SIDE_COLORS,
-    TRUTH,
     WIDTH,
     add_legend,
     decorate,
@@ -53,7 +53,7 @@ _GAP = 3.0
 # Intervals are drawn up to this many times the largest value.
 _WIDEST = 4.0
 VERDICT_COLORS = {
-    "present": TRUTH,
+    "present": ERROR,
     "confusable": "#e39b16",
     "absent": ESTIMATE,
     "not_visible": "#a9b0b7",
@@ -359,10 +359,10 @@ def _draw_bins(axes: Axes, bins: Sequence[Bin]) -> None:
         label="± 2 standard deviations of the noise",
     )
     axes.fill_between(
-        centre, low, high, color=TRUTH, alpha=0.18, linewidth=0, label="95 % interval"
+        centre, low, high, color=ERROR, alpha=0.18, linewidth=0, label="95 % interval"
     )
     axes.plot(
-        centre, error, color=TRUTH, marker="o", markersize=3.5, linewidth=1.2, label="mean error"
+        centre, error, color=ERROR, marker="o", markersize=3.5, linewidth=1.2, label="mean error"
     )
 
 
@@ -388,7 +388,7 @@ def errors_over_time(
             linewidth=0,
             label="± 2 standard deviations of the noise",
         )
-        axes.plot(residual.time, value, color=TRUTH, linewidth=0.9, label="error")
+        axes.plot(residual.time, value, color=ERROR, linewidth=0.9, label="error")
         _shade_supports(axes, residual, sides)
         axes.set_ylabel(
             f"{words(channel.row.name).replace(' ', chr(10), 1)}\n[{channel.row.unit}]", fontsize=9
@@ -699,7 +699,7 @@ def falling_error(steps: Sequence[StudyStep], unit: str) -> Figure:
         [getattr(step, name) for step in steps] for name in ("held_out_rmse", "train_rmse")
     )
     decorate(axes)
-    axes.plot(places, held_out, "o-", color=TRUTH, linewidth=2, label="held-out data")
+    axes.plot(places, held_out, "o-", color=ERROR, linewidth=2, label="held-out data")
     axes.plot(
         places,
         train,

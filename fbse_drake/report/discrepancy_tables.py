@@ -7,7 +7,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.compare import Channel, Comparison, words
 from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus, Estimate, Finding
 from fbse_drake.discrepancy.diagnosis.study import Study, StudyStep
-from fbse_drake.effects.effect import library
+from fbse_drake.effects.effect import Effect, library
 from fbse_drake.report.discrepancy_figures import (
     by_effect,
     small_motions,
@@ -115,12 +115,11 @@ def all_failure_tables(
             f.text,
             f.where.error,
             "\u00a0to\u00a0".join(map(_short, f.where.interval)),
-            f.where.noise_floor,
             f.row.unit,
         )
         for f in comparison.failures
     )
-    header = ("Failure, worst first", "Mean error", "95 % interval", "Noise in it", "Unit")
+    header = ("Failure, worst first", "Mean error", "95 % interval", "Unit")
     tables = [Table(header, rows[:_FAILURES], caption)] if rows else []
     more = rows[_FAILURES:]
     return (
@@ -190,14 +189,24 @@ def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
             *(["Round"] * several),
             *units,
             "Held-out error / noise before",
-            "after",
+            "Held-out error / noise after",
             "Explains as much",
         )
-        says = [f"{spaced(effect)}."] + (
-            [known[effect].description, known[effect].signature] if effect in known else []
-        )
+        says = [f"{spaced(effect)}."]
+        if effect in known:
+            says += [known[effect].description, known[effect].signature]
+            if meanings := parameters_explained(known[effect]):
+                says.append(meanings)
         tables.append(Table(header, tuple(rows), f"{' '.join(says)} Values with 95 % intervals."))
     return tables
+
+
+def parameters_explained(effect: type[Effect]) -> str:
+    """What its parameters are, where their names do not say it; "" where they do."""
+    meanings = [
+        f"{name} is {one.meaning}" for name, one in effect.parameters.items() if one.meaning
+    ]
+    return f"Here {'; '.join(meanings)}." if meanings else ""
 
 
 def _value_text(estimate: Estimate) -> str:

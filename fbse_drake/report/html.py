@@ -21,11 +21,26 @@ _DPI = 130
 
 
 @dataclass(frozen=True)
+class Step:
+    """Something to do, with the command that does it, if one does."""
+
+    text: str
+    command: str = ""
+
+    def __str__(self) -> str:
+        """As in `Try it: fbse simulate squat`."""
+        return " ".join(part for part in (self.text, self.command) if part)
+
+
+@dataclass(frozen=True)
 class Table:
-    """Rows of texts and numbers under a header; numbers are shown by `number`. Without a header the first column names the rows."""
+    """Rows of texts, numbers and steps under a header; numbers are shown by `number`.
+
+    Without a header the first column names the rows.
+    """
 
     header: tuple[str, ...]
-    rows: tuple[tuple[str | float, ...], ...]
+    rows: tuple[tuple[str | float | Step, ...], ...]
     # What it shows, one or two sentences.
     caption: str = ""
     # Folded away behind its caption, after the figures.
@@ -55,7 +70,7 @@ class Section:
     """A titled part of a report; shows its text, tables, figures, folded tables and details in this order."""
 
     title: str
-    text: str = ""
+    text: str | Step = ""
     tables: tuple[Table, ...] = ()
     figures: tuple[FigureBlock, ...] = ()
     details: tuple[Details, ...] = ()
@@ -71,6 +86,8 @@ class Report:
     # The result in one sentence.
     outcome: str
     sections: tuple[Section, ...]
+    # What to do next, the most important first.
+    steps: tuple[Step, ...] = ()
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -91,7 +108,7 @@ def percent(share: float) -> str:
 def numeric_table(
     header: Sequence[str], rows: Sequence[tuple[str | float, ...]]
 ) -> tuple[Table, ...]:
-    """The table of these rows without those whose numbers are all NaN; no table at all if none is left."""
+    """The table of these rows without those whose numbers are all NaN; none if no row is left."""
     kept = tuple(
         row
         for row in rows
@@ -132,6 +149,9 @@ def _png_uri(figure: Figure) -> str:
     # What `savefig` does, without its first drawing of a figure with a layout engine.
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     figure.set_dpi(_DPI)
+    # The page shows through, which may be dark.
+    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
+        patch.set_alpha(0.0)
     # Dollars that are there before ticks are labelled stand in names: no figure of ours has formulas.
     for text in figure.findobj(Text):
         if "$" in text.get_text():

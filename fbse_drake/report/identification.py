@@ -7,8 +7,8 @@ from fbse_drake.discrepancy.identification.inertial import PARAMETERS, BaseParam
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.report.discrepancy_figures import spaced, targets_text
 from fbse_drake.report.discrepancy_tables import spread_tables
-from fbse_drake.report.html import Details, Report, Section, Table, number, write_report
-from fbse_drake.report.sentences import parameters_text
+from fbse_drake.report.html import Details, Report, Section, Step, Table, number, write_report
+from fbse_drake.report.sentences import Inputs, parameters_text
 from fbse_drake.scenario import dump_scenario
 
 BASE_HEADER = ("combination", "unit", "model", "identified", "95 % interval", "known to")
@@ -73,12 +73,13 @@ def identification_outcome(result: Identification) -> str:
     return f"The relative torque error falls from {100 * before:.1f} % to {100 * after:.1f} % with identified inertia and plain friction."
 
 
-def write_identification_report(path: str | Path, result: Identification, name: str) -> None:
+def write_identification_report(path: str | Path, result: Identification, inputs: Inputs) -> None:
     """Writes what was identified as one HTML file.
 
     Args:
-        name: of the scenario.
+        inputs: what was identified, and where the results lie.
     """
+    name = inputs.name
     inertia = result.inertia
     bodies = []
     for k, body in enumerate(inertia.bodies):
@@ -121,5 +122,17 @@ def write_identification_report(path: str | Path, result: Identification, name: 
         ),
     )
     write_report(
-        path, Report(f"{name}: inertial parameters", True, identification_outcome(result), sections)
+        path,
+        Report(
+            f"{name}: inertial parameters",
+            True,
+            identification_outcome(result),
+            sections,
+            (
+                Step(
+                    "Try the completed model on a log that it has not seen:",
+                    f"fbse compare {inputs.out}/completed.yaml ANOTHER_LOG",
+                ),
+            ),
+        ),
     )

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from fbse_drake.effects.effect import library, spaced
 from fbse_drake.log import Log
 from fbse_drake.report.figures import run_figures
 from fbse_drake.report.html import (
     Details,
     Report,
     Section,
+    Step,
     Table,
     number,
     numeric_table,
@@ -27,12 +29,14 @@ def write_run_report(
     metrics: Mapping[str, Any],
     *,
     name: str,
+    folder: Path | None = None,
 ) -> None:
     """Writes the report of a run as one HTML file; it shows what the log has the channels for.
 
     Args:
         metrics: contents of metrics.json, see `run_metrics`.
         name: what the scenario is called.
+        folder: where log.npz and scenario.yaml lie, for the commands that the report proposes.
     """
     figures = {topic: tuple(blocks) for topic, blocks in run_figures(log).items()}
     sections = [
@@ -42,7 +46,7 @@ def write_run_report(
         Section("Foot forces", figures=figures["forces"]),
         Section(
             "Friction",
-            law_sentence(metrics["friction_law_error"]),
+            law_step(metrics["friction_law_error"]) or "",
             tables=_friction_table(metrics),
             figures=figures["friction"],
         ),
@@ -57,28 +61,42 @@ def write_run_report(
         Section(
             "Scenario",
             "The scenario as it was run, with all its defaults.",
+            tables=_parameter_tables(log),
             details=_scenarios(log),
         ),
     ]
     shown = tuple(
         section for section in sections if section.tables or section.figures or section.details
     )
-    write_report(path, Report(name, not metrics["fell"], run_outcome(metrics), shown))
+    steps = _steps(metrics, folder) if folder is not None else ()
+    write_report(path, Report(name, not metrics["fell"], run_outcome(metrics), shown, steps))
 
 
-def law_sentence(law_error: Mapping[str, float]) -> str:
-    """In which joints the simulated torque is not its law, and what to do; "" if it is in all.
+def _steps(metrics: Mapping[str, Any], folder: Path) -> tuple[Step, ...]:
+    """What to do after a run."""
+    study = f"fbse study {folder}/scenario.yaml {folder}/log.npz"
+    steps = [
+        Step("Find the physics that the scenario's model lacks:", study),
+    ]
+    if law := law_step(metrics["friction_law_error"]):
+        steps.insert(0, law)
+    return tuple(steps)
+
+
+def law_step(law_error: Mapping[str, float]) -> Step | None:
+    """In which joints the simulated torque is not its law, and what to do; None if it is in all.
 
     Args:
         law_error: see `friction_law_error`.
     """
     if not (broken := broken_laws(law_error)):
-        return ""
+        return None
     joints = ", ".join(f"{_words(joint)} ({percent(error)})" for joint, error in broken.items())
-    return (
+    return Step(
         "The simulated joint torque differs from its law by more than "
         f"{100 * LAW_TOLERANCE:g} % of the law's RMS in {joints}. "
-        "A smaller plant step brings it closer: --set plant.time_step=..."
+        "A smaller plant step brings it closer:",
+        "--set plant.time_step=...",
     )
 
 
@@ -187,6 +205,19 @@ def _scenarios(log: Log) -> tuple[Details, ...]:
         "estimator_scenario": "YAML of the estimator that ran over the log",
     }
     return tuple(Details(title, log.meta[key]) for key, title in titles.items() if key in log.meta)
+
+
+def _parameter_tables(log: Log) -> tuple[Table, ...]:
+    """What the parameters of the scenario's effects are, where their names do not say it."""
+    named = " ".join(scenario.text for scenario in _scenarios(log))
+    rows = tuple(
+        (spaced(name), key, parameter.meaning, parameter.unit)
+        for name, effect in library().items()
+        for key, parameter in effect.parameters.items()
+        if parameter.meaning and name in named
+    )
+    header = ("Effect", "Parameter", "What it is", "Unit")
+    return (Table(header, rows, "What the parameters are.", folded=True),) if rows else ()
 
 
 def _words(name: str) -> str:

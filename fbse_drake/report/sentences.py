@@ -17,9 +17,7 @@ from fbse_drake.report.discrepancy_figures import (
     spaced,
     targets_text,
 )
-from fbse_drake.report.html import (
-    number,
-)
+from fbse_drake.report.html import Step, number
 
 # So many rows of a disturbance are named.
 _DISTURBED = 3
@@ -231,49 +229,59 @@ def how_sure(
     return f"The error of all channels is {number(before)} times the sensors' noise, and {nothing}."
 
 
-def next_step(diagnosis: Diagnosis, inputs: Inputs) -> str:
-    """What to do, with the command."""
-    steps = _experiments_next(diagnosis, diagnosis.chosen)
+def steps_after_compare(comparison: Comparison, inputs: Inputs) -> tuple[Step, ...]:
+    """What to do after a comparison."""
+    if not comparison.failures:
+        return (Step("Nothing: there is nothing to explain."),)
+    command = f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)}"
+    return (Step("Find the effects that the model lacks:", command),)
+
+
+def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, ...]:
+    """What to do after a diagnosis, the most important first."""
+    steps = []
     if diagnosis.chosen:
-        steps.append(
-            f"Add it to the model: fbse add {inputs.scenario} {inputs.out} --out {inputs.name}_completed.yaml"
-        )
-    return (
-        " ".join(steps)
-        or "Nothing. A motion that loads and moves the joints more would show smaller effects."
+        completed = f"{inputs.name}_completed.yaml"
+        command = f"fbse add {inputs.scenario} {inputs.out} --out {completed}"
+        steps.append(Step("Add it to the model:", command))
+    steps += _experiments_next(diagnosis, diagnosis.chosen)
+    nothing = Step(
+        "Nothing. A motion that loads and moves the joints more would show smaller effects."
     )
+    return tuple(steps) or (nothing,)
 
 
-def step_after_study(study: Study, inputs: Inputs) -> str:
-    """What to do after a study, with the command."""
+def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
+    """What to do after a study, the most important first."""
     last = study.diagnoses[-1]
     if not study.found:
-        return next_step(last, inputs)
-    steps = _experiments_next(last, study.found)
-    steps.append(
-        f"Try the completed model on a log that it has not seen: fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
-    )
-    return " ".join(steps)
+        return steps_after_diagnosis(last, inputs)
+    command = f"fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
+    test = Step("Try the completed model on a log that it has not seen:", command)
+    return (test, *_experiments_next(last, study.found))
 
 
-def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[str]:
+def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[Step]:
     """What to look at and which experiments to make."""
     statuses = applicable(diagnosis.effects)
     doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
     steps = []
     if diagnosis.partial is not None:
-        steps.append("Let it look for longer: the same command with more time.")
+        steps.append(Step("Let it look for longer: the same command with more time."))
     elif diagnosis.verdict == "unknown_effect":
         steps.append(
-            "Look at the pictures of the channels that are left, and register an effect of your own that looks like them."
+            Step(
+                "Look at the pictures of the channels that are left, and register an effect of "
+                "your own that looks like them."
+            )
         )
     if doubtful:
-        steps.append(f"To tell them apart: {_experiments(doubtful)}")
+        steps += _experiments("To tell them apart:", doubtful)
     if diagnosis.partial is None and diagnosis.verdict == "not_visible":
         hidden = {
             name: status for name, status in statuses.items() if status.verdict == "not_visible"
         }
-        steps.append(f"Record a motion that shows more: {_experiments(hidden)}")
+        steps += _experiments("Record a motion that shows more:", hidden)
     return steps
 
 
@@ -350,13 +358,16 @@ def what_else(found: Sequence[Finding], *, partial: bool) -> str:
     return "No other effect of the library explains this log as well."
 
 
-def _experiments(statuses: dict[str, EffectStatus]) -> str:
+def _experiments(why: str, statuses: Mapping[str, EffectStatus]) -> list[Step]:
     """What would show effects, each experiment once."""
-    texts: dict[str, list[str]] = {}
+    shown: dict[tuple[str, str], list[str]] = {}
     for name, status in statuses.items():
-        command = f" ({status.command})" if status.command else ""
-        texts.setdefault(f"{status.experiment.rstrip('.')}{command}.", []).append(spaced(name))
-    return " ".join(f"{text} [{', '.join(names)}]" for text, names in texts.items())
+        experiment = (as_sentence(status.experiment), status.command or "")
+        shown.setdefault(experiment, []).append(_inside(name))
+    return [
+        Step(f"{why} {text} It shows {_enumerated(names)}.", command)
+        for (text, command), names in shown.items()
+    ]
 
 
 def kinds_of_failures(comparison: Comparison) -> str:

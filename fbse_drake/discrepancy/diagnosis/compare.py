@@ -578,7 +578,7 @@ def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
         what = f"{size} {unit} along its {axis} axis that a level sole at rest has not"
     else:
         what = f"move at {size} {unit} along {axis} against each other although both stand"
-    return f"{_place(row, where)}: {what}, {_digits(where.ratio)} times the noise"
+    return f"{_place(row, where)}: {what}"
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from fbse_drake.report.figures.panels import (
     stretches,
     time_grid,
 )
-from fbse_drake.report.figures.style import BROAD, ESTIMATE, THIN, TRUE, add_legend
+from fbse_drake.report.figures.style import BROAD, ESTIMATE, INK, THIN, add_legend
 from fbse_drake.report.metrics import (
     attitude_error_deg,
     base_velocity_error,
@@ -110,7 +110,7 @@ def support(log: Log) -> Figure:
                 axes,
                 log,
                 forces[side] / weight,
-                color=TRUE,
+                color=INK,
                 linewidth=0.8,
                 label="load / mean load of all feet",
             )

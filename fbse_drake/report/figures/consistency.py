@@ -20,7 +20,7 @@ from fbse_drake.report.figures.panels import (
     stride,
     time_grid,
 )
-from fbse_drake.report.figures.style import COM, ESTIMATE, TRUE, WIDTH, add_legend, decorate
+from fbse_drake.report.figures.style import COM, ESTIMATE, INK, WIDTH, add_legend, decorate
 from fbse_drake.report.metrics import nis_bounds, normalised_innovations, settled
 
 _PART_COLORS = (ESTIMATE, "#d65f1a", COM, "#8a8f14", "#7b3fa0", "#5c5c5c", "#b8436f", "#3f6fb8")
@@ -185,7 +185,7 @@ def _plot_nis(
     window = float(np.median(end - start)) * next(iter(curves.values())).shape[1]
     lower, upper = nis_bounds(np.array(window)).tolist()
     axes.axhspan(
-        lower, upper, facecolor=TRUE, alpha=0.25, linewidth=0, label="95 % of white innovations"
+        lower, upper, facecolor=INK, alpha=0.25, linewidth=0, label="95 % of white innovations"
     )
     axes.set_yscale("log")
     axes.set_ylim(max(1e-4, 0.7 * lowest), min(1e4, 1.4 * highest))

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from fbse_drake.log import Log
 from fbse_drake.report.figures.kind import figure_kind
 from fbse_drake.report.figures.panels import name_phases, plot, side_color, time_grid
-from fbse_drake.report.figures.style import PLANNED, TRUE
+from fbse_drake.report.figures.style import INK, PLANNED
 from fbse_drake.report.metrics import has_feet
 
 # The direction of a foot's force means little below this share of the feet's mean load.
@@ -28,7 +28,7 @@ def foot_forces(log: Log) -> Figure:
     force = {side: foot_force(log, side) for side in log.sides}
     total = np.sum([force[side][:, 2] for side in log.sides], axis=0)
     weight = total.mean()
-    plot(vertical, log, total, color=TRUE, linewidth=0.8, alpha=0.6, label="all feet")
+    plot(vertical, log, total, color=INK, linewidth=0.8, alpha=0.6, label="all feet")
     for side, width in zip(log.sides, np.linspace(1.8, 1, len(log.sides)), strict=True):
         plot(
             vertical,

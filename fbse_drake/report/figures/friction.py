@@ -28,9 +28,10 @@ from fbse_drake.report.figures.panels import (
 )
 from fbse_drake.report.figures.style import (
     BROAD,
+    ERROR,
+    ESTIMATE,
     PLANNED,
     THIN,
-    TRUE,
     TRUTH,
     WIDTH,
     add_legend,
@@ -75,7 +76,7 @@ def friction(log: Log) -> Figure:
         column = log.joints.index(farthest)
         law = log["truth/joint/friction_law_torque"][:, column]
         label = f"its law, {farthest.replace('_', ' ')}"
-        plot(panels[column], log, law, color=TRUE, linewidth=0.5, label=label)
+        plot(panels[column], log, law, color=ESTIMATE, linewidth=0.8, label=label)
     widen(panels, FRICTION_SPAN)
     add_legend(figure)
     return figure
@@ -147,14 +148,14 @@ def friction_errors(log: Log) -> Figure:
             axes.axhspan(
                 -rms[joint],
                 rms[joint],
-                facecolor=TRUTH,
+                facecolor=ERROR,
                 alpha=0.15,
                 linewidth=0,
                 zorder=3,
                 label="± RMS",
             )
             for edge in (-rms[joint], rms[joint]):
-                axes.axhline(edge, color=TRUTH, linewidth=0.9, linestyle="--", zorder=4)
+                axes.axhline(edge, color=ERROR, linewidth=0.9, linestyle="--", zorder=4)
             axes.set_title(
                 f"RMS {number(float(rms[joint]), 2)} Nm",
                 loc="right",
@@ -244,9 +245,11 @@ def friction_over_velocity(log: Log) -> Figure:
 
 @figure_kind(
     "Identified friction parameters",
-    "Parameters of the adopted friction model as they are learnt while the robot moves; bands are "
-    "two standard deviations, where the filter knows them. A parameter settles only when its joint "
-    "has moved enough to show it.",
+    lambda log: (
+        "Parameters of the adopted friction model as they are learnt while the robot moves; bands "
+        "are two standard deviations, where the filter knows them. A parameter settles only when "
+        f"its joint has moved enough to show it.{_meanings(log)}"
+    ),
     needs=("estimate/friction/parameters",),
 )
 def friction_parameters(log: Log) -> Figure:
@@ -303,6 +306,18 @@ def friction_parameters(log: Log) -> Figure:
 def _farthest_from_law(log: Log) -> str | None:
     """The joint whose simulated torque is farthest from its law; None if all follow theirs."""
     return next(iter(broken_laws(friction_law_error(log))), None)
+
+
+def _meanings(log: Log) -> str:
+    """What the learnt parameters are, where their names do not say it."""
+    config = _friction_config(log)
+    parameters = {} if config is None else config.model.parameters
+    meanings = (
+        f" {name}: {parameter.meaning}."
+        for name, parameter in parameters.items()
+        if parameter.linear and parameter.meaning
+    )
+    return "".join(meanings)
 
 
 def _friction_config(log: Log) -> FrictionConfig | None:

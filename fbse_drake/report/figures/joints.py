@@ -13,7 +13,7 @@ from fbse_drake.report.figures.panels import (
     source,
     widen,
 )
-from fbse_drake.report.figures.style import TRUE, add_legend
+from fbse_drake.report.figures.style import INK, add_legend
 from fbse_drake.report.metrics import joint_position_channel
 
 # The least that a panel shows of an error [mrad].
@@ -33,7 +33,7 @@ def joint_angles(log: Log) -> Figure:
         plot(axes, log, log[name][:, joint], **joint_style(log, joint, source(name)))
         if "reference/joint/position" in log:
             values = log["reference/joint/position"][:, joint]
-            plot(axes, log, values, color=TRUE, linewidth=0.9, linestyle="--", label="reference")
+            plot(axes, log, values, color=INK, linewidth=0.9, linestyle="--", label="reference")
     widen(panels, POSITION_SPAN)
     add_legend(figure)
     return figure
@@ -75,7 +75,7 @@ def torques(log: Log) -> Figure:
         )
         if "reference/joint/feedforward_torque" in log:
             values = log["reference/joint/feedforward_torque"][:, joint]
-            plot(axes, log, values, color=TRUE, linewidth=0.9, linestyle="--", label="feed-forward")
+            plot(axes, log, values, color=INK, linewidth=0.9, linestyle="--", label="feed-forward")
     add_legend(figure)
     return figure
 

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
 from fbse_drake.report.figures.style import (
+    INK,
     PLANNED,
     SIDE_COLORS,
     SWING,
-    TRUE,
     WIDTH,
     decorate,
 )
@@ -57,7 +57,7 @@ def side_color(log: Log, side: str) -> str:
 def joint_color(log: Log, joint: int) -> str:
     """The colour of the leg that a joint belongs to."""
     side = joint_sides(log)[joint]
-    return TRUE if side is None else side_color(log, side)
+    return INK if side is None else side_color(log, side)
 
 
 def joint_style(log: Log, joint: int, label: str) -> dict[str, str]:

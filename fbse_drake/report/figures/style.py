@@ -1,7 +1,8 @@
 """The looks that all figures have: colours, grids, legends.
 
 Colours stand for sides, in the log's order; solid is what happened, dashed what was planned. Where
-something is estimated, the estimate is solid and the truth dashed and red. Nothing here touches
+something is estimated, the estimate is coloured and the truth dashed and black, which nobody takes
+for each other. Nothing here touches
 pyplot or matplotlib's global settings.
 """
 
@@ -14,10 +15,11 @@ from matplotlib.lines import Line2D
 
 SIDE_COLORS = ("#2979b5", "#d65f1a", "#2f8f6b", "#8457a8")
 PLANNED = "#555b62"
-TRUE = "#15181b"
+INK = "#15181b"
+TRUTH = INK
 COM = "#7a4fa3"
 ZMP = "#2f8f6b"
-TRUTH = "#c81e1e"
+ERROR = "#c81e1e"
 ESTIMATE = "#0b7a86"
 SWING = "#8a9199"
 # Estimate and truth mostly agree: a broad pale line shows beside a thin one on top of it.

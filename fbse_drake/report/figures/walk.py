@@ -26,8 +26,9 @@ from fbse_drake.report.figures.style import (
     BROAD,
     COM,
     ESTIMATE,
+    INK,
     PLANNED,
-    TRUE,
+    TRUTH,
     WIDTH,
     ZMP,
     add_legend,
@@ -88,8 +89,8 @@ def footprints(log: Log) -> Figure:
         )
     for channel, color, line, width, label in (
         ("reference/zmp", ZMP, "--", 1.4, "planned ZMP"),
-        ("truth/com/position", COM, "-", 2.0, "true CoM"),
-        ("reference/com/position", TRUE, "--", 1.0, "planned CoM"),
+        ("truth/com/position", TRUTH, "-", 1.6, "true CoM"),
+        ("reference/com/position", COM, "--", 1.2, "planned CoM"),
     ):
         if channel in log:
             axes.plot(
@@ -141,8 +142,8 @@ def com(log: Log) -> Figure:
         axes.set_title(f"({letter})", loc="left", fontsize=10)
     lines: tuple[tuple[str, dict[str, Any]], ...] = (
         ("estimate", {"color": ESTIMATE, "label": "estimated", **BROAD}),
-        ("truth", {"color": COM, "label": "true"}),
-        ("reference", {"color": TRUE, "linestyle": "--", "linewidth": 1.0, "label": "desired"}),
+        ("truth", {"color": TRUTH, "label": "true"}),
+        ("reference", {"color": COM, "linestyle": "--", "linewidth": 1.2, "label": "desired"}),
     )
     for (position, *error_axes), name, column in zip(grid, "xy", (0, 1), strict=True):
         for source, style in lines:
@@ -186,7 +187,7 @@ def feet(log: Log) -> Figure:
             )
         for side in log.sides if has_feet(log, "reference/foot/{}/position") else ():
             values = log[f"reference/foot/{side}/position"][:, column]
-            plot(axes, log, values, color=TRUE, linewidth=0.9, linestyle="--", label="planned")
+            plot(axes, log, values, color=INK, linewidth=0.9, linestyle="--", label="planned")
         axes.set_ylabel(f"{name} [m]")
         axes.set_ylim(at_least(axes.get_ylim(), POSITION_SPAN))
     name_phases(grid[0, 0], log)
