@@ -350,6 +350,11 @@ def compare(scenario: Scenario, log: Log, *, name: str = "scenario") -> Comparis
 
     Raises:
         InputError: a log that does not fit the model, or whose signs, units or frames are wrong.
+
+    >>> from fbse_drake import compare, load_scenario, simulate
+    >>> scenario = load_scenario("bsc_arm", overrides=["duration=0.5"])  # believes in no friction
+    >>> compare(scenario, simulate(scenario).log).failures[0].row.name
+    'axis_6'
     """
     case = Case(name, scenario, log, log)
     return _with_case(ComparisonResult, case.comparison, case=case)
@@ -378,6 +383,14 @@ def diagnose(
 
     Raises:
         InputError: see `compare`; or no joint is left whose torque can be trusted.
+
+    >>> from fbse_drake import CoulombFriction, TorqueBias, diagnose, load_scenario, simulate
+    >>> scenario = load_scenario("bsc_arm", overrides=["duration=0.5"])  # believes in no friction
+    >>> found = diagnose(scenario, simulate(scenario).log, [CoulombFriction, TorqueBias])
+    >>> found.outcome
+    'The model lacks Coulomb friction in 6 joints.'
+    >>> found.chosen[0].parameters["coulomb"].unit
+    'Nm'
     """
     case = Case.divided(scenario, log, tests, name)
     diagnosis = diagnosing.diagnose(Predictor(case.trusted, case.train), effects, progress=progress)

@@ -99,6 +99,18 @@ class Log(Mapping[str, np.ndarray]):
 
     Raises:
         InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.
+
+    >>> import numpy as np
+    >>> from fbse_drake import Log
+    >>> time = np.arange(0.0, 1.0, 0.01)
+    >>> angle = 0.2 * np.sin(time)[:, None]
+    >>> channels = {"time": time, "joint/position": angle}
+    >>> log = Log(channels, {"joints": ["knee"], "period": 0.01})
+    >>> log["joint/position"].shape, log.unit("joint/position")
+    ((100, 1), 'rad')
+    >>> Log({"time": time}, log.meta)
+    Traceback (most recent call last):
+    fbse_drake.errors.InputError: channel joint/position is missing (required: time, joint/position)
     """
 
     channels: dict[str, np.ndarray]

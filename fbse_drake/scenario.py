@@ -243,6 +243,14 @@ class Scenario:
     """One experiment. SI units throughout.
 
     Periods that are not given become `usual_period`.
+
+    >>> from fbse_drake import CoulombFriction, RobotConfig, Scenario, Squat
+    >>> robot = RobotConfig(effects={"friction": CoulombFriction(coulomb={"all": 0.5})})
+    >>> scenario = Scenario(duration=2.0, robot=robot, reference=Squat(amplitude=0.03))
+    >>> scenario.believed.effects  # what `model` leaves out is not believed
+    {}
+    >>> scenario.usual_period
+    0.001
     """
 
     # One sentence for the reader of the report.
@@ -419,6 +427,14 @@ def load_scenario(
 
     Raises:
         InputError: file not found, unknown key, wrong type, impossible value, unknown joint.
+
+    >>> from fbse_drake import load_scenario
+    >>> scenario = load_scenario("paper_walk", overrides=["duration=5", "reference.step_length=0.05"])
+    >>> scenario.duration, scenario.reference.step_length
+    (5.0, 0.05)
+    >>> load_scenario("paper_walk", overrides=["duration=long"])
+    Traceback (most recent call last):
+    fbse_drake.errors.InputError: ...: duration: expected a number, found 'long'
     """
     return read_scenario(scenario, name, overrides)[1]
 

@@ -70,6 +70,11 @@ def simulate(
 
     Raises:
         InputError: see `build_station`.
+
+    >>> from fbse_drake import load_scenario, simulate
+    >>> run = simulate(load_scenario("bsc_arm", overrides=["duration=0.2"]))
+    >>> run.failure is None, run.log["joint/position"].shape
+    (True, (201, 6))
     """
     with _postponed_interruption() as interrupted:
         return _simulate(scenario, name, meshcat, progress, interrupted)

@@ -43,7 +43,13 @@ _AT_PRISMATIC_JOINT = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect, with a value for each target (joint, body or foot)."""
+    """One parameter of an effect, with a value for each target (joint, body or foot).
+
+    >>> from fbse_drake import Parameter
+    >>> viscous = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
+    >>> viscous.at_prismatic_joint.unit
+    'N s/m'
+    """
 
     unit: str
     # Does what the effect adds depend on it linearly?
@@ -83,6 +89,15 @@ class Parameter:
 class Effect(ABC):
     """Base of all effects: a frozen dataclass with one field per parameter. A field holds values by target (`{all: 0.1, left_knee: 0.2}`);
     if the effect acts on the robot as a whole, a number. A linear parameter that is not given is 0.
+
+    >>> from fbse_drake import CoulombFriction, load_description
+    >>> friction = CoulombFriction(coulomb={"all": 0.3, "left_knee_pitch": 0.9})
+    >>> biped, _ = load_description("biped")
+    >>> values = friction.resolve(biped)
+    >>> dict(zip(values.targets, values.linear[0].tolist()))["left_knee_pitch"]
+    0.9
+    >>> CoulombFriction.parameters_at("N")["coulomb"].unit  # of a joint that slides
+    'N'
     """
 
     # One sentence each: what it is, what it looks like in data, which experiment shows it.

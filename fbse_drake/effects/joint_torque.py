@@ -71,6 +71,26 @@ class JointTorqueEffect(Effect):
     part that rises with the velocity is solved by Drake's contact solver together with contact, at
     any slope. What is left of the law is taken at the velocity that is expected at the end of the
     step, so it must not be steep.
+
+    >>> from dataclasses import dataclass, field
+    >>> from fbse_drake import JointMotion, JointTorqueEffect, Parameter
+    >>> @dataclass(frozen=True)
+    ... class CubicDrag(JointTorqueEffect):
+    ...     description = "Drag that grows with the third power of the speed."
+    ...     signature = "Torque against the motion that only shows at high speed."
+    ...     experiment = "Move each joint slowly and as fast as it can."
+    ...     parameters = {"drag": Parameter("Nm s^3/rad^3", linear=True, plausible=(0.0, 1.0))}
+    ...     drag: dict[str, float] = field(default_factory=dict)
+    ...
+    ...     @staticmethod
+    ...     def basis(motion, nonlinear):
+    ...         return (motion.velocity**3,), (3 * motion.velocity**2,)
+    >>> import numpy as np
+    >>> (torque,), (slope,) = CubicDrag.basis(JointMotion(np.array([-2.0, 1.0])), np.empty((0, 2)))
+    >>> torque.tolist(), slope.tolist()
+    ([-8.0, 1.0], [12.0, 3.0])
+
+    It is a tag for YAML files, and searched for, behind `@in_library`.
     """
 
     has_memory: ClassVar[bool] = False
