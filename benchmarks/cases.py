@@ -3,16 +3,19 @@
 import argparse
 import hashlib
 import json
-from collections.abc import Iterable
+import random
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 import fbse_drake
 from fbse_drake.effects.effect import library
+
+C = TypeVar("C")
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 
@@ -169,6 +172,14 @@ def share(values: Iterable[bool]) -> tuple[str, str]:
     return (f"{100 * np.mean(values):.1f} %" if values else "n/a"), f"{len(values)}"
 
 
+def drawn(cases: Sequence[C], options: argparse.Namespace) -> list[C]:
+    """The cases that the options ask for, see `add_options`: all, or the first of them in random
+    order, so that what is done of a sample when it is stopped is a sample as well."""
+    if options.sample is None:
+        return list(cases)
+    return random.Random(options.sample_seed).sample(cases, len(cases))[: options.sample]
+
+
 def sources_checksum(*more: Path, note: str = "") -> str:
     """Checksum of what decides on a case.
 
@@ -193,6 +204,10 @@ def add_options(parser: argparse.ArgumentParser, out: str, quick: str, names: st
         names: examples of parts of names.
     """
     parser.add_argument("--quick", action="store_true", help=quick)
+    sample = "run only so many cases, drawn at random from all of them"
+    parser.add_argument("--sample", type=int, default=None, metavar="N", help=sample)
+    seed = "of what is drawn (default 0)"
+    parser.add_argument("--sample-seed", type=int, default=0, metavar="SEED", help=seed)
     only = f"run only cases with this in their names, as {names}"
     parser.add_argument("--only", default="", metavar="NAME", help=only)
     jobs = "cases that run at once (default: all cores)"

@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.closed_loop import closed_loop, in_turn
 from fbse_drake import Scenario, load_scenario, simulate
 from fbse_drake.effects.actuation import TorqueDelay, TorqueLag
+from fbse_drake.effects.counterbalance import Counterbalance
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import (
     CoulombFriction,
@@ -47,6 +48,7 @@ _EFFECTS: tuple[Effect, ...] = (
     PreslidingHysteresis(coulomb={"all": 4.0}, displacement={"all": 0.002}),
     TorqueRipple(sine={"all": 2.0}, cycles={"all": 50.0}),
     JointSpring(stiffness={"all": 20.0}),
+    Counterbalance(cosine={"all": 20.0}),
     TorqueDelay(delay={"all": 1e-3}),
     TorqueLag(time_constant={"all": 1e-3}),
     Backlash(gap={"all": 5e-4}),

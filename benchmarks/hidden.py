@@ -1,5 +1,5 @@
-"""How well missing physics is found: `python -m benchmarks.hidden [--quick] [--only NAME] [--seeds N]
-[--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
+"""How well missing physics is found: `python -m benchmarks.hidden [--quick] [--sample N] [--only NAME]
+[--seeds N] [--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
 
 Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also nothing, two effects at once, effects that
 the library does not have, and effects in robots that differ from their model in contact solver, plant step or friction law. Each log is
@@ -25,6 +25,7 @@ from benchmarks.cases import (
     UNKNOWN,
     Result,
     add_options,
+    drawn,
     judged,
     share,
     sources_checksum,
@@ -539,17 +540,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def store(name: str, some: Sequence[Case]) -> Store:
         return Store(options.out / name, "benchmarks.hidden:judge", some, sources)
 
-    drawn = store("cases", cases(seeds, sizes, quick=options.quick))
-    drawn.run(console, "hiding and finding", only=options.only, workers=options.jobs)
-    stated = Figures.of_finished(drawn.read()).stated
+    found = store("cases", drawn(cases(seeds, sizes, quick=options.quick), options))
+    found.run(console, "hiding and finding", only=options.only, workers=options.jobs)
+    stated = Figures.of_finished(found.read()).stated
     thresholds = store("thresholds", threshold_cases(stated))
     lengths = store("lengths", length_cases())
-    if not options.quick:
+    if not options.quick and options.sample is None:
         thresholds.run(console, "at the smallest sizes", only=options.only, workers=options.jobs)
         # Alone, since their times are compared.
         lengths.run(console, "longer logs", only=options.only, workers=1)
 
-    everything = [*drawn.read(), *thresholds.read(), *lengths.read()]
+    everything = [*found.read(), *thresholds.read(), *lengths.read()]
     figures = Figures.of_finished(everything)
     errors = [
         f"{result.name}:\n{result.tree['error']}" for result in everything if "error" in result.tree

@@ -1,5 +1,5 @@
 """How well missing physics is found in another simulator: `python -m benchmarks.mujoco_hidden
-[--quick] [--only NAME] [--jobs N] [--keep] [--out DIR]`.
+[--quick] [--sample N] [--only NAME] [--jobs N] [--keep] [--out DIR]`.
 
 A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
 that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
@@ -14,7 +14,7 @@ from importlib.util import find_spec
 
 from rich.console import Console
 
-from benchmarks.cases import Result, add_options, share
+from benchmarks.cases import Result, add_options, drawn, share
 from benchmarks.console import print_table
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
@@ -108,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     store = Store(
         options.out / "cases",
         "benchmarks.in_mujoco.cases:judge",
-        cases,
+        drawn(cases, options),
         None if options.keep else sources(),
     )
     store.run(console, "hiding in MuJoCo and finding", only=options.only, workers=options.jobs)

@@ -34,19 +34,36 @@ def load_tree(path: Path) -> dict[str, Any]:
     """Parses a YAML file; a tag becomes the key `_tag` of its mapping.
 
     Raises:
-        InputError: the file cannot be read, is too large, is no YAML or no mapping; see `parse`.
+        InputError: see `read_text` and `parse_mapping`.
+    """
+    return parse_mapping(read_text(path), file=str(path))
+
+
+def read_text(path: Path) -> str:
+    """Contents of a file.
+
+    Raises:
+        InputError: the file cannot be read, is too large or no text.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise InputError(f"{path}: expected at most {_LARGEST_FILE} bytes")
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
-    tree = parse(text, file=str(path))
+
+
+def parse_mapping(text: str, *, file: str) -> dict[str, Any]:
+    """As `parse`.
+
+    Raises:
+        InputError: also if it is no mapping.
+    """
+    tree = parse(text, file=file)
     if not isinstance(tree, dict):
-        raise InputError(f"{path}: expected a mapping of keys to values, found {describe(tree)}")
+        raise InputError(f"{file}: expected a mapping of keys to values, found {describe(tree)}")
     return tree
 
 

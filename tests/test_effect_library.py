@@ -17,6 +17,7 @@ from fbse_drake.effects.actuation import (
     TorqueLag,
     TorqueSaturation,
 )
+from fbse_drake.effects.counterbalance import Counterbalance
 from fbse_drake.effects.effect import Effect, in_library, library
 from fbse_drake.effects.friction import (
     CoulombFriction,
@@ -97,6 +98,7 @@ TRANSITION = {"all": 0.02}
             TorqueRipple({"all": 1.0}, {"all": -0.5}, {"all": 80.0}),
             np.sin(80 * M.position) - 0.5 * np.cos(80 * M.position),
         ),
+        (Counterbalance({"all": 3.0}, {"all": 4.0}), 5.0 * np.cos(M.position - np.arctan2(4, 3))),
         (JointSpring(stiffness={"all": 50.0}, preload={"all": -3.0}), 50.0 * M.position - 3.0),
         (TorqueGain(shortfall={"all": 0.1}), 0.1 * M.command),
         (TorqueBias(bias={"all": -2.0}), -2.0 + 0 * M.command),
@@ -300,6 +302,7 @@ def test_simulated_torque_is_the_law_where_it_does_not_depend_on_velocity():
         TorqueSaturation,
         TorqueRipple,
         JointSpring,
+        Counterbalance,
         Backlash,
     )
     effects = {kind.__name__: sample(kind, FOUR) for kind in kinds}

@@ -1,5 +1,23 @@
 """Physical effects; importing the package fills the library."""
 
-from fbse_drake.effects import actuation, contact, friction, geometry, inertia, sensor, transmission
+from fbse_drake.effects import (
+    actuation,
+    contact,
+    counterbalance,
+    friction,
+    geometry,
+    inertia,
+    sensor,
+    transmission,
+)
 
-__all__ = ["actuation", "contact", "friction", "geometry", "inertia", "sensor", "transmission"]
+__all__ = [
+    "actuation",
+    "contact",
+    "counterbalance",
+    "friction",
+    "geometry",
+    "inertia",
+    "sensor",
+    "transmission",
+]

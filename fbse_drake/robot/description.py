@@ -3,13 +3,16 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from fbse_drake import resources, schema
 from fbse_drake.errors import InputError
+
+# So many descriptions are kept as they were read: a robot is built again and again.
+_PARSED = 8
 
 
 @dataclass(frozen=True)
@@ -170,4 +173,9 @@ def load_description(name_or_path: str | Path) -> tuple[RobotDescription, Path]:
         InputError: file not found, unknown key or wrong type.
     """
     path = resources.find(name_or_path, kind="models")
-    return schema.build(RobotDescription, schema.load_tree(path), file=str(path)), path
+    return _parsed(schema.read_text(path), str(path)), path
+
+
+@lru_cache(maxsize=_PARSED)
+def _parsed(text: str, file: str) -> RobotDescription:
+    return schema.build(RobotDescription, schema.parse_mapping(text, file=file), file=file)

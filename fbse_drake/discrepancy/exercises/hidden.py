@@ -151,6 +151,7 @@ _RECIPES = {
         (5.0, 60.0),
         lambda draw, size: {"stiffness": size, "preload": size * draw.uniform(-0.3, 0.3)},
     ),
+    "Counterbalance": Recipe((5.0, 60.0), _vector(("cosine", "sine"))),
     "PreslidingHysteresis": Recipe(
         (0.5, 8.0), lambda draw, size: {"coulomb": size, "displacement": draw.between(2e-3, 2e-2)}
     ),
