@@ -12,6 +12,9 @@ from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, vector
 # The longest delay that is looked for, and for how long what it was found by counts [s]: no longer
 # than a step, so that sensors which are in time again are soon seen to be.
 _LONGEST, _MEMORY = 0.01, 0.3
+# Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
+# the size of what they remember, and one for every rate would take half a minute each to compile.
+_USUAL_PERIOD = 0.001
 # How much of that time it takes to know the noise.
 _LEAST = 0.5
 # By how much of itself a tick may be longer or shorter for its velocities' difference to be an
@@ -31,21 +34,32 @@ def force_delay_type(clock: Clock) -> np.dtype:
     """What `watch_force_delay` remembers, of delays of 0, 1, ... ticks.
 
     `smooth` (2, 3), smoothed readings of how the centre of mass accelerates, by the other sensors
-    and by the forces; `shown` (delays, 3), the former so many ticks ago [m/s^2]; `filled`, how many
-    of these are known; sums over the last time, of these, `total` (delays, 3), of their
-    `square` and of their product `cross` with the forces, (delays,), and of the forces,
+    and by the forces; `shown` (room, 3), the former so many ticks ago [m/s^2]; `filled`, how many
+    of these are known; sums over the last time, of these, `total` (room, 3), of their
+    `square` and of their product `cross` with the forces, (room,), and of the forces,
     `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `contradicted`, for
-    how long another delay has been better [s]; and the `delay` [s].
+    how long another delay has been better [s]; and the `delay` [s]. Of `room_for_delays` the first
+    `delays_of` the clock are used.
     """
-    delays = delays_of(clock)
-    shapes = {"shown": (delays, 3), "total": (delays, 3), "square": (delays,), "cross": (delays,)}
+    room = room_for_delays(clock)
+    shapes = {"shown": (room, 3), "total": (room, 3), "square": (room,), "cross": (room,)}
     numbers = ("push_square", "filled", "count", "contradicted", "delay")
     return record_type(**shapes, smooth=(2, 3), push_total=(3,), **dict.fromkeys(numbers, ()))
 
 
 def delays_of(clock: Clock) -> int:
     """How many delays there are, from none to the longest."""
-    return 1 + math.floor(_LONGEST / clock.period + 1e-6)
+    return _delays(clock.period)
+
+
+def room_for_delays(clock: Clock) -> int:
+    """How many ticks are remembered: the delays of the clock, and no fewer than at 1 ms."""
+    return max(_delays(clock.period), _delays(_USUAL_PERIOD))
+
+
+@njit(cache=True)
+def _delays(period: float) -> int:
+    return 1 + math.floor(_LONGEST / period + 1e-6)
 
 
 @njit(cache=True)
@@ -103,11 +117,12 @@ def watch_force_delay(
         x.smooth[0, i] += blend * (acceleration[i] - x.smooth[0, i])
         x.smooth[1, i] += blend * (push[i] - x.smooth[1, i])
     acceleration, push = vector(x.smooth[0]), vector(x.smooth[1])
-    for age in range(len(x.shown) - 1, 0, -1):
+    delays = _delays(period)
+    for age in range(delays - 1, 0, -1):
         x.shown[age] = x.shown[age - 1]
     put(x.shown[0], acceleration)
-    x.filled = min(x.filled + 1.0, float(len(x.shown)))
-    if x.filled < len(x.shown):
+    x.filled = min(x.filled + 1.0, float(delays))
+    if x.filled < delays:
         return
     keep = math.exp(-elapsed / _MEMORY)
     x.count = keep * x.count + 1.0
@@ -115,8 +130,8 @@ def watch_force_delay(
     put(x.push_total, add(scale(keep, vector(x.push_total)), push))
     middle = scale(1.0 / x.count, vector(x.push_total))
     push_square = x.push_square - dot(vector(x.push_total), middle)
-    best, mismatch = 0, np.empty(len(x.shown))
-    for late in range(len(mismatch)):
+    best, mismatch = 0, np.empty(delays)
+    for late in range(delays):
         shown = vector(x.shown[late])
         x.square[late] = keep * x.square[late] + dot(shown, shown)
         x.cross[late] = keep * x.cross[late] + dot(shown, push)
@@ -129,7 +144,7 @@ def watch_force_delay(
             best = late
     variance = max(noise**2, mismatch[best] / (3.0 * x.count))
     # At the longest delay the true one may be longer.
-    is_known = x.count * elapsed > _LEAST * _MEMORY and best < len(mismatch) - 1
+    is_known = x.count * elapsed > _LEAST * _MEMORY and best < delays - 1
     is_explained = mismatch[best] < (1.0 - _EXPLAINED) * push_square
     gained = mismatch[round(x.delay / period)] - mismatch[best]
     # Of the smoothed readings so many are as good as one.

@@ -18,7 +18,7 @@ from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError, require_not_negative, require_positive
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.force_delay import delays_of
+from fbse_drake.estimators.force_delay import room_for_delays
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
@@ -577,7 +577,7 @@ class ModelAidedEstimator(FrictionEstimator):
         - (one for each field)
 
     Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
-    [Nm s], after the update; `velocity` that the model sees, `past_velocity` (delays, n), that
+    [Nm s], after the update; `velocity` that the model sees, `past_velocity` (room, n), that
     one now and in the ticks before, and `joint_velocity`, that measured less what is known of its
     noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
     [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
@@ -602,7 +602,7 @@ class ModelAidedEstimator(FrictionEstimator):
         further += ("noise", "agreement", "doubt")
         shapes = dict.fromkeys(further, (n,))
         shapes["weights"] = shapes["settled"] = (n, regressor.weights)
-        shapes["past_velocity"] = (delays_of(clock), n)
+        shapes["past_velocity"] = (room_for_delays(clock), n)
         super().__init__(
             regressor, robot, measurements, link_torque, clock, regressor.weights + 2, **shapes
         )

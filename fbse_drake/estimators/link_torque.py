@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import model_type
-from fbse_drake.estimators.force_delay import delays_of, tick_of
+from fbse_drake.estimators.force_delay import delays_of, room_for_delays, tick_of
 from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -97,7 +97,8 @@ def _estimate_link_torque(
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
-            `joint_leg` (n,), which leg each joint belongs to; and `learns_noise`.
+            `joint_leg` (n,), which leg each joint belongs to; `delays`, among how many ticks the
+            one of the forces is looked for; and `learns_noise`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     model, acceleration, known = model[()], acceleration[()], known[()]
@@ -154,7 +155,7 @@ def _estimate_link_torque(
         past.impulse_variance[0, i], past.own_inertia[0, i] = impulse_variance, to_sensors[6 + i]
         is_known = trust[0] == 0 and trust[1] == 0
         past.valid[0, i] = acceleration.known[i] if is_known else 0.0
-    then = tick_of(past.duration, delay)
+    then = tick_of(past.duration[: known.delays], delay)
     posterior.late, posterior.duration = then, past.duration[then]
     for i in range(n):
         link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
@@ -216,10 +217,10 @@ class LinkTorqueEstimator(RecursiveEstimator):
 
     `base_state` is there where somebody knows that foot forces come late: then all this is of the
     tick in which they were what is read now. Further `late`, how many ticks ago that was, and its
-    `duration` [s]; `past`, what is known of these ticks but for the forces: `duration` (delays,);
+    `duration` [s]; `past`, what is known of these ticks but for the forces: `duration` (room,);
     `valid`, `torque_command`, `inertial_torque` and the noise's `torque_variance`,
-    `impulse_variance` and `own_inertia`, (delays, n); and the `lever` of the wrenches,
-    (delays, feet, 6, n);
+    `impulse_variance` and `own_inertia`, (room, n); and the `lever` of the wrenches,
+    (room, feet, 6, n), see `room_for_delays`;
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
     believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
@@ -243,10 +244,10 @@ class LinkTorqueEstimator(RecursiveEstimator):
             base_state: of that of `InvariantBaseFilter`, where somebody asks how late forces are.
         """
         n, legs = len(robot.joint_names), robot.description.legs
-        delays = delays_of(clock) if base_state is not None else 1
+        room, delays = room_for_delays(clock), 1 if base_state is None else delays_of(clock)
         kept = ("valid", "torque_command", "inertial_torque")
         kept += ("torque_variance", "impulse_variance", "own_inertia")
-        past = dict.fromkeys(kept, (delays, n))
+        past = dict.fromkeys(kept, (room, n))
         posterior_type = record_type(
             time=(),
             status=(),
@@ -261,7 +262,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             wrench_change=(len(legs), 6),
             late=(),
             duration=(),
-            past=record_type(**past, duration=(delays,), lever=(delays, len(legs), 6, n)),
+            past=record_type(**past, duration=(room,), lever=(room, len(legs), 6, n)),
         )
         super().__init__(posterior_type, clock)
         pads = FootPads(robot)
@@ -271,6 +272,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             pads=record(position=pads.position, foot=pads.foot),
             wrench_variance=variance,
             learns_noise=sensors.learns_force_noise,
+            delays=np.array(delays),
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
