@@ -153,8 +153,10 @@ def _effect(name: str, effect: type[Effect]) -> Iterator[str]:
 
 def _law(effect: type[Effect]) -> str:
     """What its docstring says, formulas as code."""
-    formula = r"(?<![`\w])(u = .+?)(?=,\s+[a-z]|\. |[.:;]?$)"
-    return re.sub(formula, r"`\1`", _text(effect), flags=re.MULTILINE)
+    # Up to the next sentence or clause.
+    ends = r"(?=,\s+[a-z_]+\b(?!\))|[.:;]?(?:\s[A-Z]|\n\n|\Z))"
+    formula = r"(?<![`\w])(u = (?:.|\n(?!\n))+?)" + ends
+    return re.sub(formula, r"`\1`", _text(effect))
 
 
 def _picture(name: str) -> str:

@@ -41,7 +41,8 @@ class PositionLoopConfig:
 def position_loop(
     error: np.ndarray, error_rate: np.ndarray, kp: np.ndarray, kd: np.ndarray
 ) -> np.ndarray:
-    """Torque of the position loop, tau_pos = kp (theta_ref - theta) + kd (theta_ref_dot - theta_dot), paper eq. (68) [Nm]."""
+    """Torque of the position loop, tau_pos = kp (theta_ref - theta) + kd
+    (theta_ref_dot - theta_dot), paper eq. (68) [Nm]."""
     return kp * error + kd * error_rate
 
 
@@ -88,8 +89,8 @@ class PositionLoop(LeafSystem):
 
     States are [positions, velocities], shape (2n,) [rad, rad/s]; torques have shape (n,) [Nm]. The
     command is the position loop's torque plus feed-forward plus friction estimate, within the
-    limits; `friction_estimate` may be left unconnected and counts as zero. `enabled` (n,) is 0 for a
-    drive that is switched off, which commands no torque. A loop may have no `feedforward_torque`,
+    limits; `friction_estimate` may be left unconnected and counts as zero. `enabled` (n,) is 0 for
+    a drive that is switched off, which commands no torque. A loop may have no `feedforward_torque`,
     and no `enabled`: then all drives are on. At a tick the command is that of the tick's own
     inputs. Discrete state: the command being held.
     """

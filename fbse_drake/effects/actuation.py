@@ -16,7 +16,8 @@ class TorqueGain(JointTorqueEffect):
     """The motor gives (1 - shortfall) of the commanded torque: u = shortfall * command."""
 
     description: ClassVar[str] = (
-        "The motor gives another share of the commanded torque than believed, as from a wrong torque constant."
+        "The motor gives another share of the commanded torque than believed, as from a wrong "
+        "torque constant."
     )
     signature: ClassVar[str] = "Torque in proportion to the command."
     experiment: ClassVar[str] = "Hold each joint under several loads."
@@ -61,7 +62,8 @@ class TorqueBias(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class TorqueDelay(JointTorqueEffect):
-    """The motor gives the command of some time ago: u = command(t) - command(t - delay), linear between the steps.
+    """The motor gives the command of some time ago: u = command(t) - command(t - delay), linear
+    between the steps.
 
     Before the first step the command is taken to have been what it is then.
     """
@@ -113,9 +115,11 @@ class TorqueDelay(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class TorqueLag(JointTorqueEffect):
-    """The motor's torque follows the command like a low-pass y of first order: u = command - y, time_constant dy/dt = command - y.
+    """The motor's torque follows the command like a low-pass y of first order: u = command - y,
+    time_constant dy/dt = command - y.
 
-    Exact for a command that is held over the step; y is then its mean over the step. It starts at the command.
+    Exact for a command that is held over the step; y is then its mean over the step. It starts at
+    the command.
     """
 
     description: ClassVar[str] = (
@@ -186,10 +190,12 @@ class TorqueSaturation(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class TorqueRollOff(JointTorqueEffect):
-    """The motor gives ever less of what is commanded: u = command - command / (1 + |command| / half)."""
+    """The motor gives ever less of what is commanded:
+    u = command - command / (1 + |command| / half)."""
 
     description: ClassVar[str] = (
-        "The harder a motor is driven, the less of the command it gives: iron saturates, the supply gives way."
+        "The harder a motor is driven, the less of the command it gives: iron saturates, the "
+        "supply gives way."
     )
     signature: ClassVar[str] = "Torque that grows with the square of the command."
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
@@ -219,11 +225,13 @@ class TorqueRollOff(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class DcMotor(JointTorqueEffect):
-    """A DC motor of which the voltage is commanded, behind its gear: torque = kt / R (voltage - kt w).
+    """A DC motor of which the voltage is commanded, behind its gear: torque = kt / R
+    (voltage - kt w).
 
-    `torque_command` is then the torque at standstill, kt / R times the voltage, and what the motor's own voltage takes off it is the loss
-    u = kt^2 / R w. A limited voltage is a limited command (`control.torque_limit`). A command of exactly zero is a drive that is switched
-    off: the motor is open, and nothing brakes it.
+    `torque_command` is then the torque at standstill, kt / R times the voltage, and what the
+    motor's own voltage takes off it is the loss u = kt^2 / R w. A limited voltage is a limited
+    command (`control.torque_limit`). A command of exactly zero is a drive that is switched off: the
+    motor is open, and nothing brakes it.
     """
 
     description: ClassVar[str] = (

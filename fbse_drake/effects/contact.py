@@ -1,6 +1,7 @@
 """Effects in the contact of soles and ground.
 
-To simulate one is to change ground and contact solver; to predict it is to say how a standing sole moves because of it.
+To simulate one is to change ground and contact solver; to predict it is to say how a standing sole
+moves because of it.
 """
 
 import math
@@ -53,16 +54,19 @@ class ContactEffect(Effect):
     def sole_motion(
         pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How a sole that stands moves against one on level, rigid ground that holds it, per unit of each of the p parameters.
+        """How a sole that stands moves against one on level, rigid ground that holds it, per unit
+        of each of the p parameters.
 
         Args:
-            pad_force: force of the ground on each pad, in the sole frame, shape (N, P, 3) [N]; that of a row is of the step that ends then.
-                Its normal component is what the contact's spring carries, see `spring_force`.
+            pad_force: force of the ground on each pad, in the sole frame, shape (N, P, 3) [N]; that
+                of a row is of the step that ends then. Its normal component is what the contact's
+                spring carries, see `spring_force`.
             pad_positions: in the sole frame, shape (P, 3) [m].
             time: of the rows, shape (N,) [s].
 
         Returns:
-            Rotation vector [rad] and displacement of the sole's origin [m], in the sole frame, each of shape (p, N, 3).
+            Rotation vector [rad] and displacement of the sole's origin [m], in the sole frame, each
+            of shape (p, N, 3).
         """
 
 
@@ -160,10 +164,12 @@ class GroundSlope(ContactEffect):
 @in_library
 @dataclass(frozen=True)
 class GroundCompliance(ContactEffect):
-    """Ground and soles that give way: each pad sinks by compliance * (its normal force), more than the contact's stiffness says.
+    """Ground and soles that give way: each pad sinks by compliance * (its normal force), more than
+    the contact's stiffness says.
 
-    The prediction is that of springs. In a simulation sinking comes late by dissipation * depth; so that this time stays what it is without
-    the effect (a hundredth of a second for the biped on the default ground), the dissipation is lowered with the stiffness.
+    The prediction is that of springs. In a simulation sinking comes late by dissipation * depth; so
+    that this time stays what it is without the effect (a hundredth of a second for the biped on the
+    default ground), the dissipation is lowered with the stiffness.
     """
 
     description: ClassVar[str] = "Ground or soles give way under load."
@@ -181,7 +187,8 @@ class GroundCompliance(ContactEffect):
         plant: MultibodyPlantConfig,
         friction: float,  # noqa: ARG002
     ) -> tuple[Ground, MultibodyPlantConfig]:
-        # Drake puts the springs of both surfaces in series, so this adds to the compliance of the contact as a whole.
+        # Drake puts the springs of both surfaces in series, so this adds to the compliance of the
+        # contact as a whole.
         share = 1.0 / (1.0 + self.compliance * ground.stiffness)
         return replace(
             ground, stiffness=share * ground.stiffness, dissipation=share * ground.dissipation
@@ -191,7 +198,8 @@ class GroundCompliance(ContactEffect):
     def sole_motion(
         pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        # Height of a pad: that of the origin plus the tilt's, h + a y - b x; the plane that fits the pads best.
+        # Height of a pad: that of the origin plus the tilt's, h + a y - b x; the plane that fits
+        # the pads best.
         x, y, _ = pad_positions.T
         h, a, b = np.linalg.pinv(np.stack([np.ones_like(x), y, -x], axis=1)) @ -pad_force[:, :, 2].T
         zero = np.zeros(len(time))
@@ -201,12 +209,14 @@ class GroundCompliance(ContactEffect):
 @in_library
 @dataclass(frozen=True)
 class FootCreep(ContactEffect):
-    """Soles that creep while they stand: each pad with the velocity creep * (tangential force) / (normal force), along the force that the
-    robot exerts on the ground.
+    """Soles that creep while they stand: each pad with the velocity creep * (tangential
+    force) / (normal force), along the force that the robot exerts on the ground.
 
-    It is what Drake's `lagged` and `similar` contact do anyhow, v = stiction_tolerance * r / sqrt(1 - r^2) where r is the tangential force
-    over the friction limit, which is the law above for small r. So slippery ground looks like creep of stiction_tolerance / friction as
-    long as the limit is not reached. How fast a sole slides beyond it no force tells: that is no creep, and no effect here.
+    It is what Drake's `lagged` and `similar` contact do anyhow,
+    v = stiction_tolerance * r / sqrt(1 - r^2) where r is the tangential force over the friction
+    limit, which is the law above for small r. So slippery ground looks like creep of
+    stiction_tolerance / friction as long as the limit is not reached. How fast a sole slides beyond
+    it no force tells: that is no creep, and no effect here.
     """
 
     description: ClassVar[str] = "Feet slip slowly while they stand."
@@ -226,7 +236,8 @@ class FootCreep(ContactEffect):
         if plant.discrete_contact_approximation not in _CREEPING:
             found = plant.discrete_contact_approximation
             raise InputError(
-                f"plant.discrete_contact_approximation: FootCreep needs lagged or similar, found {found}"
+                "plant.discrete_contact_approximation: FootCreep needs lagged or similar, found "
+                f"{found}"
             )
         changed = copy(plant)
         changed.stiction_tolerance += self.creep * friction
@@ -236,8 +247,8 @@ class FootCreep(ContactEffect):
     def sole_motion(
         pad_force: np.ndarray, pad_positions: np.ndarray, time: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        # Velocity (v_x, v_y) of the origin and rate w about z so that the pads' forces -F_n (v + w x p) add up to what they are; a
-        # point has no such rate.
+        # Velocity (v_x, v_y) of the origin and rate w about z so that the pads' forces -F_n
+        # (v + w x p) add up to what they are; a point has no such rate.
         x, y, _ = pad_positions.T
         ones, zeros = np.ones_like(x), np.zeros_like(x)
         motion = np.stack(
@@ -256,7 +267,8 @@ class FootCreep(ContactEffect):
 
 @dataclass(frozen=True)
 class PadContact:
-    """How the contact of one pad gives way: normal force = stiffness * depth * (1 + dissipation * d(depth)/dt) (Hunt and Crossley 1975)."""
+    """How the contact of one pad gives way: normal
+    force = stiffness * depth * (1 + dissipation * d(depth)/dt) (Hunt and Crossley 1975)."""
 
     # [N/m], [s/m]; of pad and ground together.
     stiffness: float
@@ -266,7 +278,8 @@ class PadContact:
 
 
 def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -> PadContact:
-    """The contact between a robot's pads and the ground, as Drake combines the two and solves it with these settings."""
+    """The contact between a robot's pads and the ground, as Drake combines the two and solves it
+    with these settings."""
     slides = plant.discrete_contact_approximation in _CREEPING
     creep = (
         plant.stiction_tolerance / _friction(description, ground)
@@ -289,7 +302,8 @@ def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -
 
 
 def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -> np.ndarray:
-    """Share of the normal force on each pad that the contact's spring carries: stiffness times depth, without the dissipation.
+    """Share of the normal force on each pad that the contact's spring carries: stiffness times
+    depth, without the dissipation.
 
     Args:
         normal_force: shape (N, P) [N].
@@ -304,7 +318,8 @@ def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -
 
 @njit(cache=True)
 def _fill_spring_force(spring: np.ndarray, force: np.ndarray, rate: float) -> None:
-    # d(spring)/dt = (stiffness / dissipation) (force / spring - 1), by implicit Euler: stable however shallow the contact is.
+    # d(spring)/dt = (stiffness / dissipation) (force / spring - 1), by implicit Euler: stable
+    # however shallow the contact is.
     samples, pads = force.shape
     for pad in range(pads):
         last = force[0, pad]

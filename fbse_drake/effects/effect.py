@@ -1,15 +1,18 @@
 """What a physical effect is, and the library of all of them.
 
-An effect is one class with one definition that serves three purposes: simulating it in a robot, predicting what it adds to every channel of
-a log, and identifying its parameters. What kind of thing it is, is said by its base class:
+An effect is one class with one definition that serves three purposes: simulating it in a robot,
+predicting what it adds to every channel of a log, and identifying its parameters. What kind of
+thing it is, is said by its base class:
 
-    JointTorqueEffect   a torque loss in a joint: friction, springs, ripple; also of its actuation: gain, bias, delay   (joint_torque.py)
-    InertiaEffect       reflected inertia, masses, centres of mass                                                      (inertia.py)
-    GeometryEffect      lengths of links                                                                                (geometry.py)
-    SensorEffect        what a sensor reads beside the truth                                                            (sensor.py)
-    ContactEffect       ground and soles                                                                                (contact.py)
+    JointTorqueEffect   a torque loss in a joint: friction, springs, ripple; also of its
+                        actuation: gain, bias, delay (joint_torque.py)
+    InertiaEffect       reflected inertia, masses, centres of mass (inertia.py)
+    GeometryEffect      lengths of links (geometry.py)
+    SensorEffect        what a sensor reads beside the truth (sensor.py)
+    ContactEffect       ground and soles (contact.py)
 
-An effect of a user's own is a subclass of one of them behind `@in_library`; from then on YAML files can name it and the diagnosis tries it.
+An effect of a user's own is a subclass of one of them behind `@in_library`; from then on YAML files
+can name it and the diagnosis tries it.
 """
 
 from abc import ABC
@@ -24,9 +27,11 @@ from fbse_drake.library import require_new
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 
-# A prismatic joint is to a revolute one as the end of a lever of this length to its axis [m]: plausible values are converted with it.
+# A prismatic joint is to a revolute one as the end of a lever of this length to its axis [m]:
+# plausible values are converted with it.
 _LEVER = 0.1
-# Units at a revolute joint: that at a prismatic one, and the power of the lever's length by which values are multiplied.
+# Units at a revolute joint: that at a prismatic one, and the power of the lever's length by which
+# values are multiplied.
 _AT_PRISMATIC_JOINT = {
     "Nm": ("N", -1),
     "Nm/rad": ("N/m", -2),
@@ -60,10 +65,11 @@ class Parameter:
     bounds: tuple[float, float] = (0.0, np.inf)
     # For a nonlinear one: at how many points of its plausible range a search for it starts.
     grid: int = 9
-    # For a nonlinear one: the value with which there is no effect; targets that are not named get it.
+    # For a nonlinear one: the value with which there is no effect; targets that are not named get
+    # it.
     neutral: float | None = None
-    # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that a log which does not show it does not
-    # make it large; by default nothing is believed.
+    # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that
+    # a log which does not show it does not make it large; by default nothing is believed.
     belief: float = np.inf
     # For a nonlinear one: is what would lie beyond its plausible range something else?
     closed: bool = False
@@ -77,7 +83,8 @@ class Parameter:
 
     @property
     def at_prismatic_joint(self) -> "Parameter":
-        """The same for a prismatic joint, with m and N in the place of rad and Nm; its bounds, which are of no size, stay."""
+        """The same for a prismatic joint, with m and N in the place of rad and Nm; its bounds,
+        which are of no size, stay."""
         unit, _ = _AT_PRISMATIC_JOINT.get(self.unit, (self.unit, 0))
         low, high = self.plausible
         return replace(
@@ -87,8 +94,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect(ABC):
-    """Base of all effects: a frozen dataclass with one field per parameter. A field holds values by target (`{all: 0.1, left_knee: 0.2}`);
-    if the effect acts on the robot as a whole, a number. A linear parameter that is not given is 0.
+    """Base of all effects: a frozen dataclass with one field per parameter. A field holds values by
+    target (`{all: 0.1, left_knee: 0.2}`); if the effect acts on the robot as a whole, a number. A
+    linear parameter that is not given is 0.
 
     >>> from fbse_drake import CoulombFriction, load_description
     >>> friction = CoulombFriction(coulomb={"all": 0.3, "left_knee_pitch": 0.9})
@@ -110,7 +118,8 @@ class Effect(ABC):
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "joint"
     # Other effects can say the same together; then the diagnosis does not try it.
     composite: ClassVar[bool] = False
-    # Its linear parameters enter linearly only about some values: a search makes it linear about those that fit.
+    # Its linear parameters enter linearly only about some values: a search makes it linear about
+    # those that fit.
     linear_nearby: ClassVar[bool] = False
 
     @staticmethod
@@ -129,7 +138,8 @@ class Effect(ABC):
 
     @classmethod
     def largest_plausible(cls, unit: str = "Nm") -> float:
-        """Largest plausible size of its first parameter, which says how strong it is; at a joint whose torque has this unit."""
+        """Largest plausible size of its first parameter, which says how strong it is; at a joint
+        whose torque has this unit."""
         return max(abs(bound) for bound in next(iter(cls.parameters_at(unit).values())).plausible)
 
     @classmethod
@@ -139,12 +149,14 @@ class Effect(ABC):
 
     @classmethod
     def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:  # noqa: ARG003
-        """Smallest possible values of its linear parameters on a target, (p,); a fit does not go below them."""
+        """Smallest possible values of its linear parameters on a target, (p,); a fit does not go
+        below them."""
         return np.array([p.bounds[0] for p in cls.parameters.values() if p.linear])
 
     @classmethod
     def from_values(cls, targets: Sequence[str], values: Mapping[str, Sequence[float]]) -> "Effect":
-        """The effect with these values of each parameter, target by target; other parameters and targets keep their defaults.
+        """The effect with these values of each parameter, target by target; other parameters and
+        targets keep their defaults.
 
         Args:
             targets: joints, bodies or sides; one (any) name for an effect on the robot.
@@ -163,7 +175,8 @@ class Effect(ABC):
         """This effect with its values as arrays.
 
         Raises:
-            InputError: unknown target, a value out of bounds, or a nonlinear parameter without a value.
+            InputError: unknown target, a value out of bounds, or a nonlinear parameter without a
+                value.
         """
         targets = self._targets(names)
         linear, nonlinear = [], []
@@ -175,7 +188,8 @@ class Effect(ABC):
             low, high = parameter.bounds
             if not np.all((low <= values) & (values <= high)):
                 raise InputError(
-                    f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found {values.tolist()}"
+                    f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found "
+                    f"{values.tolist()}"
                 )
             (linear if parameter.linear else nonlinear).append(values)
         columns = len(targets)
@@ -211,7 +225,8 @@ class Effect(ABC):
         for target in values:
             if target not in targets and target != "all":
                 raise InputError(
-                    f"{key}.{target}: unknown {self.acts_on} (allowed: {', '.join(['all', *targets])})"
+                    f"{key}.{target}: unknown {self.acts_on} (allowed: "
+                    f"{', '.join(['all', *targets])})"
                 )
         result = [values.get(target, values.get("all", default)) for target in targets]
         if None in result:
@@ -239,7 +254,8 @@ def in_library(effect: T) -> T:
     """Class decorator: puts an effect into the library, under its class name.
 
     Raises:
-        InputError: it lacks one of the class variables or a method, has a field without a parameter, or another effect has its name.
+        InputError: it lacks one of the class variables or a method, has a field without a
+            parameter, or another effect has its name.
     """
     for name in ("description", "signature", "experiment", "parameters"):
         if not hasattr(effect, name):
@@ -248,12 +264,14 @@ def in_library(effect: T) -> T:
     names = [field.name for field in fields(effect)]
     if names != list(effect.parameters):
         raise InputError(
-            f"effect {effect.__name__}: expected a dataclass with the fields {list(effect.parameters)}, found {names}"
+            f"effect {effect.__name__}: expected a dataclass with the fields "
+            f"{list(effect.parameters)}, found {names}"
         )
     for name, parameter in effect.parameters.items():
         if not parameter.linear and not 0 < parameter.plausible[0] < parameter.plausible[1]:
             raise InputError(
-                f"effect {effect.__name__}: parameter {name} is not linear, so it is searched in its plausible range: "
+                f"effect {effect.__name__}: parameter {name} is not linear, so it is searched in "
+                "its plausible range: "
                 f"expected 0 < low < high, found {parameter.plausible}"
             )
     _LIBRARY[effect.__name__] = effect

@@ -83,7 +83,8 @@ class ViscousFriction(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class CoulombViscousFriction(JointTorqueEffect):
-    """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb tanh(w / transition) + viscous w."""
+    """Coulomb and viscous friction (paper eq. 57) with the sign smoothed: u = coulomb
+    tanh(w / transition) + viscous w."""
 
     description: ClassVar[str] = (
         "Friction of constant size against the motion, plus a part that grows with speed."
@@ -123,13 +124,15 @@ class CoulombViscousFriction(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class StribeckFriction(JointTorqueEffect):
-    """Continuously differentiable friction with static, Stribeck, Coulomb and viscous parts (Makkar et al. 2005, paper eq. 56):
+    """Continuously differentiable friction with static, Stribeck, Coulomb and viscous parts (Makkar
+    et al. 2005, paper eq. 56):
 
     u = gamma1 (tanh(gamma2 w) - tanh(gamma3 w)) + gamma4 tanh(gamma5 w) + gamma6 w
     """
 
     description: ClassVar[str] = (
-        "Friction that is largest just after the joint starts to move, then falls, then grows with speed."
+        "Friction that is largest just after the joint starts to move, then falls, then grows with "
+        "speed."
     )
     signature: ClassVar[str] = (
         "Torque changes sign with the velocity and peaks at a few hundredths of a rad/s."
@@ -201,9 +204,11 @@ class StribeckFriction(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class DirectionalFriction(JointTorqueEffect):
-    """What friction has more in one direction than in the other: u = asymmetry tanh(w / transition)^2.
+    """What friction has more in one direction than in the other: u = asymmetry
+    tanh(w / transition)^2.
 
-    Beside Coulomb friction, whose size is then coulomb + asymmetry forwards and coulomb - asymmetry backwards.
+    Beside Coulomb friction, whose size is then coulomb + asymmetry forwards and coulomb - asymmetry
+    backwards.
     """
 
     description: ClassVar[str] = "Friction is larger in one direction of motion than in the other."
@@ -237,7 +242,8 @@ class DirectionalFriction(JointTorqueEffect):
 class DirectionalViscousFriction(JointTorqueEffect):
     """What viscous friction has more in one direction than in the other: u = asymmetry |w|.
 
-    Beside viscous friction, whose coefficient is then viscous + asymmetry forwards and viscous - asymmetry backwards.
+    Beside viscous friction, whose coefficient is then viscous + asymmetry forwards and
+    viscous - asymmetry backwards.
     """
 
     description: ClassVar[str] = (
@@ -267,10 +273,11 @@ class DirectionalViscousFriction(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class LoadDependentFriction(JointTorqueEffect):
-    """Coulomb friction in proportion to what the gear transmits: u = coefficient |load| tanh(w / transition).
+    """Coulomb friction in proportion to what the gear transmits: u = coefficient |load|
+    tanh(w / transition).
 
-    The load is what reaches the link. To lift it slowly takes a command of (1 + coefficient) load, to let it down one of
-    (1 - coefficient) load.
+    The load is what reaches the link. To lift it slowly takes a command of (1 + coefficient) load,
+    to let it down one of (1 - coefficient) load.
     """
 
     description: ClassVar[str] = "Friction that grows with the torque through the gear."
@@ -330,7 +337,8 @@ class QuadraticDrag(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class ThermalDrift(JointTorqueEffect):
-    """Coulomb friction that changes while the joint warms up: u = change (1 - exp(-t / warm_up)) tanh(w / transition)."""
+    """Coulomb friction that changes while the joint warms up: u = change (1 - exp(-t / warm_up))
+    tanh(w / transition)."""
 
     description: ClassVar[str] = "Friction that changes over minutes as the joint warms up."
     signature: ClassVar[str] = (
@@ -367,5 +375,6 @@ class ThermalDrift(JointTorqueEffect):
         return Rise(speeds=(nonlinear[1],))
 
 
-# The friction laws that an estimator can adopt: those that depend on the velocity alone, with all that friction has at least.
+# The friction laws that an estimator can adopt: those that depend on the velocity alone, with all
+# that friction has at least.
 FrictionModel = StribeckFriction | CoulombViscousFriction

@@ -1,6 +1,7 @@
 """Effects on a robot's shape: what the model's joints are placed by.
 
-The same lines change the plant that is simulated, the model that is believed, and the model that the diagnosis tries out.
+The same lines change the plant that is simulated, the model that is believed, and the model that
+the diagnosis tries out.
 """
 
 from collections.abc import Mapping
@@ -20,7 +21,8 @@ _SHORTEST_LINK = 0.02
 
 @dataclass(frozen=True)
 class GeometryEffect(Effect):
-    """Base of the effects on a robot's shape; a subclass moves joints against the bodies that carry them."""
+    """Base of the effects on a robot's shape; a subclass moves joints against the bodies that carry
+    them."""
 
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
 
@@ -67,11 +69,13 @@ def joint_shifts(effects: Mapping[str, Effect], robot: Robot) -> dict[str, np.nd
 @in_library
 @dataclass(frozen=True)
 class LinkLength(GeometryEffect):
-    """A link is longer than the model says, along the line from the joint that moves it to the next joint; its mass stays where it is."""
+    """A link is longer than the model says, along the line from the joint that moves it to the next
+    joint; its mass stays where it is."""
 
     description: ClassVar[str] = "A link is longer or shorter than the model says."
     signature: ClassVar[str] = (
-        "Standing feet that move against each other as the leg swings, and forces under them on another lever."
+        "Standing feet that move against each other as the leg swings, and forces under them on "
+        "another lever."
     )
     experiment: ClassVar[str] = (
         "Stand on both feet, squat and sway: the legs and the ground are a closed chain."
@@ -101,8 +105,9 @@ class LinkLength(GeometryEffect):
 
 
 def _next_joint(robot: Robot, body: str) -> tuple[Joint, np.ndarray] | None:
-    """The one joint that a body carries, and the way to it from the joint that moves the body, in the body's frame, (3,) [m]; None where
-    there are not just these two joints, apart from each other."""
+    """The one joint that a body carries, and the way to it from the joint that moves the body, in
+    the body's frame, (3,) [m]; None where there are not just these two joints, apart from each
+    other."""
     joints = [robot.plant.GetJointByName(name) for name in robot.joint_names]
     moving = [joint for joint in joints if joint.child_body().name() == body]
     carried = [joint for joint in joints if joint.parent_body().name() == body]

@@ -1,6 +1,7 @@
 """Effects on a plant's inertia.
 
-The same lines change the plant that is simulated, the model that is believed, and the model that the diagnosis tries out.
+The same lines change the plant that is simulated, the model that is believed, and the model that
+the diagnosis tries out.
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,8 @@ from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.errors import InputError, located
 from fbse_drake.robot.plant import PointMass, Robot
 
-# The model's masses and centres of mass are suspected in bodies heavier than this share of the robot.
+# The model's masses and centres of mass are suspected in bodies heavier than this share of the
+# robot.
 _LIGHT_BODY = 0.03
 # Share of an inertia that may be lost in rounding.
 _ROUNDING = 1e-9
@@ -22,8 +24,9 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class InertiaEffect(Effect):
-    """Base of the inertia effects. One that acts on joints adds rotor inertia to them, one that acts on bodies adds point masses; a
-    subclass gives the one of the two functions that it needs. All its parameters are linear, at least about some values.
+    """Base of the inertia effects. One that acts on joints adds rotor inertia to them, one that
+    acts on bodies adds point masses; a subclass gives the one of the two functions that it needs.
+    All its parameters are linear, at least about some values.
     """
 
     @staticmethod
@@ -38,7 +41,8 @@ class InertiaEffect(Effect):
 
     @staticmethod
     def expansion_point(body: RigidBody) -> np.ndarray | None:  # noqa: ARG004
-        """Values about which it is linear enough for a search to begin with, shape (parameters,); None for zeros."""
+        """Values about which it is linear enough for a search to begin with, shape (parameters,);
+        None for zeros."""
         return None
 
     @staticmethod
@@ -63,7 +67,8 @@ class InertiaEffect(Effect):
 def inertia_changes(
     effects: Mapping[str, Effect], robot: Robot
 ) -> tuple[np.ndarray, list[PointMass]]:
-    """What the inertia effects among some effects add to a robot: rotor inertia of each joint, shape (n,) [kg m^2], and point masses.
+    """What the inertia effects among some effects add to a robot: rotor inertia of each joint,
+    shape (n,) [kg m^2], and point masses.
 
     Args:
         effects: by name, of any kind.
@@ -89,12 +94,13 @@ def inertia_changes(
 @in_library
 @dataclass(frozen=True)
 class ReflectedInertia(InertiaEffect):
-    """Inertia of rotor and gears as the joint feels it (that of the rotor times the gear ratio squared), beside a configured
-    `rotor_inertia`."""
+    """Inertia of rotor and gears as the joint feels it (that of the rotor times the gear ratio
+    squared), beside a configured `rotor_inertia`."""
 
     description: ClassVar[str] = "Inertia of motor and gears, as felt at the joint."
     signature: ClassVar[str] = (
-        "Torque in step with the joint's own acceleration, also where the link barely loads the joint."
+        "Torque in step with the joint's own acceleration, also where the link barely loads the "
+        "joint."
     )
     experiment: ClassVar[str] = "Swing each joint fast, with the robot hanging and its feet free."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -111,11 +117,13 @@ class ReflectedInertia(InertiaEffect):
 @in_library
 @dataclass(frozen=True)
 class BodyMass(InertiaEffect):
-    """Mass at the centre of mass of a body; negative where the model has too much. Mass elsewhere is a `Payload`."""
+    """Mass at the centre of mass of a body; negative where the model has too much. Mass elsewhere
+    is a `Payload`."""
 
     description: ClassVar[str] = "A body is heavier or lighter than the model says."
     signature: ClassVar[str] = (
-        "Too much or too little force under the feet, and torque in the joints that carry the body, with its weight."
+        "Too much or too little force under the feet, and torque in the joints that carry the "
+        "body, with its weight."
     )
     experiment: ClassVar[str] = "Squat and sway; for a leg's body also lift that leg."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
@@ -139,15 +147,18 @@ class BodyMass(InertiaEffect):
 @in_library
 @dataclass(frozen=True)
 class BodyCentreOfMass(InertiaEffect):
-    """The centre of mass of a body, moved in the body's frame; its mass and its rotational inertia about the centre of mass stay.
+    """The centre of mass of a body, moved in the body's frame; its mass and its rotational inertia
+    about the centre of mass stay.
 
-    A body of mass m whose centre of mass moves from c to c + d differs by the point masses -m at c and m at c + d: exactly what is said
-    above, and linear in d but for the part d^2 of the rotational inertia.
+    A body of mass m whose centre of mass moves from c to c + d differs by the point masses -m at c
+    and m at c + d: exactly what is said above, and linear in d but for the part d^2 of the
+    rotational inertia.
     """
 
     description: ClassVar[str] = "The centre of mass of a body is elsewhere than the model says."
     signature: ClassVar[str] = (
-        "Moments and joint torques with the body's weight and tilt, but the right force under the feet."
+        "Moments and joint torques with the body's weight and tilt, but the right force under the "
+        "feet."
     )
     experiment: ClassVar[str] = (
         "Squat and sway slowly; for its height, tilt or accelerate the body."
@@ -168,7 +179,8 @@ class BodyCentreOfMass(InertiaEffect):
         return [PointMass(body.name(), -mass, com), PointMass(body.name(), mass, com + values)]
 
 
-# Half the distance of the masses that stand for a second moment [m]; what they add does not depend on it.
+# Half the distance of the masses that stand for a second moment [m]; what they add does not depend
+# on it.
 _ARM = 0.1
 # Mass of the payload about which a search for one begins [kg].
 _SOME_MASS = 1.0
@@ -177,16 +189,18 @@ _SOME_MASS = 1.0
 @in_library
 @dataclass(frozen=True)
 class Payload(InertiaEffect):
-    """A rigid mass that a body B carries: its mass, the place p_BoP_B of its centre P, and its second moments about P along the axes
-    of B, as sxx = integral of (x - x_P)^2 dm; all of them 0 for a point mass.
+    """A rigid mass that a body B carries: its mass, the place p_BoP_B of its centre P, and its
+    second moments about P along the axes of B, as sxx = integral of (x - x_P)^2 dm; all of them 0
+    for a point mass.
 
-    Second moments that are not negative are those of some distribution of mass. The rotational inertia about P is
-    ixx = syy + szz and so on; products of inertia are left out.
+    Second moments that are not negative are those of some distribution of mass. The rotational
+    inertia about P is ixx = syy + szz and so on; products of inertia are left out.
     """
 
     description: ClassVar[str] = "A body carries something: a payload, a tool, a load on the back."
     signature: ClassVar[str] = (
-        "Torque in all joints that carry the body, as of one weight at one place; under the feet its weight."
+        "Torque in all joints that carry the body, as of one weight at one place; under the feet "
+        "its weight."
     )
     experiment: ClassVar[str] = (
         "Move all joints that carry the body, through many postures and fast."
@@ -217,7 +231,8 @@ class Payload(InertiaEffect):
 
     @staticmethod
     def suspected_bodies(robot: Robot) -> list[str]:
-        """Of bodies that are fixed to each other the heaviest, however light it is; none that is fixed to the world."""
+        """Of bodies that are fixed to each other the heaviest, however light it is; none that is
+        fixed to the world."""
         plant, names = robot.plant, robot.body_names
         at_rest = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
         carriers = (
@@ -250,7 +265,8 @@ class Payload(InertiaEffect):
         return result
 
 
-# Parameters of a body's inertia: mass, first moment and rotational inertia about the origin of the body's frame, in that frame.
+# Parameters of a body's inertia: mass, first moment and rotational inertia about the origin of the
+# body's frame, in that frame.
 _INERTIAL = {
     "mass": ("kg", 10.0),
     **{f"m{axis}": ("kg m", 1.0) for axis in "xyz"},
@@ -327,9 +343,11 @@ def inertial_parameters(inertia: SpatialInertia) -> np.ndarray:
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """Pseudo-inertia [[integral of p p^T dm, m c], [m c^T, m]], (..., 4, 4), of parameters (..., 10); linear in them.
+    """Pseudo-inertia [[integral of p p^T dm, m c], [m c^T, m]], (..., 4, 4), of parameters
+    (..., 10); linear in them.
 
-    A distribution of mass has these parameters just if it is positive semidefinite (Wensing, Kim and Slotine 2018).
+    A distribution of mass has these parameters just if it is positive semidefinite (Wensing, Kim
+    and Slotine 2018).
     """
     m, mx, my, mz, xx, yy, zz, xy, xz, yz = np.moveaxis(np.asarray(parameters), -1, 0)
     half = 0.5 * (xx + yy + zz)
@@ -343,7 +361,8 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def equal_point_masses(J: np.ndarray, name: str) -> list[tuple[float, np.ndarray]]:
-    """Four equal masses [kg] and their places [m] that have a pseudo-inertia: the corners of a tetrahedron.
+    """Four equal masses [kg] and their places [m] that have a pseudo-inertia: the corners of a
+    tetrahedron.
 
     Raises:
         InputError: no distribution of mass has it; `name` is the body's.

@@ -1,11 +1,12 @@
 """Joint torque effects: one definition each for simulation, prediction and identification.
 
-An effect is a torque loss u in `tau_command = u + tau_link` (paper eq. 34), positive when it eats positive torque. It is written as
+An effect is a torque loss u in `tau_command = u + tau_link` (paper eq. 34), positive when it eats
+positive torque. It is written as
 
     u(motion) = sum over linear parameters k of  theta_k * basis_k(motion; nonlinear parameters)
 
-so that the same lines simulate it, predict it over a whole log and give the regressor to identify it. An effect without linear parameters
-is one basis torque as it stands.
+so that the same lines simulate it, predict it over a whole log and give the regressor to identify
+it. An effect without linear parameters is one basis torque as it stands.
 """
 
 from abc import abstractmethod
@@ -21,7 +22,8 @@ from fbse_drake.robot.description import RobotDescription
 
 
 class JointMotion(NamedTuple):
-    """A plant step, or many, as joint torque effects see it: arrays that broadcast to (..., n), the last axis is the joints.
+    """A plant step, or many, as joint torque effects see it: arrays that broadcast to (..., n), the
+    last axis is the joints.
 
     An effect that depends on the velocity alone can be given the velocity alone.
     """
@@ -104,13 +106,16 @@ class JointTorqueEffect(Effect):
     def basis(
         motion: JointMotion, nonlinear: np.ndarray
     ) -> tuple[Sequence[np.ndarray | float], Sequence[np.ndarray | float]]:
-        """Torque per unit of each linear parameter, and its derivative with respect to the joint velocity.
+        """Torque per unit of each linear parameter, and its derivative with respect to the joint
+        velocity.
 
         Args:
-            nonlinear: values of the nonlinear parameters in the order of `parameters`, shape (parameters, ..., n).
+            nonlinear: values of the nonlinear parameters in the order of `parameters`, shape
+                (parameters, ..., n).
 
         Returns:
-            Two sequences in the order of the linear parameters (one item if there are none), items that broadcast to (..., n).
+            Two sequences in the order of the linear parameters (one item if there are none), items
+            that broadcast to (..., n).
         """
 
     @staticmethod
@@ -125,12 +130,14 @@ class JointTorqueEffect(Effect):
 
     @staticmethod
     def lean(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | float:  # noqa: ARG004
-        """Where in its range, from -1 to 1, the torque of a memory stands at velocity zero, (n,)."""
+        """Where in its range, from -1 to 1, the torque of a memory stands at velocity zero,
+        (n,)."""
         return 0.0
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        """Memory at the start of the first step, shape (rows, ..., n). Everything about the step is known but its velocity."""
+        """Memory at the start of the first step, shape (rows, ..., n). Everything about the step is
+        known but its velocity."""
         raise NotImplementedError
 
     @staticmethod
@@ -140,7 +147,8 @@ class JointTorqueEffect(Effect):
 
     @staticmethod
     def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | bool:  # noqa: ARG004
-        """Does a joint that moves through a range of angles show what the effect is, and not just its value and slope there?
+        """Does a joint that moves through a range of angles show what the effect is, and not just
+        its value and slope there?
 
         Args:
             travel: from the smallest to the largest angle, shape (n,) [rad].
@@ -150,7 +158,8 @@ class JointTorqueEffect(Effect):
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
-        """Memory at the start of each of N steps that follow each other, (rows, ..., N, n), where that can be had faster than step by step.
+        """Memory at the start of each of N steps that follow each other, (rows, ..., N, n), where
+        that can be had faster than step by step.
 
         Args:
             motion: arrays (N, n).
@@ -167,12 +176,14 @@ class JointTorqueEffect(Effect):
 
 @dataclass(frozen=True)
 class ResolvedJointTorque(ResolvedEffect):
-    """A joint torque effect with values per joint; without linear parameters `linear` is one row of ones."""
+    """A joint torque effect with values per joint; without linear parameters `linear` is one row of
+    ones."""
 
     effect: type[JointTorqueEffect]
 
     def torque_and_slope(self, motion: JointMotion) -> tuple[np.ndarray, np.ndarray]:
-        """Torque loss u [Nm] and its derivative with respect to the joint velocity [Nm s/rad], each of shape (..., n)."""
+        """Torque loss u [Nm] and its derivative with respect to the joint velocity [Nm s/rad], each
+        of shape (..., n)."""
         nonlinear = self.nonlinear
         if motion.velocity.ndim > 1:
             # (parameters, n) -> (parameters, 1, ..., n), to go with the leading axes of the motion.
@@ -191,10 +202,12 @@ def basis_over_time(
 
     Args:
         motion: arrays that broadcast to (N, n); the memory is made here.
-        nonlinear: values of the nonlinear parameters, shape (m, n), or (m, G, n) for G sets of values.
+        nonlinear: values of the nonlinear parameters, shape (m, n), or (m, G, n) for G sets of
+            values.
 
     Returns:
-        Shape (p, N, n), or (p, G, N, n), for the p linear parameters, or one basis torque if there are none.
+        Shape (p, N, n), or (p, G, N, n), for the p linear parameters, or one basis torque if there
+        are none.
     """
     samples, n = motion.velocity.shape
     sets = nonlinear.shape[1:-1]
@@ -217,7 +230,8 @@ def basis_over_time(
 
 
 def law_over_time(effects: Sequence[ResolvedJointTorque], motion: JointMotion) -> np.ndarray:
-    """Torque loss of some effects over N steps that follow each other, memory included, (N, n) [Nm].
+    """Torque loss of some effects over N steps that follow each other, memory included,
+    (N, n) [Nm].
 
     Args:
         motion: arrays that broadcast to (N, n); the memory is made here.
@@ -230,7 +244,8 @@ def law_over_time(effects: Sequence[ResolvedJointTorque], motion: JointMotion) -
 
 
 def affine_recursion(start: np.ndarray | float, keep: np.ndarray, add: np.ndarray) -> np.ndarray:
-    """Memory z of each step with z[0] = start and z[k + 1] = keep[k] z[k] + add[k]; time is the last axis but one.
+    """Memory z of each step with z[0] = start and z[k + 1] = keep[k] z[k] + add[k]; time is the
+    last axis but one.
 
     Args:
         start: broadcasts to (..., n).

@@ -1,7 +1,7 @@
 """Effects in sensors: what is read beside the truth.
 
-The same lines distort the readings of a simulation, tick by tick, and those of a whole log, where the diagnosis asks what an effect would
-have added.
+The same lines distort the readings of a simulation, tick by tick, and those of a whole log, where
+the diagnosis asks what an effect would have added.
 """
 
 from abc import abstractmethod
@@ -25,7 +25,8 @@ _UNDOING = 3
 
 @dataclass(frozen=True)
 class SensorSignals:
-    """What the sensors measure; any leading axes (time). IMU signals in the IMU frame, forces in the sole frames."""
+    """What the sensors measure; any leading axes (time). IMU signals in the IMU frame, forces in
+    the sole frames."""
 
     # Shape (..., n) [rad], [rad/s].
     joint_position: np.ndarray
@@ -43,8 +44,8 @@ class SensorSignals:
 class SensorEffect(Effect):
     """Base of the sensor effects.
 
-    A subclass gives `reading`. One that depends on the past, on torque commands for instance, sets `memory_size` and gives `remembered`;
-    its memory is 0 at first.
+    A subclass gives `reading`. One that depends on the past, on torque commands for instance, sets
+    `memory_size` and gives `remembered`; its memory is 0 at first.
     """
 
     # Numbers that it remembers for each target.
@@ -58,7 +59,8 @@ class SensorEffect(Effect):
         """What the sensors read if this is what they ought to read.
 
         Args:
-            signals: any leading axes. The reading must not depend on `torque_command`, which is only known after it.
+            signals: any leading axes. The reading must not depend on `torque_command`, which is
+                only known after it.
             memory: what is remembered from the ticks before, shape (memory_size, ..., targets).
         """
 
@@ -109,7 +111,8 @@ class SensorEffect(Effect):
     ) -> SensorSignals:
         """What the sensors ought to read over a whole log if this is what they read.
 
-        By taking off, again and again, what the effect adds: it is small, and each time leaves a share of its own size.
+        By taking off, again and again, what the effect adds: it is small, and each time leaves a
+        share of its own size.
 
         Args:
             measured: with the ticks as the leading axis.
@@ -137,7 +140,8 @@ class SensorEffect(Effect):
 
 
 def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
-    """Wrench [moment, force] on each foot in its sole frame, (..., feet, 6) [Nm, N], from (..., P, 3)."""
+    """Wrench [moment, force] on each foot in its sole frame, (..., feet, 6) [Nm, N], from
+    (..., P, 3)."""
     parts, start = [], 0
     for grasp in robot.grasp_maps:
         stop = start + grasp.shape[1] // 3
@@ -147,7 +151,8 @@ def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
 
 
 def _with_wrenches(signals: SensorSignals, added: np.ndarray, robot: Robot) -> SensorSignals:
-    """Signals with wrenches (..., feet, 6) added to those on the feet, by the smallest forces that have them."""
+    """Signals with wrenches (..., feet, 6) added to those on the feet, by the smallest forces that
+    have them."""
     forces = [
         added[..., foot, :] @ np.linalg.pinv(grasp).T for foot, grasp in enumerate(robot.grasp_maps)
     ]
@@ -169,7 +174,8 @@ class FootForceGain(SensorEffect):
         "The force sensors of a foot read a share more or less than the force."
     )
     signature: ClassVar[str] = (
-        "The feet seem to carry more or less than the weight, in proportion to the load on the one foot."
+        "The feet seem to carry more or less than the weight, in proportion to the load on the one "
+        "foot."
     )
     experiment: ClassVar[str] = "Shift the weight slowly from foot to foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
@@ -193,7 +199,8 @@ class FootForceGain(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class FootForceBias(SensorEffect):
-    """Each pad of a foot, or its six-axis sensor, reads this force too much, in the axes of the sole."""
+    """Each pad of a foot, or its six-axis sensor, reads this force too much, in the axes of the
+    sole."""
 
     description: ClassVar[str] = "The force sensors of a foot read a constant force too much."
     signature: ClassVar[str] = "Force on the foot while it is in the air."
@@ -230,7 +237,8 @@ class FootForceBias(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class FootMomentBias(SensorEffect):
-    """The force sensors of a foot together read this moment too much, about the origin of the sole and in its axes."""
+    """The force sensors of a foot together read this moment too much, about the origin of the sole
+    and in its axes."""
 
     description: ClassVar[str] = "The force sensors of a foot read a constant moment too much."
     signature: ClassVar[str] = "Moment on the foot while it is in the air."
@@ -259,8 +267,9 @@ class FootMomentBias(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class FootForceMisalignment(SensorEffect):
-    """The force sensors of a foot are turned against the sole by this rotation vector, about its origin; force and moment are read in the
-    turned axes. As a rotation it is linear for small angles only.
+    """The force sensors of a foot are turned against the sole by this rotation vector, about its
+    origin; force and moment are read in the turned axes. As a rotation it is linear for small
+    angles only.
     """
 
     description: ClassVar[str] = "The force sensors of a foot are mounted askew."
@@ -297,17 +306,19 @@ class FootForceMisalignment(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class FootForceLag(SensorEffect):
-    """The wrench that the force sensors of a foot read follows the true one through a low-pass of first order.
+    """The wrench that the force sensors of a foot read follows the true one through a low-pass of
+    first order.
 
-    In steps of the sampling period, so that a log shows the time constant linearly: the true wrench is the one that is read, plus
-    time_constant times its rate.
+    In steps of the sampling period, so that a log shows the time constant linearly: the true wrench
+    is the one that is read, plus time_constant times its rate.
     """
 
     description: ClassVar[str] = (
         "The force sensors of a foot are read through a low-pass, and so come late."
     )
     signature: ClassVar[str] = (
-        "Force under the foot that lags behind what the motion needs, and is smoother, at touch-down most of all."
+        "Force under the foot that lags behind what the motion needs, and is smoother, at "
+        "touch-down most of all."
     )
     experiment: ClassVar[str] = "Shift the weight to and fro fast; step on the spot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
@@ -375,7 +386,8 @@ class FootForceLag(SensorEffect):
 
 
 def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
-    """Share of what a low-pass of first order holds that is left after a period, as by an implicit Euler step."""
+    """Share of what a low-pass of first order holds that is left after a period, as by an implicit
+    Euler step."""
     return time_constant / (time_constant + period)
 
 
@@ -468,7 +480,8 @@ class GyroscopeBias(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class ImuMisalignment(SensorEffect):
-    """The IMU's axes are turned against the IMU frame by this rotation vector; both of its sensors read in the turned axes.
+    """The IMU's axes are turned against the IMU frame by this rotation vector; both of its sensors
+    read in the turned axes.
 
     As a rotation it is linear for small angles only.
     """
@@ -513,7 +526,8 @@ class EncoderOffset(SensorEffect):
 
     description: ClassVar[str] = "The zero of a joint's encoder is off."
     signature: ClassVar[str] = (
-        "Gravity torques of another posture, and feet that do not fit the ground: tilted while they stand flat."
+        "Gravity torques of another posture, and feet that do not fit the ground: tilted while "
+        "they stand flat."
     )
     experiment: ClassVar[str] = "Stand in several postures; squat and sway."
     parameters: ClassVar[dict[str, Parameter]] = {
@@ -535,19 +549,21 @@ class EncoderOffset(SensorEffect):
 @in_library
 @dataclass(frozen=True)
 class TransmissionElasticity(SensorEffect):
-    """A massless damped spring between motor and joint, with the encoder on the motor's side: it reads q + d, where
+    """A massless damped spring between motor and joint, with the encoder on the motor's side: it
+    reads q + d, where
 
     time_constant d_dot = compliance * command - d
 
-    The command is held from tick to tick, and the solution is exact. A loop of derivative gain kd over such an encoder needs
-    kd * compliance < time_constant.
+    The command is held from tick to tick, and the solution is exact. A loop of derivative gain kd
+    over such an encoder needs kd * compliance < time_constant.
     """
 
     description: ClassVar[str] = (
         "The transmission twists under torque, and the encoder sits on the motor's side of it."
     )
     signature: ClassVar[str] = (
-        "Joint angles off in proportion to the torque command; a foot that stands seems to give way under load."
+        "Joint angles off in proportion to the torque command; a foot that stands seems to give "
+        "way under load."
     )
     experiment: ClassVar[str] = (
         "Stand on one leg and shift the weight, or squat: large torques with little motion."
@@ -587,7 +603,8 @@ class TransmissionElasticity(SensorEffect):
         robot: Robot,  # noqa: ARG004
         period: float,
     ) -> np.ndarray:
-        """Torque that the spring has followed so far, and the command of the tick's step, (2, n) [Nm]."""
+        """Torque that the spring has followed so far, and the command of the tick's step,
+        (2, n) [Nm]."""
         command = signals.torque_command
         return np.stack(
             [command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command]
@@ -608,9 +625,11 @@ class SensorEffects(LeafSystem):
         output_ports:
         - measured
 
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific force, angular velocity], shape (6,)
-    [m/s^2, rad/s]; `pad_force` three components pad by pad [N]; `torque_command` (n,) [Nm]. `measured` is [joint_state, imu, pad_force] as
-    read; it does not depend on the command of its own tick, which is computed from it. Discrete state: each effect's memory.
+    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific force,
+    angular velocity], shape (6,) [m/s^2, rad/s]; `pad_force` three components pad by pad [N];
+    `torque_command` (n,) [Nm]. `measured` is [joint_state, imu, pad_force] as read; it does not
+    depend on the command of its own tick, which is computed from it. Discrete state: each effect's
+    memory.
     """
 
     def __init__(self, effects: Sequence[ResolvedEffect], robot: Robot, period: float):

@@ -58,7 +58,8 @@ class TorqueRipple(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class JointSpring(JointTorqueEffect):
-    """A spring beside the motor, as of cables and hoses over the joint: u = stiffness q + preload."""
+    """A spring beside the motor, as of cables and hoses over the joint: u = stiffness
+    q + preload."""
 
     description: ClassVar[str] = "A spring across the joint, as of cables and hoses."
     signature: ClassVar[str] = "Torque rises linearly with the joint angle."
@@ -84,7 +85,8 @@ class JointSpring(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class PreslidingHysteresis(JointTorqueEffect):
-    """Coulomb friction that builds up over a displacement, like a bristle that bends before it slips (Dahl 1968):
+    """Coulomb friction that builds up over a displacement, like a bristle that bends before it
+    slips (Dahl 1968):
 
     u = coulomb z,   dz/dt = w / displacement (1 - z sign(w))
 
@@ -95,7 +97,8 @@ class PreslidingHysteresis(JointTorqueEffect):
         "Friction that builds up like a spring before the joint really slips."
     )
     signature: ClassVar[str] = (
-        "After each reversal the torque changes over an angle, not at once: a loop over the joint angle."
+        "After each reversal the torque changes over an angle, not at once: a loop over the joint "
+        "angle."
     )
     experiment: ClassVar[str] = (
         "Move each joint to and fro by amounts from a thousandth to a tenth of a rad."
@@ -149,10 +152,12 @@ class PreslidingHysteresis(JointTorqueEffect):
 @in_library
 @dataclass(frozen=True)
 class Backlash(JointTorqueEffect):
-    """Play between motor and link: when the torque changes sign the motor crosses the gap, and until then nothing reaches the link.
+    """Play between motor and link: when the torque changes sign the motor crosses the gap, and
+    until then nothing reaches the link.
 
-    In the gap the rotor turns against the link with the acceleration command / rotor_inertia; the link's own motion is left out, and so is
-    the impact at the other side. The step in which the gap closes counts in part.
+    In the gap the rotor turns against the link with the acceleration command / rotor_inertia; the
+    link's own motion is left out, and so is the impact at the other side. The step in which the gap
+    closes counts in part.
     """
 
     description: ClassVar[str] = (
@@ -205,7 +210,8 @@ class Backlash(JointTorqueEffect):
 
 
 def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-    """Result of `_crossings` for one step, (3, ...); the memory is offset and velocity at its start."""
+    """Result of `_crossings` for one step, (3, ...); the memory is offset and velocity at its
+    start."""
     arrays = np.broadcast_arrays(*motion.memory, motion.command, *nonlinear)
     offset, velocity, *step = (np.ascontiguousarray(array).reshape(1, -1) for array in arrays)
     return _crossings(offset[0], velocity[0], *step, motion.time_step).reshape(3, *arrays[0].shape)
@@ -220,8 +226,8 @@ def _crossings(
     inertia: np.ndarray,
     time_step: float,
 ) -> np.ndarray:
-    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step, and for which share of the step they were
-    free, (3, N, C).
+    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step, and
+    for which share of the step they were free, (3, N, C).
 
     Args:
         offset, velocity: at the start, (C,); the offset is within half the gap to either side.

@@ -25,7 +25,8 @@ JOINT_STATE, IMU, WRENCH = (
     "sensor_msgs/msg/Imu",
     "geometry_msgs/msg/WrenchStamped",
 )
-# What holds channels that have no standard message, and what our own files say beside their channels.
+# What holds channels that have no standard message, and what our own files say beside their
+# channels.
 ARRAY, METADATA = "std_msgs/msg/Float64MultiArray", "fbse_drake"
 # Channel -> field of the standard message.
 _JOINT_STATE_FIELDS = {
@@ -75,7 +76,8 @@ class Bag:
         """Channels of the standard messages, with the map's on top; what was left out, in words.
 
         Raises:
-            InputError: a topic that the map names is not there, it is not clear which is meant, or there are no joint positions.
+            InputError: a topic that the map names is not there, it is not clear which is meant, or
+                there are no joint positions.
         """
         present = {
             topic: connection.msgtype
@@ -110,7 +112,8 @@ class Bag:
             )
         if "joint/position" not in channels:
             raise InputError(
-                f"no {JOINT_STATE} topic, and no map names joint/position (topics: {listed(list(present))})"
+                f"no {JOINT_STATE} topic, and no map names joint/position (topics: "
+                f"{listed(list(present))})"
             )
         return channels, left_out
 
@@ -147,11 +150,13 @@ class Bag:
             name = f"foot/{side}/wrench"
             if side is None:
                 left_out.append(
-                    f"topic {topic}, a wrench, is left out: its name says neither left nor right; a map can"
+                    f"topic {topic}, a wrench, is left out: its name says neither left nor right; "
+                    "a map can"
                 )
             elif name in channels:
                 raise InputError(
-                    f"topics {channels[name].topic} and {topic} are both {side}; a map's key topics chooses"
+                    f"topics {channels[name].topic} and {topic} are both {side}; a map's key "
+                    "topics chooses"
                 )
             elif not (name in mapped and mapped[name].topic):
                 channels[name] = ChannelMap(topic=topic, columns=_WRENCH_FIELDS)
@@ -199,12 +204,14 @@ class Bag:
             for path in paths:
                 if not first.width(path):
                     raise InputError(
-                        f"topic {topic}: its messages have no numbers {path} (there are: {listed(list(first.numbers))})"
+                        f"topic {topic}: its messages have no numbers {path} (there are: "
+                        f"{listed(list(first.numbers))})"
                     )
             for joint in joints:
                 if names and joint not in names:
                     raise InputError(
-                        f"joints: {joint} is not in the messages of {topic} (there are: {listed(names)})"
+                        f"joints: {joint} is not in the messages of {topic} (there are: "
+                        f"{listed(names)})"
                     )
             widths = {path: len(joints) if names else first.width(path) for path in paths}
             topics[topic] = _Collected(widths, joints if names else [])
@@ -224,7 +231,8 @@ class Bag:
         for name, topic in topics.items():
             topic.decode(lambda raw, name=name: self._layout(name, raw))
         left_out = [
-            f"{topic.foreign} messages of {name} are left out: they have not all of the joints {listed(joints)}"
+            f"{topic.foreign} messages of {name} are left out: they have not all of the joints "
+            f"{listed(joints)}"
             for name, topic in topics.items()
             if topic.foreign
         ]
@@ -315,7 +323,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
             files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
             if len(files) != 1:
                 raise InputError(
-                    f"expected the folder of a bag, with a metadata.yaml or one bag file; found {len(files)} bag files"
+                    "expected the folder of a bag, with a metadata.yaml or one bag file; found "
+                    f"{len(files)} bag files"
                 )
             path = files[0]
         if not path.is_dir() and path.stat().st_size == 0:

@@ -68,9 +68,10 @@ def convert(paths: Sequence[Path], log_map: LogMap, *, progress: Progress = lamb
     then those are what the files are called, and files lie side by side in time, of which those
     without the joint positions are interpolated at the rows of the one that has them.
 
-    Rows that lack a number, and rows at the time of the row before, are left out. What was left out is said in `meta["findings"]`; the
-    stretch that each file became is in `meta["segments"]` ("start", "end" [s], "source", "recorded_start" [s], and the map's constants).
-    Time begins at zero.
+    Rows that lack a number, and rows at the time of the row before, are left out. What was left out
+    is said in `meta["findings"]`; the stretch that each file became is in `meta["segments"]`
+    ("start", "end" [s], "source", "recorded_start" [s], and the map's constants). Time begins at
+    zero.
 
     Args:
         log_map: what columns and topics mean; not needed for bags with standard messages.
@@ -284,7 +285,8 @@ def _in_rows(name: str, values: np.ndarray, samples: int) -> np.ndarray:
     rows = values[:, None] if values.ndim == 1 else values if len(values) == samples else values.T
     if len(rows) != samples:
         raise InputError(
-            f"column {name}: expected {samples} rows as in the time, found {' x '.join(map(str, values.shape))}"
+            f"column {name}: expected {samples} rows as in the time, found "
+            f"{' x '.join(map(str, values.shape))}"
         )
     return rows
 
@@ -348,7 +350,8 @@ def _later(time: np.ndarray) -> np.ndarray:
     if (steps < 0).any():
         row = int((steps < 0).argmax()) + 1
         raise InputError(
-            f"time runs backwards {int((steps < 0).sum())} times, first at row {row}: {time[row - 1]:.6f} s, then {time[row]:.6f} s"
+            f"time runs backwards {int((steps < 0).sum())} times, first at row {row}: "
+            f"{time[row - 1]:.6f} s, then {time[row]:.6f} s"
         )
     return np.concatenate([[True], steps > 0])
 
@@ -370,7 +373,8 @@ def _cleaned(recording: _Recording, log_map: LogMap) -> _Recording:
             raise InputError(f"no row has numbers in {name}")
         if not known.all():
             findings.append(
-                f"{int((~known).sum())} rows without numbers in {name} are left out (the first is row {int(known.argmin())})"
+                f"{int((~known).sum())} rows without numbers in {name} are left out (the first is "
+                f"row {int(known.argmin())})"
             )
         whole &= known
     rows = np.flatnonzero(whole)
@@ -400,7 +404,8 @@ def _check_period(time: np.ndarray, period: float | None) -> None:
     median = float(np.median(np.diff(time)))
     if period is not None and not 1 / _OTHER_UNIT < median / period < _OTHER_UNIT:
         raise InputError(
-            f"time: rows are {median:g} s apart, but the map's period is {period:g} s; is the time's unit right?"
+            f"time: rows are {median:g} s apart, but the map's period is {period:g} s; is the "
+            "time's unit right?"
         )
 
 
@@ -413,7 +418,8 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
         ):
             if ours != theirs:
                 raise InputError(
-                    f"{other.source}: cannot be one log with {first.source}: its {what} are {listed(theirs)}, not {listed(ours)}"
+                    f"{other.source}: cannot be one log with {first.source}: its {what} are "
+                    f"{listed(theirs)}, not {listed(ours)}"
                 )
     segments: list[dict[str, Any]] = []
     times, begin = [], 0.0

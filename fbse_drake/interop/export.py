@@ -41,10 +41,12 @@ def writer_for(path: Path) -> Callable[[Log, Path], None]:
 
 
 def write_mcap(log: Log, path: Path) -> None:
-    """Writes the sensors' channels as ROS 2 messages: sensor_msgs/JointState on /joint_states (effort is the commanded torque),
-    sensor_msgs/Imu on /imu and geometry_msgs/WrenchStamped on /foot/<side>/wrench, at the sole frame `<side>_sole`.
-    Every other channel becomes std_msgs/Float64MultiArray on the topic of its name, as /estimate/com/position.
-    The units are in the metadata of the topics, and what the log says beside its channels in the file's: it can be read back.
+    """Writes the sensors' channels as ROS 2 messages: sensor_msgs/JointState on /joint_states
+    (effort is the commanded torque), sensor_msgs/Imu on /imu and geometry_msgs/WrenchStamped on
+    /foot/<side>/wrench, at the sole frame `<side>_sole`. Every other channel becomes
+    std_msgs/Float64MultiArray on the topic of its name, as /estimate/com/position. The units are in
+    the metadata of the topics, and what the log says beside its channels in the file's: it can be
+    read back.
 
     Raises:
         InputError: times are negative, or it is not known where a foot's force sensors are.
@@ -177,7 +179,8 @@ def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[st
 
 
 def _wrench(log: Log, side: str) -> np.ndarray | None:
-    """Moment and force on a foot at its sole frame, in the sole frame, (N, 6) [Nm, N]; None where they were not measured."""
+    """Moment and force on a foot at its sole frame, in the sole frame, (N, 6) [Nm, N]; None where
+    they were not measured."""
     if f"foot/{side}/wrench" in log:
         return log[f"foot/{side}/wrench"]
     if f"foot/{side}/pad_force" not in log:

@@ -4,10 +4,12 @@
     time: {column: t, unit: ms}
     channels:
       joint/position: {columns: [q1, q2], unit: deg}
-      joint/torque_command: {columns: [i1, i2], gains: [0.091, -0.091]}    # motor current [A] times Nm/A
+      # Motor current [A] times Nm/A.
+      joint/torque_command: {columns: [i1, i2], gains: [0.091, -0.091]}
 
-A column that has several numbers in a row is meant with all of them (`q`), one (`q[0]`) or some (`q[0:3]`).
-Joints that share motors are combinations of columns, and what another file recorded is said by its name:
+A column that has several numbers in a row is meant with all of them (`q`), one (`q[0]`) or some
+(`q[0:3]`). Joints that share motors are combinations of columns, and what another file recorded is
+said by its name:
 
       joint/velocity: {columns: [m1, m2], matrix: [[0.5, 0.5], [0.5, -0.5]]}
       imu/angular_velocity: {topic: imu_*, columns: [wx, wy, wz]}
@@ -27,20 +29,22 @@ from fbse_drake.signals import channel_kind
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """Where the numbers of a channel come from: unit * (gain * gains_i * column_i [* times_i] + offsets_i), turned by the rotation.
+    """Where the numbers of a channel come from:
+    unit * (gain * gains_i * column_i [* times_i] + offsets_i), turned by the rotation.
 
     With a matrix, column_i stands for row i of it times all columns.
     """
 
-    # Of a bag; by default the one that has the channel's standard message. Of files of rows that lie
-    # side by side: what the file is called without its suffix, where `*` is any text.
+    # Of a bag; by default the one that has the channel's standard message. Of files of rows that
+    # lie side by side: what the file is called without its suffix, where `*` is any text.
     topic: str = ""
-    # One for each component, or fewer that have several numbers in a row. Of a message: a field, as `wrench.force`. An orientation
-    # is a quaternion [w, x, y, z] or roll, pitch and yaw.
+    # One for each component, or fewer that have several numbers in a row. Of a message: a field, as
+    # `wrench.force`. An orientation is a quaternion [w, x, y, z] or roll, pitch and yaw.
     columns: list[str] = field(default_factory=list)
     # The columns are multiplied by these: one, or as many.
     times: list[str] = field(default_factory=list)
-    # Columns that hold signed numbers of so many bits, recorded as if they had no sign; 0 if they do not.
+    # Columns that hold signed numbers of so many bits, recorded as if they had no sign; 0 if they
+    # do not.
     signed_bits: int = 0
     # One row of factors for each component, one factor in it for each column.
     matrix: list[list[float]] = field(default_factory=list)
@@ -50,7 +54,8 @@ class ChannelMap:
     offsets: list[float] = field(default_factory=list)
     # Of gain times column, and of the offsets; SI by default.
     unit: str = ""
-    # Of an IMU's or a foot's channel: roll, pitch and yaw of the recorded frame in the frame that the log wants [deg].
+    # Of an IMU's or a foot's channel: roll, pitch and yaw of the recorded frame in the frame that
+    # the log wants [deg].
     rotation_deg: list[float] = field(default_factory=list)
     # Of a foot's wrench: where it was recorded, origin in the sole frame [m].
     position: list[float] = field(default_factory=list)
@@ -63,7 +68,8 @@ class ChannelMap:
                 raise InputError(f"{key}: expected three numbers, found {len(getattr(self, key))}")
         if len(self.times) not in (0, 1, len(self.columns)):
             raise InputError(
-                f"times: expected one column or {len(self.columns)} as in columns, found {len(self.times)}"
+                f"times: expected one column or {len(self.columns)} as in columns, found "
+                f"{len(self.times)}"
             )
         if len(set(map(len, self.matrix))) > 1:
             raise InputError("matrix: its rows are not of one length")
@@ -105,7 +111,8 @@ class ChannelMap:
         for key in ("gains", "offsets"):
             if len(getattr(self, key)) not in (0, width):
                 raise InputError(
-                    f"{key}: expected {width} numbers, one for each component, found {len(getattr(self, key))}"
+                    f"{key}: expected {width} numbers, one for each component, found "
+                    f"{len(getattr(self, key))}"
                 )
         factor = si_factor(self.unit, unit, joint="n" in shape) if self.unit else 1.0
         if self.gain != 1.0 or factor != 1.0 or self.gains:
@@ -167,7 +174,8 @@ class TimeMap:
 class LogMap:
     """How a log is made of a recording."""
 
-    # Names, in the order of the log's columns. Needed for files; by default those of the JointState messages.
+    # Names, in the order of the log's columns. Needed for files; by default those of the JointState
+    # messages.
     joints: list[str] = field(default_factory=list)
     # What the same joints are called in JointState messages, if otherwise.
     recorded_joints: list[str] = field(default_factory=list)
@@ -197,7 +205,8 @@ class LogMap:
             raise InputError("joints: a name is given twice")
         if self.recorded_joints and len(self.recorded_joints) != len(self.joints):
             raise InputError(
-                f"recorded_joints: expected {len(self.joints)} names as in joints, found {len(self.recorded_joints)}"
+                f"recorded_joints: expected {len(self.joints)} names as in joints, found "
+                f"{len(self.recorded_joints)}"
             )
         if not self.time.column and self.period is None:
             raise InputError("period: needed where time has no column")
@@ -217,7 +226,8 @@ class LogMap:
 
 
 def load_map(name_or_path: str | Path) -> LogMap:
-    """Reads a map: a file, or one that ships with the package, as `real/emps` for `scenarios/real/emps.map.yaml`.
+    """Reads a map: a file, or one that ships with the package, as `real/emps` for
+    `scenarios/real/emps.map.yaml`.
 
     Raises:
         InputError: file not found, unknown key, wrong type, unit or channel.
@@ -237,6 +247,7 @@ def load_map(name_or_path: str | Path) -> LogMap:
             for path in shipped.rglob("*.map.yaml")
         )
         raise InputError(
-            f"{name_or_path}: no such file, and no such map in scenarios/ (there are: {', '.join(names)})"
+            f"{name_or_path}: no such file, and no such map in scenarios/ (there are: "
+            f"{', '.join(names)})"
         )
     return schema.build(LogMap, schema.load_tree(file), file=str(file))

@@ -1,7 +1,8 @@
 """Where the numbers of a ROS message stand in its bytes.
 
-Messages of one topic have the same layout as long as their texts and the lengths of their lists stay the same. It is worked out once and
-then whole blocks of messages are decoded at a time, which is some twenty times faster than one message object after another.
+Messages of one topic have the same layout as long as their texts and the lengths of their lists
+stay the same. It is worked out once and then whole blocks of messages are decoded at a time, which
+is some twenty times faster than one message object after another.
 """
 
 import struct
@@ -40,7 +41,8 @@ class Layout:
     """The layout of a message of `size` bytes."""
 
     size: int
-    # Field, as `wrench.force.x` -> type and places of its numbers. Fields of all elements of a list have one name.
+    # Field, as `wrench.force.x` -> type and places of its numbers. Fields of all elements of a list
+    # have one name.
     numbers: dict[str, tuple[np.dtype, np.ndarray]]
     texts: dict[str, list[str]]
     # Places of the bytes that decide on the layout, and these bytes.
@@ -89,7 +91,8 @@ class Layout:
         )
 
     def encode(self, raw: bytes, fields: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Copies of a message of this layout with other numbers in some fields, (B, k) each -> bytes (B, size)."""
+        """Copies of a message of this layout with other numbers in some fields, (B, k)
+        each -> bytes (B, size)."""
         block = np.tile(np.frombuffer(raw, np.uint8), (len(next(iter(fields.values()))), 1))
         for path, values in fields.items():
             first = 0
@@ -115,7 +118,8 @@ class _Walk:
         if cdr and raw[:2] not in (b"\0\0", b"\0\1"):
             raise ValueError("an unknown encapsulation")
         self.raw, self.definitions, self.cdr = raw, definitions, cdr
-        # CDR has four bytes in front that say how it is encoded; numbers stand at multiples of their size after these.
+        # CDR has four bytes in front that say how it is encoded; numbers stand at multiples of
+        # their size after these.
         self.position = 4 if cdr else 0
         self.order = ">" if cdr and raw[1] == 0 else "<"
         self.numbers: dict[str, tuple[np.dtype, list[np.ndarray]]] = {}

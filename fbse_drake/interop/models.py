@@ -1,7 +1,8 @@
 """A robot's model, with what was found of it, as files of other programs: URDF and MJCF (MuJoCo).
 
-Both have the bodies with their inertia, as added masses and moved joints have changed it, rotor inertia, viscous friction and Coulomb
-friction. What they cannot say, as a delay of a torque, stands in a comment. Shapes are left out: they are in the original.
+Both have the bodies with their inertia, as added masses and moved joints have changed it, rotor
+inertia, viscous friction and Coulomb friction. What they cannot say, as a delay of a torque, stands
+in a comment. Shapes are left out: they are in the original.
 """
 
 from collections.abc import Iterator
@@ -51,7 +52,8 @@ class Axis:
 
 @dataclass(frozen=True)
 class Link:
-    """A body L and the joint that carries it. Its frame is that of the joint, which in Drake's plant may be another than the body's."""
+    """A body L and the joint that carries it. Its frame is that of the joint, which in Drake's
+    plant may be another than the body's."""
 
     name: str
     # In L; None for a body without mass.
@@ -234,7 +236,8 @@ def _inertia(robot: Robot, body: RigidBody, X_BL: RigidTransform) -> SpatialIner
 
 
 def _central(inertia: SpatialInertia) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass, (3,) [m], and moments and products of inertia about it, xx, yy, zz, xy, xz, yz, (6,) [kg m^2]."""
+    """Centre of mass, (3,) [m], and moments and products of inertia about it, xx, yy, zz, xy, xz,
+    yz, (6,) [kg m^2]."""
     com = inertia.get_com()
     central = inertia.Shift(com).CalcRotationalInertia()
     return np.array(com), np.concatenate([central.get_moments(), central.get_products()])

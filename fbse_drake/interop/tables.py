@@ -123,7 +123,8 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     array = np.asarray(values)
     if array.dtype.kind not in "fiub" or array.ndim not in (1, 2):
         raise InputError(
-            f"column {name}: expected numbers in rows, found an array of {array.dtype} with {array.ndim} dimensions"
+            f"column {name}: expected numbers in rows, found an array of {array.dtype} with "
+            f"{array.ndim} dimensions"
         )
     return array.astype(float, copy=False)
 
@@ -254,7 +255,8 @@ def _open_json(path: Path, records: str) -> Table:
         lists = [key for key in lists if key == records]
     if len(lists) != 1:
         raise InputError(
-            f"expected one list of records{records and f' under {records}'}, found {listed(lists)}; the map's key records names one"
+            f"expected one list of records{records and f' under {records}'}, found "
+            f"{listed(lists)}; the map's key records names one"
         )
     rows = content[lists[0]]
     names = list(rows[0])
@@ -284,7 +286,8 @@ def _json_number(row: Any, name: str, number: int) -> Any:
 def _open_mat(path: Path) -> Table:
     if h5py.is_hdf5(path):
         return _open_hdf5(path)
-    # Some damaged files crash scipy's parser (1.17: one in fifty with a few wrong bytes), so it gets a process of its own.
+    # Some damaged files crash scipy's parser (1.17: one in fifty with a few wrong bytes), so it
+    # gets a process of its own.
     with ProcessPoolExecutor(1, mp_context=get_context("fork")) as process:
         try:
             content = process.submit(_load_mat, path).result()

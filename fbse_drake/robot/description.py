@@ -1,4 +1,5 @@
-"""What the project must know of a robot beyond its model file: names of its base, legs, feet and sensors."""
+"""What the project must know of a robot beyond its model file: names of its base, legs, feet and
+sensors."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -22,19 +23,21 @@ class Leg:
     joints: list[str]
     # Body that carries the sole and the force sensors.
     foot: str
-    # Frame: z up, origin on the ground when the foot is flat. Of a point foot: in the point, z up as it mostly stands.
+    # Frame: z up, origin on the ground when the foot is flat. Of a point foot: in the point, z up
+    # as it mostly stands.
     sole: str
-    # A foot with 3-axis force sensors: the fixed joints that hold its pads, parallel to the sole frame. One alone makes a point
-    # foot, which may turn while it stands.
+    # A foot with 3-axis force sensors: the fixed joints that hold its pads, parallel to the sole
+    # frame. One alone makes a point foot, which may turn while it stands.
     pads: list[str] = field(default_factory=list)
-    # A foot with a six-axis sensor instead: where it meets the ground, points in the sole frame [m].
-    # One alone, the origin, makes a point foot with a three-axis sensor.
+    # A foot with a six-axis sensor instead: where it meets the ground, points in the sole
+    # frame [m]. One alone, the origin, makes a point foot with a three-axis sensor.
     corners: list[list[float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if bool(self.pads) == bool(self.corners):
             raise InputError(
-                "pads: expected either these (3-axis force sensors) or corners (of a foot with a six-axis sensor)"
+                "pads: expected either these (3-axis force sensors) or corners (of a foot with a "
+                "six-axis sensor)"
             )
         for point in self.corners:
             if len(point) != 3:
@@ -84,13 +87,15 @@ class AddedFrame:
 class RobotDescription:
     """Names of a robot's parts in its model; read from YAML by `load_description`.
 
-    A robot has legs, further joints, or both. Joints of the model that are not named are held where `held` says.
+    A robot has legs, further joints, or both. Joints of the model that are not named are held where
+    `held` says.
     """
 
     # Root of the robot: floats unless `fixed_base` is true or a scenario hangs it in a gantry.
     base: str
-    # The model: Drake model directives, or a URDF whose shapes are not needed. Relative to the description's file; may begin with
-    # an environment variable, as ${FBSE_DATA_DIR}/ur10/ur10_robot.urdf.
+    # The model: Drake model directives, or a URDF whose shapes are not needed. Relative to the
+    # description's file; may begin with an environment variable, as
+    # ${FBSE_DATA_DIR}/ur10/ur10_robot.urdf.
     directives: str = ""
     urdf: str = ""
     fixed_base: bool = False
@@ -101,8 +106,8 @@ class RobotDescription:
     legs: dict[str, Leg] = field(default_factory=dict)
     # Further joints: of arms, of a torso, of a machine that has no legs.
     joints: list[str] = field(default_factory=list)
-    # Angles near which the legs stand [rad], by joint or by what it is called in `leg_joints`: they say
-    # which way knees bend. By default the middle of the joints' ranges.
+    # Angles near which the legs stand [rad], by joint or by what it is called in `leg_joints`: they
+    # say which way knees bend. By default the middle of the joints' ranges.
     stance: dict[str, float] = field(default_factory=dict)
     # Angles [rad] (or places [m]) of joints that are not named above; 0 by default.
     held: dict[str, float] = field(default_factory=dict)
@@ -115,7 +120,8 @@ class RobotDescription:
         for side, leg in self.legs.items():
             if len(leg.joints) != len(self.leg_joints):
                 raise InputError(
-                    f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, found {len(leg.joints)}"
+                    f"legs.{side}.joints: expected {len(self.leg_joints)} names as in leg_joints, "
+                    f"found {len(leg.joints)}"
                 )
         twice = [name for name, count in Counter(self.joint_names).items() if count > 1]
         if twice:
@@ -125,12 +131,14 @@ class RobotDescription:
 
     @cached_property
     def joint_names(self) -> list[str]:
-        """Model names of all joints, in the order of every joint vector and log column: leg by leg, then the further ones."""
+        """Model names of all joints, in the order of every joint vector and log column: leg by leg,
+        then the further ones."""
         return [*(name for leg in self.legs.values() for name in leg.joints), *self.joints]
 
     @cached_property
     def roles(self) -> list[str]:
-        """What each joint is called in a scenario beside its name: a joint of a leg as in `leg_joints`."""
+        """What each joint is called in a scenario beside its name: a joint of a leg as in
+        `leg_joints`."""
         return [*(role for _ in self.legs for role in self.leg_joints), *self.joints]
 
     @property
@@ -147,7 +155,8 @@ class RobotDescription:
     def per_joint(
         self, values: Mapping[str, float], *, key: str, default: float | None = None
     ) -> np.ndarray:
-        """A value for each joint, shape (n,), from `{all: ..., <leg joint>: ..., <joint>: ...}`; the more special key wins.
+        """A value for each joint, shape (n,), from `{all: ..., <leg joint>: ..., <joint>: ...}`;
+        the more special key wins.
 
         Raises:
             InputError: unknown joint, or (without a default) a joint that has no value.

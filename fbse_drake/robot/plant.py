@@ -52,10 +52,11 @@ _CORNER_RADIUS, _CORNER_STIFFNESS = 1e-9, 1e12
 
 @dataclass(frozen=True)
 class Stairs:
-    """Steps across the world's x axis, as wide as the ground; before the first and beyond the last it is even."""
+    """Steps across the world's x axis, as wide as the ground; before the first and beyond the last
+    it is even."""
 
-    # Where the first step begins [m], how far it is from one to the next [m], how far each is above the one before (below
-    # it, if negative) [m], and how many there are.
+    # Where the first step begins [m], how far it is from one to the next [m], how far each is above
+    # the one before (below it, if negative) [m], and how many there are.
     begin: float
     depth: float
     rise: float
@@ -67,16 +68,18 @@ class Stairs:
 
 @dataclass(frozen=True)
 class Ground:
-    """Flat ground with point contact. The world's frame is fixed to it: its surface is z = 0 also where it slopes, but for
-    its stairs."""
+    """Flat ground with point contact. The world's frame is fixed to it: its surface is z = 0 also
+    where it slopes, but for its stairs."""
 
     # Coulomb friction coefficient of the ground's surface; the pads' own is in the robot's model.
     friction: float = 0.8
-    # Contact stiffness [N/m] and Hunt-Crossley dissipation [s/m] of one point. A foot of 5.5 kg that lands at millimetres per second
-    # bounces for a tenth of a second below some 20 s/m, and then slips; 100 s/m is a rubber sole.
+    # Contact stiffness [N/m] and Hunt-Crossley dissipation [s/m] of one point. A foot of 5.5 kg
+    # that lands at millimetres per second bounces for a tenth of a second below some 20 s/m, and
+    # then slips; 100 s/m is a rubber sole.
     stiffness: float = 1.0e6
     dissipation: float = 100.0
-    # Rotation vector, about world x and y, that tilts it from level [rad]. A robot in a gantry hangs level all the same.
+    # Rotation vector, about world x and y, that tilts it from level [rad]. A robot in a gantry
+    # hangs level all the same.
     slope: list[float] = field(default_factory=lambda: [0.0, 0.0])
     stairs: Stairs | None = None
 
@@ -89,7 +92,8 @@ class Ground:
 
 @dataclass(frozen=True)
 class PointMass:
-    """A mass fixed to a body B at one point, beside the mass that the robot's model gives the body."""
+    """A mass fixed to a body B at one point, beside the mass that the robot's model gives the
+    body."""
 
     body: str
     # May be negative [kg].
@@ -107,7 +111,8 @@ class PointMass:
 
 @dataclass(frozen=True)
 class Robot:
-    """A finalized plant together with its description. Joint vectors have the description's order, shape (n,)."""
+    """A finalized plant together with its description. Joint vectors have the description's order,
+    shape (n,)."""
 
     plant: MultibodyPlant
     description: RobotDescription
@@ -155,7 +160,8 @@ class Robot:
         """Raises InputError where there is none of this name that has a mass."""
         if name not in self.body_names:
             raise InputError(
-                f"{name}: the model has no body of this name with a mass (there are: {', '.join(self.body_names)})"
+                f"{name}: the model has no body of this name with a mass (there are: "
+                f"{', '.join(self.body_names)})"
             )
         return self.plant.GetBodyByName(name)
 
@@ -176,18 +182,20 @@ class Robot:
         return self.plant.GetFrameByName(self.description.legs[side].sole)
 
     def pad_positions(self, side: str) -> np.ndarray:
-        """Places in the sole frame F where the ground's force is known: the foot's force sensors, or the corners of a foot with a
-        six-axis sensor, shape (points, 3) [m]."""
+        """Places in the sole frame F where the ground's force is known: the foot's force sensors,
+        or the corners of a foot with a six-axis sensor, shape (points, 3) [m]."""
         leg = self.description.legs[side]
         return np.array(leg.corners or [X_FP.translation() for X_FP in self._pad_poses(side)])
 
     @cached_property
     def grasp_maps(self) -> list[np.ndarray]:
-        """Of each foot, from the forces at these places to the wrench, (6, 3 points) each; see `grasp_map`."""
+        """Of each foot, from the forces at these places to the wrench, (6, 3 points) each; see
+        `grasp_map`."""
         return [grasp_map(self.pad_positions(side)) for side in self.description.sides]
 
     def pad_joints(self, side: str) -> list[Joint]:
-        """The fixed joints through which the ground's force passes at these places. (Corners have them only on a ground.)"""
+        """The fixed joints through which the ground's force passes at these places. (Corners have
+        them only on a ground.)"""
         leg = self.description.legs[side]
         return [self.plant.GetJointByName(name) for name in leg.pads or _corner_joints(side, leg)]
 
@@ -212,7 +220,8 @@ class Robot:
 
     @cached_property
     def joint_state_selector(self) -> np.ndarray:
-        """Matrix that takes the plant's state to [joint positions, joint velocities], shape (2n, state)."""
+        """Matrix that takes the plant's state to [joint positions, joint velocities], shape
+        (2n, state)."""
         columns = np.concatenate(
             [self.position_index, self.plant.num_positions() + self.velocity_index]
         )
@@ -228,7 +237,8 @@ class Robot:
 
     @cached_property
     def clamp_selector(self) -> np.ndarray:
-        """Matrix that takes the offsets of all clamps, row by row, to the actuation vector, shape (actuators, m n)."""
+        """Matrix that takes the offsets of all clamps, row by row, to the actuation vector, shape
+        (actuators, m n)."""
         selector = np.zeros((self.plant.num_actuators(), self.implicit.limit.size))
         for k, clamp in self._clamps:
             selector[clamp.input_start(), k] = -1.0
@@ -236,7 +246,8 @@ class Robot:
 
     @cached_property
     def clamp_index(self) -> np.ndarray:
-        """Place of each joint's clamps in the plant's net actuation, or -1 for a joint without, shape (n,).
+        """Place of each joint's clamps in the plant's net actuation, or -1 for a joint without,
+        shape (n,).
 
         Drake reports the torque of all clamps of a joint together, at each of them.
         """
@@ -281,7 +292,8 @@ class Robot:
         Args:
             q, v: joint positions [rad] and velocities [rad/s], shape (n,).
             X_WB: pose of a floating base.
-            V_WB: its spatial velocity [angular, linear] in world axes, shape (6,) [rad/s, m/s]; at rest by default.
+            V_WB: its spatial velocity [angular, linear] in world axes, shape (6,) [rad/s, m/s]; at
+                rest by default.
         """
         velocities = np.zeros(self.plant.num_velocities())
         velocities[self.velocity_index] = v
@@ -299,8 +311,8 @@ def is_point_mass(body: RigidBody) -> bool:
 
 
 def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
-    """Matrix that takes the forces on all pads of a foot, [x, y, z] pad by pad, to the wrench [moment, force] at the sole's origin in the
-    sole frame.
+    """Matrix that takes the forces on all pads of a foot, [x, y, z] pad by pad, to the
+    wrench [moment, force] at the sole's origin in the sole frame.
 
     Args:
         pad_positions: (pads, 3) [m].
@@ -340,16 +352,19 @@ def make_robot(
         description: name or path of a robot description (`models/*.yaml`).
         rotor_inertia: reflected rotor inertia [kg m^2] by joint, see `RobotDescription.per_joint`.
         point_masses: further masses on bodies of the model.
-        joint_shifts: how far joints are moved in the frames of the bodies that carry them, (3,) [m], by joint.
-        gantry_height: hangs the base in a gantry: welds it to the world at this height [m], upright.
-        builder: the diagram that gets the plant and its scene graph; by default one that is thrown away, which is what a
-            model needs that is only computed with.
+        joint_shifts: how far joints are moved in the frames of the bodies that carry them,
+            (3,) [m], by joint.
+        gantry_height: hangs the base in a gantry: welds it to the world at this height [m],
+            upright.
+        builder: the diagram that gets the plant and its scene graph; by default one that is thrown
+            away, which is what a model needs that is only computed with.
         config: Drake's plant settings.
         ground: ground at z = 0; without it there is none.
         implicit: losses of the joints that the plant's solver takes; by default none.
 
     Raises:
-        InputError: unknown file, joint, frame, body or pad; point masses that leave a body with an impossible inertia.
+        InputError: unknown file, joint, frame, body or pad; point masses that leave a body with an
+            impossible inertia.
     """
     names, path = load_description(description)
     diagram = builder or DiagramBuilder()
@@ -393,7 +408,8 @@ def make_robot(
                 )
     if robot.has_floating_base and robot.imu.body() not in plant.GetBodiesWeldedTo(robot.base):
         raise InputError(
-            f"{path}: imu: {names.imu} moves against {names.base}; expected a frame that is fixed to it"
+            f"{path}: imu: {names.imu} moves against {names.base}; expected a frame that is fixed "
+            "to it"
         )
     return robot, scene_graph
 
@@ -418,8 +434,9 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
         raise InputError(f"{key}: {reason}") from None
 
 
-# What is not taken from a URDF: shapes, whose meshes need not be there; friction, which is an effect; actuators, which every joint has that
-# is named; and that one joint mimics another, for what is not named is held.
+# What is not taken from a URDF: shapes, whose meshes need not be there; friction, which is an
+# effect; actuators, which every joint has that is named; and that one joint mimics another, for
+# what is not named is held.
 _NOT_TAKEN = ("visual", "collision", "dynamics", "transmission", "mimic")
 
 
@@ -508,7 +525,8 @@ def _check_names(plant: MultibodyPlant, names: RobotDescription) -> None:
         if joint not in single or joint in names.joint_names:
             others = ", ".join(name for name in single if name not in names.joint_names) or "none"
             raise InputError(
-                f"held.{joint}: expected a joint of the model that is not named elsewhere (there are: {others})"
+                f"held.{joint}: expected a joint of the model that is not named elsewhere (there "
+                f"are: {others})"
             )
 
 
@@ -527,7 +545,8 @@ def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
             X_FM = RigidTransform(place * joint.translation_axis())
         else:
             raise InputError(
-                f"joint {joint.name()} is {joint.type_name()}: expected only revolute and prismatic joints"
+                f"joint {joint.name()} is {joint.type_name()}: expected only revolute and "
+                "prismatic joints"
             )
         parent, child = joint.frame_on_parent(), joint.frame_on_child()
         plant.RemoveJoint(joint)
@@ -535,7 +554,8 @@ def _hold_other_joints(plant: MultibodyPlant, names: RobotDescription) -> None:
 
 
 def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> None:
-    """Moves joints in the frames of the bodies that carry them; they lose their actuators, which every named joint gets anyhow."""
+    """Moves joints in the frames of the bodies that carry them; they lose their actuators, which
+    every named joint gets anyhow."""
     for name, shift in shifts.items():
         joint, body = plant.GetJointByName(name), plant.GetJointByName(name).parent_body()
         X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
@@ -567,7 +587,8 @@ def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> No
 def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) -> None:
     """Gives every named joint an actuator and its rotor inertia.
 
-    Damping and limits of torque that the model file has are dropped: friction is an effect, and torque is limited by the controller.
+    Damping and limits of torque that the model file has are dropped: friction is an effect, and
+    torque is limited by the controller.
     """
     actuators = _actuators(plant)
     for name, inertia in rotor_inertia.items():
@@ -596,8 +617,8 @@ def _add_point_masses(
 ) -> None:
     instance = plant.GetBodyByName(names.base).model_instance()
     inertias: dict[str, SpatialInertia] = {}
-    # One carrier for all that is added to a body, one for all that is taken away. What takes mass away comes last: Drake does not add to a
-    # composite without mass.
+    # One carrier for all that is added to a body, one for all that is taken away. What takes mass
+    # away comes last: Drake does not add to a composite without mass.
     carried: dict[tuple[str, bool], SpatialInertia] = {}
     for point in sorted(point_masses, key=lambda point: -point.mass):
         if not plant.HasBodyNamed(point.body, instance):
@@ -622,7 +643,8 @@ def _add_point_masses(
     for name, inertia in inertias.items():
         if not inertia.IsPhysicallyValid():
             raise InputError(
-                f"{name}: expected the inertia of a body, found one that no distribution of mass has"
+                f"{name}: expected the inertia of a body, found one that no distribution of mass "
+                "has"
             )
 
 
@@ -631,7 +653,8 @@ def _corner_joints(side: str, leg: Leg) -> list[str]:
 
 
 def _add_corners(plant: MultibodyPlant, side: str, leg: Leg, ground: Ground) -> None:
-    """Lets a foot that has no pads meet the ground: each corner is a massless body, as the pads of other feet are."""
+    """Lets a foot that has no pads meet the ground: each corner is a massless body, as the pads of
+    other feet are."""
     properties = ProximityProperties()
     AddContactMaterial(
         properties=properties,
@@ -663,7 +686,8 @@ def _add_ground(plant: MultibodyPlant, ground: Ground) -> None:
         edges = stairs.begin + stairs.depth * np.arange(stairs.count)
         if not -size / 2 < edges[0] <= edges[-1] < size / 2:
             raise InputError(
-                f"stairs: expected them within {size / 2:g} m of the origin, found {edges[0]:g} to {edges[-1]:g} m"
+                f"stairs: expected them within {size / 2:g} m of the origin, found {edges[0]:g} to "
+                f"{edges[-1]:g} m"
             )
         begins, ends = [-size / 2, *edges], [*edges, size / 2]
         parts = zip(begins, ends, stairs.rise * np.arange(stairs.count + 1), strict=True)

@@ -38,8 +38,8 @@ class Proposal:
 def propose(urdf: Path, file: str) -> Proposal:
     """A description of the robot of a URDF.
 
-    Two legs of six joints become legs with soles, two or three pairs of legs of three joints legs on
-    point feet; of every other robot all joints become `joints`.
+    Two legs of six joints become legs with soles, two or three pairs of legs of three joints legs
+    on point feet; of every other robot all joints become `joints`.
 
     Args:
         urdf: its file.
@@ -87,8 +87,10 @@ def _on_soles(
     legs.sort(key=lambda leg: (_named_side(leg), -leg.hip[1]))
     if legs[0].hip[1] < legs[1].hip[1]:
         raise InputError(
-            f"{model.urdf}: {legs[0].joints[0].name()} is on the right of {model.base.name()}, whose axes "
-            "must point forwards (x) and up (z): fix a frame with such axes to it and make it the root"
+            f"{model.urdf}: {legs[0].joints[0].name()} is on the right of {model.base.name()}, "
+            "whose axes "
+            "must point forwards (x) and up (z): fix a frame with such axes to it and make it the "
+            "root"
         )
     sides = ("left", "right")
     soles = [_sole(model, leg, side) for leg, side in zip(legs, sides, strict=True)]

@@ -17,7 +17,8 @@ def link_points(link: Element, kind: str, urdf: Path, axes: np.ndarray) -> np.nd
         link: of a URDF.
         kind: of its shapes, collision or visual.
         urdf: its file, near which meshes are looked for.
-        axes: of the directions in which a sphere's points are taken, columns in the link's frame, (3, 3).
+        axes: of the directions in which a sphere's points are taken, columns in the link's frame,
+            (3, 3).
 
     Returns:
         Shape (N, 3) [m]; N is 0 for a link without shapes.

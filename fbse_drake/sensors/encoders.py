@@ -45,7 +45,8 @@ class EncoderConfig(Sensor):
     resolution: float = 0.0
     # Standard deviation of the angle before it is rounded [rad].
     noise: float = 0.0
-    # How the velocity is had: `exact` (a tachometer with `velocity_noise`) or `differenced` from two readings.
+    # How the velocity is had: `exact` (a tachometer with `velocity_noise`) or `differenced` from
+    # two readings.
     velocity: str = "exact"
     # Standard deviation of an `exact` velocity [rad/s].
     velocity_noise: float = 0.0
@@ -137,8 +138,9 @@ class EncoderReadings(LeafSystem):
         output_ports:
         - measured_joint_state
 
-    Both are [positions, velocities], shape (2n,) [rad, rad/s]. The output is the reading of the present tick (it is meant to be
-    sampled at the encoders' ticks). Discrete state: the reading of the last tick, for a differenced velocity.
+    Both are [positions, velocities], shape (2n,) [rad, rad/s]. The output is the reading of the
+    present tick (it is meant to be sampled at the encoders' ticks). Discrete state: the reading of
+    the last tick, for a differenced velocity.
     """
 
     def __init__(self, config: EncoderConfig, joints: int):

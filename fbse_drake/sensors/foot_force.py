@@ -107,7 +107,8 @@ def _by_foot(
 
 
 def wrench_deviations(config: FootForceConfig, robot: Robot) -> list[np.ndarray]:
-    """Standard deviation of the noise in the wrench [moment, force] that is measured on each sole, shape (6,) each [Nm, N]."""
+    """Standard deviation of the noise in the wrench [moment, force] that is measured on each sole,
+    shape (6,) each [Nm, N]."""
     six_axis = np.repeat([config.moment_noise, config.noise], 3)
     legs = robot.description.legs.values()
     return [
@@ -136,7 +137,8 @@ def force_noise(
 
 
 class PadForces(LeafSystem):
-    """Picks the force of the ground on each pad, in the axes of its sole frame: what the pad's fixed joint transmits.
+    """Picks the force of the ground on each pad, in the axes of its sole frame: what the pad's
+    fixed joint transmits.
 
     .. pydrake_system::
 
@@ -195,7 +197,8 @@ class NoFeet(Diagram):
 
 
 class FootForceSensors(Diagram):
-    """Measures the force of the ground on each pad, or the wrench on the sole of a foot with a six-axis sensor.
+    """Measures the force of the ground on each pad, or the wrench on the sole of a foot with a
+    six-axis sensor.
 
     .. pydrake_system::
 
@@ -206,9 +209,10 @@ class FootForceSensors(Diagram):
         - true_pad_force
         - measured_pad_force
 
-    Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's attitude at the start of that step;
-    a delayed sensor reads zero at first. A measured wrench [moment, force] at the sole's origin comes out as the smallest forces at the
-    foot's corners that have this wrench, see `corner_forces`.
+    Outputs as that of `PadForces`. The force is that of the plant's last step, with the foot's
+    attitude at the start of that step; a delayed sensor reads zero at first. A measured
+    wrench [moment, force] at the sole's origin comes out as the smallest forces at the foot's
+    corners that have this wrench, see `corner_forces`.
     """
 
     def __init__(
@@ -252,7 +256,8 @@ class FootForceSensors(Diagram):
             builder.Connect(read, wrenches.get_input_port())
             read = wrenches.get_output_port()
         if config.delay > 0:
-            # A discrete update sees the next step's force already, and its delay is read one step later: both together are even.
+            # A discrete update sees the next step's force already, and its delay is read one step
+            # later: both together are even.
             steps = round(config.delay / time_step)
             late = builder.AddNamedSystem("late", DiscreteTimeDelay(time_step, steps, size))
             builder.Connect(read, late.get_input_port())

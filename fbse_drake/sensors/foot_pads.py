@@ -57,7 +57,8 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
         if pads in log:
             if log[pads].shape[1] != leg.points:
                 raise InputError(
-                    f"channel {pads}: expected {leg.points} pads as in the model, found {log[pads].shape[1]}"
+                    f"channel {pads}: expected {leg.points} pads as in the model, found "
+                    f"{log[pads].shape[1]}"
                 )
             forces.append(log[pads])
         elif wrench in log:
@@ -68,7 +69,8 @@ def measured_pad_forces(robot: Robot, log: Log) -> np.ndarray:
 
 
 def leg_of_joint(robot: Robot) -> np.ndarray:
-    """Which leg each joint belongs to, shape (n,); -1 for a joint that is no leg's: what is asked of its leg is then asked of the last."""
+    """Which leg each joint belongs to, shape (n,); -1 for a joint that is no leg's: what is asked
+    of its leg is then asked of the last."""
     legs = list(robot.description.legs.values())
     return np.array(
         [
@@ -96,7 +98,8 @@ def vertical_loads(force: np.ndarray, pad_foot: np.ndarray, feet: int) -> np.nda
 def foot_wrenches(
     force: np.ndarray, pad_position: np.ndarray, pad_foot: np.ndarray, feet: int
 ) -> np.ndarray:
-    """Wrench [moment, force] on each foot at the sole's origin in the sole frame, shape (feet, 6) [Nm, N].
+    """Wrench [moment, force] on each foot at the sole's origin in the sole frame, shape
+    (feet, 6) [Nm, N].
 
     Args:
         force: on each pad, shape (P, 3) [N].

@@ -69,7 +69,8 @@ class ImuConfig(Sensor):
 
 
 def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:
-    """What is added to the ideal signals at each tick, shape (ticks, 6) [m/s^2, rad/s]: bias, its random walk, white noise."""
+    """What is added to the ideal signals at each tick, shape (ticks, 6) [m/s^2, rad/s]: bias, its
+    random walk, white noise."""
     ticks = ticks_until(duration, config.period)
     noise = np.repeat([config.acceleration_noise, config.angular_velocity_noise], 3)
     walk = np.repeat(
@@ -93,8 +94,9 @@ class Imu(Diagram):
         output_ports:
         - measured_imu
 
-    `measured_imu` is [specific force (3) [m/s^2], angular velocity (3) [rad/s]] in the IMU frame. The acceleration is that of the plant's
-    last step, from its velocity before to its velocity after.
+    `measured_imu` is [specific force (3) [m/s^2], angular velocity (3) [rad/s]] in the IMU frame.
+    The acceleration is that of the plant's last step, from its velocity before to its velocity
+    after.
     """
 
     def __init__(self, config: ImuConfig, robot: Robot, seed: int, duration: float):

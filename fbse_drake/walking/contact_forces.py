@@ -1,4 +1,5 @@
-"""Forces of the ground on many feet that together have one wrench: a quadratic program at each instant."""
+"""Forces of the ground on many feet that together have one wrench: a quadratic program at each
+instant."""
 
 import numpy as np
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
@@ -14,8 +15,8 @@ _LEAST_WEIGHT, _LEAST_FORCE = 1e-9, 1e-6
 
 
 def foot_weights(plan: TaskPlan) -> np.ndarray:
-    """How much each foot is to carry, (N, feet), each in [0, 1]: 1 while it stands and others swing,
-    0 while it swings, and in between it takes over or is relieved smoothly."""
+    """How much each foot is to carry, (N, feet), each in [0, 1]: 1 while it stands and others
+    swing, 0 while it swings, and in between it takes over or is relieved smoothly."""
     weights = np.zeros((len(plan.time), len(plan.feet)))
     for k, side in enumerate(plan.feet):
         # Nothing is known of what was before the first phase and comes after the last.

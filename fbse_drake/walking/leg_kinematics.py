@@ -1,8 +1,9 @@
-"""Kinematics of a leg of n revolute joints, whatever their axes: six that turn and move a flat foot, or three that move a point foot.
+"""Kinematics of a leg of n revolute joints, whatever their axes: six that turn and move a flat
+foot, or three that move a point foot.
 
-A leg with hip yaw, roll, pitch in one point, knee pitch, and ankle pitch, roll in one point has a closed inverse; any other is
-inverted by Newton's method. All functions work on arrays over time. B is the base frame, F the sole frame; quantities are expressed
-in B's axes.
+A leg with hip yaw, roll, pitch in one point, knee pitch, and ankle pitch, roll in one point has a
+closed inverse; any other is inverted by Newton's method. All functions work on arrays over time. B
+is the base frame, F the sole frame; quantities are expressed in B's axes.
 """
 
 from collections.abc import Iterator
@@ -43,10 +44,12 @@ class LegMotion:
     # Sole: rotation (N, 3, 3), position (N, 3) [m].
     R_BF: np.ndarray
     p_BF: np.ndarray
-    # Jacobian of the sole's spatial velocity [angular, linear], (N, 6, n), and its rate times the joint velocity, (N, 6).
+    # Jacobian of the sole's spatial velocity [angular, linear], (N, 6, n), and its rate times the
+    # joint velocity, (N, 6).
     J: np.ndarray
     Jdot_v: np.ndarray
-    # First moment of mass (mass times centre of mass), (N, 3) [kg m], with Jacobian (N, 3, n) and bias (N, 3).
+    # First moment of mass (mass times centre of mass), (N, 3) [kg m], with Jacobian (N, 3, n) and
+    # bias (N, 3).
     moment: np.ndarray
     J_moment: np.ndarray
     Jdot_v_moment: np.ndarray
@@ -54,26 +57,30 @@ class LegMotion:
 
 @dataclass(frozen=True)
 class LegKinematics:
-    """Geometry and masses of one leg, read from the plant by `from_robot`; all vectors in B's axes, in the zero posture."""
+    """Geometry and masses of one leg, read from the plant by `from_robot`; all vectors in B's axes,
+    in the zero posture."""
 
     # Unit axes of the joints, from hip to foot, shape (n, 3).
     axes: np.ndarray
-    # First joint in B; then from joint to joint, last from the last joint to the sole; shape (n + 1, 3) [m].
+    # First joint in B; then from joint to joint, last from the last joint to the sole; shape
+    # (n + 1, 3) [m].
     offsets: np.ndarray
     # Attitude of the sole, R_BF, shape (3, 3).
     sole: np.ndarray
-    # Mass that moves with each joint but not the next [kg], (n,), and its centre from the joint, (n, 3) [m].
+    # Mass that moves with each joint but not the next [kg], (n,), and its centre from the joint,
+    # (n, 3) [m].
     masses: np.ndarray
     centers: np.ndarray
     # Near which it stands [rad], shape (n,): which way a knee bends.
     stance: np.ndarray
-    # Which of a twist [angular, linear] of the sole its joints determine: all of a flat foot, what is linear of a point foot.
+    # Which of a twist [angular, linear] of the sole its joints determine: all of a flat foot, what
+    # is linear of a point foot.
     ruled: slice
 
     @classmethod
     def from_robot(cls, robot: Robot, side: str) -> "LegKinematics":
-        """Raises InputError where the leg has not six revolute joints (with a point foot three), one behind the other, that begin
-        at the base."""
+        """Raises InputError where the leg has not six revolute joints (with a point foot three),
+        one behind the other, that begin at the base."""
         plant, leg = robot.plant, robot.description.legs[side]
         context = plant.CreateDefaultContext()
         robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
@@ -83,7 +90,8 @@ class LegKinematics:
         is_right = len(joints) == ruled.stop - ruled.start
         if not is_right or not all(isinstance(joint, RevoluteJoint) for joint in joints):
             raise InputError(
-                f"legs.{side}.joints: a walking robot's leg needs {needed} revolute joints, found {len(joints)} joints"
+                f"legs.{side}.joints: a walking robot's leg needs {needed} revolute joints, found "
+                f"{len(joints)} joints"
             )
         if leg.is_point and np.linalg.norm(robot.pad_positions(side)) > _AXIS_TOLERANCE:
             raise InputError(f"legs.{side}.sole: expected the origin of a point foot in its pad")
@@ -97,14 +105,16 @@ class LegKinematics:
         carried = {robot.sole(side).body().index()}
         if not all(after <= before for before, after in pairwise([*moved, carried])):
             raise InputError(
-                f"legs.{side}.joints: expected them from hip to foot, one behind the other, found {', '.join(leg.joints)}"
+                f"legs.{side}.joints: expected them from hip to foot, one behind the other, found "
+                f"{', '.join(leg.joints)}"
             )
         for name in robot.description.joints:
             if carried <= set(
                 plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name).index()])
             ):
                 raise InputError(
-                    f"joints: {name} carries the {side} leg; a walking robot's legs begin at its base"
+                    f"joints: {name} carries the {side} leg; a walking robot's legs begin at its "
+                    "base"
                 )
         moved.append(set())
         masses, centers = [], []
@@ -139,7 +149,8 @@ class LegKinematics:
 
     @cached_property
     def has_closed_inverse(self) -> bool:
-        """Are the hip's axes z, x, y in one point, knee and ankle straight below, the ankle's axes y, x in one point, the sole level?"""
+        """Are the hip's axes z, x, y in one point, knee and ankle straight below, the ankle's axes
+        y, x in one point, the sole level?"""
         if not np.array_equal(self.axes, _CLOSED_AXES):
             return False
         in_line = np.concatenate([self.offsets[[1, 2, 5]].ravel(), self.offsets[3:5, :2].ravel()])
@@ -153,8 +164,10 @@ class LegKinematics:
         """Joint angles that put the sole at a pose; the knee bent as its range has it.
 
         Args:
-            R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m]; how a point foot is turned does not matter.
-            start: angles near the solution, shape (N, n) [rad], if known; by default the description's `stance`.
+            R_BF, p_BF: sole's pose in the base, shapes (N, 3, 3) and (N, 3) [m]; how a point foot
+                is turned does not matter.
+            start: angles near the solution, shape (N, n) [rad], if known; by default the
+                description's `stance`.
 
         Returns:
             Angles from hip to foot, shape (N, n) [rad].
@@ -164,8 +177,8 @@ class LegKinematics:
         """
         if self.has_closed_inverse:
             return self._closed_inverse(R_BF, p_BF)
-        # Levenberg-Marquardt, damped by the error itself: robust far away, quadratic near the solution (Sugihara 2011, IEEE
-        # Transactions on Robotics 27(5)).
+        # Levenberg-Marquardt, damped by the error itself: robust far away, quadratic near the
+        # solution (Sugihara 2011, IEEE Transactions on Robotics 27(5)).
         q = np.tile(self.stance, (len(p_BF), 1)) if start is None else start
         for _ in range(_MAX_ITERATIONS):
             R, p, J = self._pose(q)
@@ -248,7 +261,8 @@ class LegKinematics:
             yield r, position, axis, R
 
     def forward(self, q: np.ndarray, v: np.ndarray | None = None) -> LegMotion:
-        """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes (N, n) [rad, rad/s]."""
+        """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes
+        (N, n) [rad, rad/s]."""
         samples = len(q)
         v = np.zeros_like(q) if v is None else v
         axes, origins = [], []
@@ -301,7 +315,8 @@ def _stance(robot: Robot, leg: Leg) -> np.ndarray:
 
 
 def _jacobian(axes: list[np.ndarray], origins: list[np.ndarray], point: np.ndarray) -> np.ndarray:
-    """Of a point's spatial velocity [angular, linear] with respect to the rates about the axes through the origins, (N, 6, joints)."""
+    """Of a point's spatial velocity [angular, linear] with respect to the rates about the axes
+    through the origins, (N, 6, joints)."""
     return np.stack(
         [
             np.concatenate([e, np.cross(e, point - o)], axis=1)

@@ -11,11 +11,13 @@ from scipy.interpolate import PPoly
 
 @dataclass(frozen=True)
 class LipmTrajectory:
-    """CoM over a piecewise polynomial ZMP: in each piece the polynomial solution plus two exponentials."""
+    """CoM over a piecewise polynomial ZMP: in each piece the polynomial solution plus two
+    exponentials."""
 
     # Polynomial part, in each piece a particular solution [m].
     particular: PPoly
-    # Amplitudes of exp(-omega (t - piece start)) and exp(-omega (piece end - t)), shape (pieces, axes) [m].
+    # Amplitudes of exp(-omega (t - piece start)) and exp(-omega (piece end - t)), shape
+    # (pieces, axes) [m].
     decaying: np.ndarray
     growing: np.ndarray
     # sqrt(g / z_c) [1/s].
@@ -39,8 +41,9 @@ class LipmTrajectory:
 def solve_lipm(zmp: PPoly, com_height: float, gravity: float) -> LipmTrajectory:
     """CoM trajectory that satisfies the LIPM exactly for the ZMP `zmp` and starts and ends on it.
 
-    In each piece a particular solution of c - c''/omega^2 = p is sum_k p^(2k) / omega^(2k); the exponentials make position and
-    velocity continuous across pieces. One linear system over the whole walk, so there is no drift.
+    In each piece a particular solution of c - c''/omega^2 = p is sum_k p^(2k) / omega^(2k); the
+    exponentials make position and velocity continuous across pieces. One linear system over the
+    whole walk, so there is no drift.
 
     Args:
         zmp: ZMP over time [m], polynomial pieces with values of shape (axes,).

@@ -1,4 +1,5 @@
-"""What a reference motion is before it becomes joint angles: CoM, feet, ZMP and support over time, in the world frame."""
+"""What a reference motion is before it becomes joint angles: CoM, feet, ZMP and support over time,
+in the world frame."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +12,8 @@ from fbse_drake.errors import InputError
 
 @dataclass(frozen=True)
 class PointMotion:
-    """A point's position, velocity and acceleration over time, each of shape (N, 3) [m, m/s, m/s^2]."""
+    """A point's position, velocity and acceleration over time, each of shape
+    (N, 3) [m, m/s, m/s^2]."""
 
     position: np.ndarray
     velocity: np.ndarray
@@ -74,8 +76,8 @@ class Phase:
 
     @property
     def label(self) -> str:
-        """`DS` for double support, `AS` for that of all of more legs, else the supporting legs' initials and S, as `LS` or
-        `FL+RRS`; empty without support."""
+        """`DS` for double support, `AS` for that of all of more legs, else the supporting legs'
+        initials and S, as `LS` or `FL+RRS`; empty without support."""
         if len(self.support) == self.legs:
             return "DS" if self.legs == 2 else "AS"
         initials = ["".join(word[0].upper() for word in side.split("_")) for side in self.support]
@@ -131,7 +133,8 @@ class TaskPlan:
 
 
 def smooth_step(s: np.ndarray, derivative: int = 0) -> np.ndarray:
-    """Quintic from 0 to 1 over s in [0, 1] with zero velocity and acceleration at both ends; constant outside."""
+    """Quintic from 0 to 1 over s in [0, 1] with zero velocity and acceleration at both ends;
+    constant outside."""
     inside = (0 < s) & (s < 1)
     s = np.clip(s, 0, 1)
     value = {
@@ -182,6 +185,8 @@ def check_zmp(plan: TaskPlan, foot_corners: dict[str, np.ndarray], margin: float
         if distance.min() < margin:
             time = plan.time[inside][distance.argmin()]
             raise InputError(
-                f"phase {number} ({' and '.join(phase.support)} support), t = {time:.2f} s: the ZMP is {distance.min():.3f} m inside the "
-                f"support polygon, zmp_margin asks for {margin:.3f} m; shorten the step, lengthen the phase or lower zmp_margin"
+                f"phase {number} ({' and '.join(phase.support)} support), t = {time:.2f} s: the "
+                f"ZMP is {distance.min():.3f} m inside the "
+                f"support polygon, zmp_margin asks for {margin:.3f} m; shorten the step, lengthen "
+                "the phase or lower zmp_margin"
             )

@@ -1,4 +1,5 @@
-"""Reference motions for the joints: inverse kinematics, feed-forward torque, and the Drake source that plays them."""
+"""Reference motions for the joints: inverse kinematics, feed-forward torque, and the Drake source
+that plays them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,7 +32,8 @@ _MAX_ITERATIONS = 100
 
 @dataclass(frozen=True)
 class JointSines:
-    """Every joint swings about a posture on its own: q = posture + amplitude sin(2 pi frequency t + phase), from rest to rest.
+    """Every joint swings about a posture on its own: q = posture + amplitude
+    sin(2 pi frequency t + phase), from rest to rest.
 
     For a robot on a gantry (`robot.gantry_height`); the feet are free.
     """
@@ -50,11 +52,12 @@ class JointSines:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What the robot was asked for is in its log, or nobody knows: for recordings, which are compared with the model but not simulated
-    without the log.
+    """What the robot was asked for is in its log, or nobody knows: for recordings, which are
+    compared with the model but not simulated without the log.
     """
 
-    # Name of a number that the log keeps with each of its stretches and that multiplies the gains of `control`, as `kp`.
+    # Name of a number that the log keeps with each of its stretches and that multiplies the gains
+    # of `control`, as `kp`.
     gain: str = ""
 
 
@@ -63,7 +66,8 @@ ReferenceConfig = Walk | Trot | Squat | Sway | JointSines | Recorded
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference motion sampled at `time`, N samples; joint quantities of shape (N, n) in the description's joint order."""
+    """A reference motion sampled at `time`, N samples; joint quantities of shape (N, n) in the
+    description's joint order."""
 
     time: np.ndarray
     joint_position: np.ndarray
@@ -146,7 +150,8 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         time: increasing sample times (N,) [s].
 
     Raises:
-        InputError: a step out of reach, the ZMP too near the edge, a joint beyond its limits, an unknown joint.
+        InputError: a step out of reach, the ZMP too near the edge, a joint beyond its limits, an
+            unknown joint.
     """
     if isinstance(config, Recorded):
         raise InputError(
@@ -168,7 +173,8 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         )
     except np.linalg.LinAlgError:
         raise InputError(
-            "a leg is stretched out straight, where its joint velocities are not defined; lower com_height"
+            "a leg is stretched out straight, where its joint velocities are not defined; lower "
+            "com_height"
         ) from None
     _check_limits(robot, time, joint_motion.position, plan)
     torque = _feedforward(robot, plan, joint_motion, base, motions)
@@ -196,7 +202,8 @@ def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarra
     for joint in posture:
         if joint not in names.joints:
             raise InputError(
-                f"posture.{joint}: expected a joint that is no leg's (there are: {', '.join(names.joints) or 'none'})"
+                f"posture.{joint}: expected a joint that is no leg's (there are: "
+                f"{', '.join(names.joints) or 'none'})"
             )
     return names.per_joint(posture, key="posture", default=0.0)
 
@@ -204,7 +211,8 @@ def _posture(posture: Mapping[str, float], names: RobotDescription) -> np.ndarra
 def _inverse_kinematics(
     robot: Robot, legs: dict[str, LegKinematics], plan: TaskPlan, posture: np.ndarray
 ) -> tuple[PointMotion, PointMotion, dict[str, LegMotion]]:
-    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk level, other joints still."""
+    """Joints and base that put the robot's own CoM and the feet where the plan wants them; trunk
+    level, other joints still."""
     plant, samples = robot.plant, len(plan.time)
     context = plant.CreateDefaultContext()
     total_mass = plant.CalcTotalMass(context)
@@ -234,7 +242,8 @@ def _inverse_kinematics(
             break
     else:
         raise InputError(
-            f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change com_height"
+            f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change "
+            "com_height"
         )
 
     # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m. All in the trunk's axes.
@@ -318,7 +327,8 @@ def _turned(A: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _solve_leg(leg: LegKinematics, J: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Joint rates (N, n) that give the sole a twist [angular, linear] (N, 6), as far as they rule it."""
+    """Joint rates (N, n) that give the sole a twist [angular, linear] (N, 6), as far as they rule
+    it."""
     return np.linalg.solve(J[:, leg.ruled], twist[:, leg.ruled, None])[:, :, 0]
 
 
@@ -327,7 +337,10 @@ def _unreachable(plan: TaskPlan, side: str, error: UnreachableError) -> str:
     number, _ = plan.phase_at(time)
     step = (number + 1) // 2
     where = f"step {step}" if step else "the starting posture"
-    return f"{where} ({side} leg, t = {time:.2f} s) is out of reach: {error}; shorten step_length or change com_height"
+    return (
+        f"{where} ({side} leg, t = {time:.2f} s) is out of reach: {error}; "
+        "shorten step_length or change com_height"
+    )
 
 
 def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan | None) -> None:
@@ -338,7 +351,8 @@ def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan 
         sample, joint = np.unravel_index(excess.argmax(), excess.shape)
         step = f"step {(plan.phase_at(time[sample])[0] + 1) // 2}, " if plan is not None else ""
         raise InputError(
-            f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at {q[sample, joint]:.3f} rad, "
+            f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at "
+            f"{q[sample, joint]:.3f} rad, "
             f"its limits are {lower[joint]:.3f} to {upper[joint]:.3f} rad"
         )
 
@@ -410,8 +424,8 @@ def _share_by_zmp(
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Moments about the soles' origins and forces, in the world, of two flat feet.
 
-    One weight per foot (`load_shares`); the centres of pressure are the points where the ZMP rests in each foot
-    (`TaskPlan.anchor`), moved together so that the ZMP comes out exactly.
+    One weight per foot (`load_shares`); the centres of pressure are the points where the ZMP rests
+    in each foot (`TaskPlan.anchor`), moved together so that the ZMP comes out exactly.
 
     Args:
         moment, force: what both together give, about the base's origin, (N, 3) each [Nm, N].
@@ -521,8 +535,9 @@ class ReferenceSource(Diagram):
         - desired_state
         - feedforward_torque
 
-    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s]; `feedforward_torque` has shape (n,) [Nm].
-    Both are exact at the reference's sample times; before its start and after its end the robot is to stand still.
+    `desired_state` is [joint positions, joint velocities], shape (2n,) [rad, rad/s];
+    `feedforward_torque` has shape (n,) [Nm]. Both are exact at the reference's sample times; before
+    its start and after its end the robot is to stand still.
     """
 
     def __init__(self, reference: Reference):

@@ -19,7 +19,8 @@ from fbse_drake.walking.plan import (
 def smooth_sine(
     time: np.ndarray, frequency: float, ramp: float, duration: float, phase: float = 0.0
 ) -> list[np.ndarray]:
-    """A sine that swells from rest over `ramp` [s] and dies out before `duration` [s]; with its first two derivatives."""
+    """A sine that swells from rest over `ramp` [s] and dies out before `duration` [s]; with its
+    first two derivatives."""
     rise = [smooth_step(time / ramp, k) / ramp**k for k in range(3)]
     fall = [(-1.0) ** k * smooth_step((duration - time) / ramp, k) / ramp**k for k in range(3)]
     envelope = [
@@ -44,13 +45,15 @@ def smooth_sine(
 class _Stand:
     """All feet stand side by side."""
 
-    # Amplitude of the CoM's motion [m], its frequency [Hz], and the time in which it swells and dies out [s].
+    # Amplitude of the CoM's motion [m], its frequency [Hz], and the time in which it swells and
+    # dies out [s].
     amplitude: float = 0.03
     frequency: float = 0.4
     ramp: float = 2.0
     # Height of the centre of mass above the ground at rest [m].
     com_height: float = 0.66
-    # Distance between the soles' centres [m], and that of front and rear feet, where there are such.
+    # Distance between the soles' centres [m], and that of front and rear feet, where there are
+    # such.
     foot_spacing: float = 0.20
     wheelbase: float = 0.0
     # Where the CoM stands ahead of the sole frames [m].

@@ -1,4 +1,5 @@
-"""Walking from rest to rest: footsteps, ZMP and swing feet, with the timing of the paper (Sec. 7.1, Fig. 5) as default."""
+"""Walking from rest to rest: footsteps, ZMP and swing feet, with the timing of the paper (Sec. 7.1,
+Fig. 5) as default."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,8 @@ from fbse_drake.walking.plan import (
     smooth_step,
 )
 
-# Coefficients, highest power first, of the quintic step 0 -> 1 and of the bump 64 s^3 (1 - s)^3, in local time s in [0, 1].
+# Coefficients, highest power first, of the quintic step 0 -> 1 and of the bump 64 s^3 (1 - s)^3, in
+# local time s in [0, 1].
 _STEP = np.array([0.0, 6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
 _BUMP = np.array([-64.0, 192.0, -192.0, 64.0, 0.0, 0.0, 0.0])
 # The vertical part of a place.
@@ -68,8 +70,8 @@ class Walk:
 
     # Advance of the stance position from one step to the next [m]; a swing foot travels twice that.
     step_length: float = 0.10
-    # The same to the left [m], as a turn to the left [rad], and upwards [m], which is how far each of the ground's steps
-    # is above the one before.
+    # The same to the left [m], as a turn to the left [rad], and upwards [m], which is how far each
+    # of the ground's steps is above the one before.
     step_left: float = 0.0
     step_turn: float = 0.0
     step_rise: float = 0.0
@@ -80,17 +82,21 @@ class Walk:
     # Number of single supports, and the side that supports first.
     single_supports: int = 7
     first_support: str = "left"
-    # Duration [s] of the first double support, of each single support, and of each double support in between; the walk ends
-    # with a double support of the same length, after which the robot stands.
+    # Duration [s] of the first double support, of each single support, and of each double support
+    # in between; the walk ends with a double support of the same length, after which the robot
+    # stands.
     initial_double_support: float = 0.5
     single_support: float = 0.6
     double_support: float = 0.9
-    # Height of the centre of mass above the ground [m], constant; on a staircase above the line through its steps.
+    # Height of the centre of mass above the ground [m], constant; on a staircase above the line
+    # through its steps.
     com_height: float = 0.66
-    # Distance between the soles' centres [m], and that of front and rear feet, where there are such.
+    # Distance between the soles' centres [m], and that of front and rear feet, where there are
+    # such.
     foot_spacing: float = 0.20
     wheelbase: float = 0.0
-    # Where the ZMP stands in the supporting foot [m]: ahead of the sole frame, and inwards from it (more means less sway).
+    # Where the ZMP stands in the supporting foot [m]: ahead of the sole frame, and inwards from it
+    # (more means less sway).
     zmp_forward: float = 0.025
     zmp_inward: float = 0.01
     # Smallest distance of the planned ZMP to the edge of the support polygon [m].
@@ -119,7 +125,8 @@ class Walk:
             raise InputError(f"slope: expected two numbers, found {self.slope}")
         if self.step_rise != 0 and (self.step_left or self.step_turn or self.step_length == 0):
             raise InputError(
-                "step_rise: stairs are climbed straight ahead: expected a step_length, and no step_left or step_turn"
+                "step_rise: stairs are climbed straight ahead: expected a step_length, and no "
+                "step_left or step_turn"
             )
 
     @property
@@ -152,7 +159,8 @@ class Walk:
     def phases(
         self, sides: tuple[str, ...], supports: tuple[tuple[str, ...], ...], duration: float
     ) -> list[Phase]:
-        """Double and single supports in turn, up to the end of the last double support or `duration`, whichever is later.
+        """Double and single supports in turn, up to the end of the last double support or
+        `duration`, whichever is later.
 
         Args:
             supports: see there.
@@ -199,7 +207,8 @@ class Walk:
             gravity: of a level world, (3,) [m/s^2].
 
         Raises:
-            InputError: the ZMP leaves the support polygon less its margin, or a value is impossible.
+            InputError: the ZMP leaves the support polygon less its margin, or a value is
+                impossible.
         """
         phases = self.phases(tuple(stance), self.supports(stance), float(time[-1]))
         steps = self.steps(phases)
@@ -291,8 +300,9 @@ class Walk:
     ) -> tuple[PPoly, LipmTrajectory]:
         """ZMP (x, y) and the CoM that goes with it, at rest at both ends.
 
-        In a single support the ZMP rests in the supporting feet, in double support it moves smoothly from foot to foot. The first
-        and last double support hold a bump that first sends the ZMP the other way, as people do who start to walk.
+        In a single support the ZMP rests in the supporting feet, in double support it moves
+        smoothly from foot to foot. The first and last double support hold a bump that first sends
+        the ZMP the other way, as people do who start to walk.
         """
         middle = dict.fromkeys(beside, Place(self.start, 0.0, 0.0, 0.0))
 
@@ -308,7 +318,8 @@ class Walk:
                 middle |= dict.fromkeys(steps[number].swing, steps[number].land)
         targets.append(rest(phases[-1].support))
 
-        # Double supports move, single supports rest, and after the last double support the robot stands.
+        # Double supports move, single supports rest, and after the last double support the robot
+        # stands.
         breaks = [phase.start for phase in phases] + [
             round(phases[-1].start + self.double_support, 9)
         ]
@@ -346,8 +357,8 @@ class Walk:
 
 @dataclass(frozen=True)
 class Trot(Walk):
-    """Walks on four legs from rest to rest: two that are diagonally opposite step together. Six legs
-    step as two tripods.
+    """Walks on four legs from rest to rest: two that are diagonally opposite step together. Six
+    legs step as two tripods.
 
     A single support is one by half of the legs, between which the ZMP rests, and in a double
     support all stand. Two point feet do not keep the robot from tipping over the line between them:
