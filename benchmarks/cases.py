@@ -100,7 +100,8 @@ class Result:
     def is_visible(self, stated: dict[str, dict[str, float]]) -> bool:
         """Is every hidden effect, on some target, larger than the smallest size that can be found?
 
-        Where nothing is found, also larger than the size that this log's own diagnosis states: what is hidden may keep a joint still.
+        Where nothing is found, also larger than the size that this log's own diagnosis states: what
+        is hidden may keep a joint still.
         """
         own = {
             name: status["smallest_detectable_by_target"]
@@ -141,7 +142,8 @@ class Result:
 
 
 def _strength(hidden: dict[str, Any], target: str) -> float:
-    """How large a hidden effect is on a target, so that more is easier to find: its first parameter, or the length of a vector."""
+    """How large a hidden effect is on a target, so that more is easier to find: its first
+    parameter, or the length of a vector."""
     name, parameter = next(iter(library()[hidden["effect"]].parameters.items()))
     if parameter.neutral == np.inf:
         return -hidden["parameters"][name][target]

@@ -1,7 +1,9 @@
-"""How long `fbse convert` takes for a long bag, and how much memory: `python -m benchmarks.convert [MINUTES]`.
+"""How long `fbse convert` takes for a long bag, and how much memory:
+`python -m benchmarks.convert [MINUTES]`.
 
-The bag is an MCAP file with 1 kHz messages of a robot with 12 joints, an IMU and two six-axis foot sensors. It is made by a program of
-its own, and converted by another one, so that the memory is that of the conversion.
+The bag is an MCAP file with 1 kHz messages of a robot with 12 joints, an IMU and two six-axis foot
+sensors. It is made by a program of its own, and converted by another one, so that the memory is
+that of the conversion.
 """
 
 import os
@@ -53,13 +55,16 @@ def main() -> None:
         if status:
             sys.exit("the conversion failed")
         print(
-            f"{minutes:g} min at 1 kHz: {bag.stat().st_size / 2**20:.0f} MiB of MCAP, written in {written:.0f} s"
+            f"{minutes:g} min at 1 kHz: {bag.stat().st_size / 2**20:.0f} MiB of MCAP, written in "
+            f"{written:.0f} s"
         )
         print(
-            f"converted in {elapsed:.1f} s ({usage.ru_utime + usage.ru_stime:.1f} s of processor time)"
+            f"converted in {elapsed:.1f} s ({usage.ru_utime + usage.ru_stime:.1f} s of processor "
+            "time)"
         )
         print(
-            f"peak memory {usage.ru_maxrss / 2**10:.0f} MiB; the log's numbers alone are {_numbers(log) / 2**20:.0f} MiB"
+            f"peak memory {usage.ru_maxrss / 2**10:.0f} MiB; the log's numbers alone are "
+            f"{_numbers(log) / 2**20:.0f} MiB"
         )
 
 

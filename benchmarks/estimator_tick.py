@@ -1,9 +1,11 @@
-"""What one tick of a scenario's estimator costs, against the bare Drake calls it needs: `python -m benchmarks.estimator_tick [SCENARIO]`.
+"""What one tick of a scenario's estimator costs, against the bare Drake calls it needs:
+`python -m benchmarks.estimator_tick [SCENARIO]`.
 
-The scenario is simulated for a few seconds and its estimator runs over the log, as `fbse estimate` does. A tick is the evaluation of the
-friction estimate and the update of all states. The bare calls are those that a model-based estimator cannot do without, in the same
-postures: mass matrix, bias, gravity, and Jacobian and bias acceleration of every sole. Both take turns over short stretches of the log, so
-that whatever else the computer does slows down both alike.
+The scenario is simulated for a few seconds and its estimator runs over the log, as `fbse estimate`
+does. A tick is the evaluation of the friction estimate and the update of all states. The bare calls
+are those that a model-based estimator cannot do without, in the same postures: mass matrix, bias,
+gravity, and Jacobian and bias acceleration of every sole. Both take turns over short stretches of
+the log, so that whatever else the computer does slows down both alike.
 """
 
 import dataclasses
@@ -71,7 +73,8 @@ def whole_tick(scenario: Scenario, log: Log) -> Timer:
 
 
 def single_systems(scenario: Scenario, log: Log) -> tuple[list[str], Timer]:
-    """Names of the estimator's LeafSystems; times the output of each, its inputs known, and then the update of each."""
+    """Names of the estimator's LeafSystems; times the output of each, its inputs known, and then
+    the update of each."""
     replay = Replay(scenario, log)
     systems = [
         system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)

@@ -1,7 +1,9 @@
-"""How good the friction estimate is, and what it is good for: `python -m benchmarks.fbse [--seeds N] [--out DIR]`.
+"""How good the friction estimate is, and what it is good for:
+`python -m benchmarks.fbse [--seeds N] [--out DIR]`.
 
-Simulates the walks for several seeds on all cores, prints every table, and writes them as DIR/report.html and DIR/figures.json. A table
-holds means over the seeds. Estimates are online and causal; the methods that only watch are run over the log of the same walk.
+Simulates the walks for several seeds on all cores, prints every table, and writes them as
+DIR/report.html and DIR/figures.json. A table holds means over the seeds. Estimates are online and
+causal; the methods that only watch are run over the log of the same walk.
 """
 
 import argparse
@@ -47,7 +49,8 @@ _FINER = (
     "sensors.imu.angular_velocity_noise=1.0e-4",
     "sensors.foot_force.noise=0.05",
 )
-# The errors of the robustness table, by what a scenario says of them; the trunk's, see `_model_override`.
+# The errors of the robustness table, by what a scenario says of them; the trunk's, see
+# `_model_override`.
 _DISTURBED = {
     "trunk mass + 10 %": ("heavy",),
     "trunk CoM + 10 mm in x": ("shifted",),
@@ -69,7 +72,8 @@ class Case:
     scenario: str
     child: str | None = None
     overrides: tuple[str, ...] = ()
-    # Estimators that are run over its log besides, by name: as in `--set estimator=...`, or the name of another child of the scenario.
+    # Estimators that are run over its log besides, by name: as in `--set estimator=...`, or the
+    # name of another child of the scenario.
     watchers: dict[str, str] | None = None
 
 
@@ -84,7 +88,8 @@ def _sources() -> str:
 
 
 def run(case: Case, seed: int) -> dict[str, dict[str, Any]]:
-    """Simulates a case; returns the figures of the walk (under the case's name) and of each watcher."""
+    """Simulates a case; returns the figures of the walk (under the case's name) and of each
+    watcher."""
     with tempfile.TemporaryDirectory() as scratch:
         overrides = [
             f"seed={seed}",
@@ -133,7 +138,8 @@ def _figures(log: Log, failure: str | None, tick_us: float) -> dict[str, Any]:
 
 
 def _model_override(text: str, scratch: Path) -> str:
-    """An override as it is, or that of a model with another trunk, whose files are written to `scratch`."""
+    """An override as it is, or that of a model with another trunk, whose files are written to
+    `scratch`."""
     changes = {
         "heavy": ('<mass value="50"/>', '<mass value="55"/>'),
         "shifted": (
@@ -154,7 +160,8 @@ def _model_override(text: str, scratch: Path) -> str:
 
 
 def _changes(changes: tuple[str, ...], scenario: str) -> tuple[str, ...]:
-    """Overrides of a robustness case; a model that is spelt out needs the scenario's rotor inertia as well."""
+    """Overrides of a robustness case; a model that is spelt out needs the scenario's rotor inertia
+    as well."""
     if not set(changes) & {"heavy", "shifted"}:
         return changes
     inertia = load_scenario(scenario).believed.rotor_inertia
@@ -162,7 +169,8 @@ def _changes(changes: tuple[str, ...], scenario: str) -> tuple[str, ...]:
 
 
 def fixed_friction(scenario: str, child: str | None = None) -> str:
-    """A friction model identified offline from the measured friction of one walk, as `--set estimator=` takes it."""
+    """A friction model identified offline from the measured friction of one walk, as
+    `--set estimator=` takes it."""
     log = simulate(load_scenario(scenario, child, [f"seed={_OFFLINE_SEED}"])).log
     rows = slice(500, None)
     found = identify(

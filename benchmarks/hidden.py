@@ -1,10 +1,12 @@
-"""How well missing physics is found: `python -m benchmarks.hidden [--quick] [--sample N] [--only NAME]
-[--seeds N] [--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
+"""How well missing physics is found: `python -m
+benchmarks.hidden [--quick] [--sample N] [--only NAME] [--seeds N] [--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
 
-Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also nothing, two effects at once, effects that
-the library does not have, and effects in robots that differ from their model in contact solver, plant step or friction law. Each log is
-diagnosed. Every case becomes a row of a campaign in DIR; those that are there already, made by the same sources, are not run again. Prints
-the figures beside what was asked for and saves them as DIR/report.html with the confusion matrix, which is also DIR/confusion.png.
+Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also
+nothing, two effects at once, effects that the library does not have, and effects in robots that
+differ from their model in contact solver, plant step or friction law. Each log is diagnosed. Every
+case becomes a row of a campaign in DIR; those that are there already, made by the same sources, are
+not run again. Prints the figures beside what was asked for and saves them as DIR/report.html with
+the confusion matrix, which is also DIR/confusion.png.
 """
 
 import argparse
@@ -85,7 +87,8 @@ class Mismatch:
 
 _CREEP = frozenset({"FootCreep", "GroundCompliance"})
 _OTHER_LAW = (
-    "robot.effects.joint_friction=!CoulombViscousFriction {coulomb: {hip_yaw: 0.9, hip_roll: 0.8, hip_pitch: 0.6, knee_pitch: 0.5, "
+    "robot.effects.joint_friction=!CoulombViscousFriction {coulomb: {hip_yaw: 0.9, hip_roll: 0.8, "
+    "hip_pitch: 0.6, knee_pitch: 0.5, "
     "ankle_pitch: 0.1, ankle_roll: 0.05}, viscous: {all: 0.9}}"
 )
 _MISMATCHES = {
@@ -109,7 +112,8 @@ _THRESHOLDS = {
     "EncoderOffset": ("right_ankle_pitch", "offset"),
     "GyroscopeBias": ("robot", "x"),
 }
-# Logs without a hidden effect whose model is simulated: they show what the sensors' noise alone makes of two walks.
+# Logs without a hidden effect whose model is simulated: they show what the sensors' noise alone
+# makes of two walks.
 _ROLLED_DECOYS = 4
 
 
@@ -257,7 +261,8 @@ def judge(material: Material) -> dict[str, str]:
 
 
 def stated_sizes(decoys: Sequence[Result]) -> dict[str, dict[str, float]]:
-    """The smallest size that can be found, by effect and target: the median of what the diagnoses of the decoys say."""
+    """The smallest size that can be found, by effect and target: the median of what the diagnoses
+    of the decoys say."""
     sizes: dict[str, dict[str, float]] = {}
     for name in library():
         stated = [
@@ -303,8 +308,8 @@ class Figures:
         small = [r for r in self.of("effect") if not r.is_visible(self.stated)]
         right = [r for r in visible if r.is_found(alternatives=False)]
         covered = [value for r in right for value in r.score["covered"].values()]
-        # What is wrong with a sensor that the controller does not read changes no bit of the simulated motion, and a small effect less than
-        # other noise does.
+        # What is wrong with a sensor that the controller does not read changes no bit of the
+        # simulated motion, and a small effect less than other noise does.
         noise = max((_rollouts(r)[0] for r in decoys if r.tree["steps"]), default=0.0)
         rolled = [
             r

@@ -176,8 +176,8 @@ class WalkModel:
     # Noise of each foot's measured wrench in the step that ends in a row, of independent unit
     # normal numbers (K, feet, 6, columns) [Nm, N].
     wrench_noise: np.ndarray
-    # Standard deviation of each sole's motion [angular, linear], (K, feet, 6) [rad/s, m/s]; infinite
-    # for a foot that does not stand.
+    # Standard deviation of each sole's motion [angular, linear], (K, feet, 6) [rad/s, m/s];
+    # infinite for a foot that does not stand.
     foot_motion: np.ndarray
 
     @property

@@ -4,8 +4,8 @@
 A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
 that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
 does not have. Each log is diagnosed. Every case becomes a row of a campaign in DIR; those that are
-there already, made by the same sources, are not run again. Prints the figures beside what was asked for
-and a line for each case that went wrong, and saves both as DIR/figures.json.
+there already, made by the same sources, are not run again. Prints the figures beside what was asked
+for and a line for each case that went wrong, and saves both as DIR/figures.json.
 """
 
 import argparse

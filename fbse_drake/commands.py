@@ -183,7 +183,10 @@ def _convert(options: argparse.Namespace) -> bool:
     table = Table(title=str(out), show_header=False, title_justify="left")
     table.add_row(
         "rows",
-        f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} s apart",
+        (
+            f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} "
+            "s apart"
+        ),
     )
     table.add_row("joints", ", ".join(log.joints))
     table.add_row("channels", ", ".join(name for name in log if name != "time"))
@@ -255,7 +258,8 @@ def _told(
     *,
     first: str = "comparing the model with the log",
 ) -> Iterator[Progress]:
-    """Tells the progress of long work: in a line that changes, or without a terminal in lines below each other.
+    """Tells the progress of long work: in a line that changes, or without a terminal in lines below
+    each other.
 
     Args:
         limit: time after which the work ends with what is known [s].
@@ -360,7 +364,10 @@ def _hide(options: argparse.Namespace) -> bool:
     _write_run(console, out, SimulationResult(exercise.log, None, took, exercise.scenario, name))
     write_text(out / "answer.sealed", seal(exercise.answer))
     console.print(
-        f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal {out}",
+        (
+            f"Find it: fbse study {out}/scenario.yaml {out}/log.npz --out {out}; then fbse reveal "
+            f"{out}"
+        ),
         soft_wrap=True,
     )
     return True

@@ -25,7 +25,8 @@ from fbse_drake.wiring import release
 
 @dataclass(frozen=True, eq=False)
 class EstimationResult(RunResult):
-    """A log with the estimates in its `estimate/...` channels, and the time that each tick took [s], shape (N,)."""
+    """A log with the estimates in its `estimate/...` channels, and the time that each tick
+    took [s], shape (N,)."""
 
     log: Log
     tick_time: np.ndarray
@@ -47,10 +48,12 @@ def estimate(
     name: str = "scenario",
     progress: Callable[[float], None] | None = None,
 ) -> EstimationResult:
-    """Runs the scenario's estimator over a log, sample by sample, with the very LeafSystems that run in the station.
+    """Runs the scenario's estimator over a log, sample by sample, with the very LeafSystems that
+    run in the station.
 
-    Only sensor channels are used; `time` is what the log says, so samples may be missing or late. On the log of a simulation with the same
-    scenario the estimates are those of the simulation. Without `joint/velocity` the angles are differentiated and smoothed. Without
+    Only sensor channels are used; `time` is what the log says, so samples may be missing or late.
+    On the log of a simulation with the same scenario the estimates are those of the simulation.
+    Without `joint/velocity` the angles are differentiated and smoothed. Without
     `joint/torque_command` an `Fbse` estimates all but the friction.
 
     Args:
@@ -58,7 +61,8 @@ def estimate(
         progress: called with the log's time [s] as the work goes on.
 
     Raises:
-        InputError: no estimator in the scenario, a log that lacks a channel, other joints or feet than the model's.
+        InputError: no estimator in the scenario, a log that lacks a channel, other joints or feet
+            than the model's.
     """
     replay = Replay(scenario, log)
     values, tick_time = replay.run(progress)
@@ -171,7 +175,8 @@ class Replay:
             fixed.GetMutableData().get_mutable_value().SetFromVector(samples[sample])
 
     def update(self) -> None:
-        """Lets the estimators remember the tick. (`ExecuteForcedEvents` does so too, but allocates two states.)"""
+        """Lets the estimators remember the tick. (`ExecuteForcedEvents` does so too, but allocates
+        two states.)"""
         self.estimator.CalcForcedUnrestrictedUpdate(self.context, self._next)
         self.context.SetDiscreteState(self._next_values)
 

@@ -1,8 +1,8 @@
 """Logs: named channels over time, from a simulation or from a robot.
 
-Row k holds what is known at `time[k]`: joint positions and velocities at that time; IMU and foot forces over the plant's step that ends
-then; commanded torque, friction torque and the law of the friction (at the velocity that comes out
-of the step) of the step that begins then.
+Row k holds what is known at `time[k]`: joint positions and velocities at that time; IMU and foot
+forces over the plant's step that ends then; commanded torque, friction torque and the law of the
+friction (at the velocity that comes out of the step) of the step that begins then.
 """
 
 from collections.abc import Iterator, Mapping
@@ -90,15 +90,17 @@ class LogMeta:
 class Log(Mapping[str, np.ndarray]):
     """Channels by name, `log["joint/position"]`, and what is known about them.
 
-    The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`, `joint/velocity` and
-    `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force) and `imu/angular_velocity` (N, 3) in the IMU frame,
-    `foot/<side>/pad_force` (N, pads, 3) in the sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
+    The contract's channels (N samples, n joints, SI, float64): `time` (N,), `joint/position`,
+    `joint/velocity` and `joint/torque_command` (N, n), `imu/linear_acceleration` (specific force)
+    and `imu/angular_velocity` (N, 3) in the IMU frame, `foot/<side>/pad_force` (N, pads, 3) in the
+    sole frame or `foot/<side>/wrench` (N, 6) [moment, force]; further channels begin with
     `reference/`, `estimate/` or `truth/`, or are those of further sensors. Units and shapes of all
     are in `fbse_drake.signals`. A robot that does not know its joint torques has no
     `joint/torque_command`; nothing is said about the torques of its joints then.
 
     Raises:
-        InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not increase.
+        InputError: a channel is missing, unknown, of the wrong shape or not finite; time does not
+            increase.
 
     >>> import numpy as np
     >>> from fbse_drake import Log
@@ -137,7 +139,8 @@ class Log(Mapping[str, np.ndarray]):
                 e not in ("m", s) for e, s in zip(expected, values.shape, strict=True)
             ):
                 raise InputError(
-                    f"channel {name}: expected shape {_shape_text(expected)}, found {_shape_text(values.shape)}"
+                    f"channel {name}: expected shape {_shape_text(expected)}, found "
+                    f"{_shape_text(values.shape)}"
                 )
             if values.dtype.kind not in "fiub":
                 raise InputError(f"channel {name}: expected numbers, found {values.dtype}")
@@ -150,7 +153,8 @@ class Log(Mapping[str, np.ndarray]):
         if backwards.any():
             row = int(backwards.argmax()) + 1
             raise InputError(
-                f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} s)"
+                f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} "
+                "s)"
             )
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -205,7 +209,8 @@ class Log(Mapping[str, np.ndarray]):
         return to_xarray(self)
 
     def save(self, path: str | Path) -> None:
-        """Writes an npz file (compressed, no pickles), to a temporary name first. The same log gives the same bytes."""
+        """Writes an npz file (compressed, no pickles), to a temporary name first. The same log
+        gives the same bytes."""
         meta = {
             "format_version": FORMAT_VERSION,
             **self.meta,
@@ -298,7 +303,8 @@ def joined(logs: Mapping[str, "Log"], gap: float = 1.0) -> Log:
         ):
             if ours != theirs:
                 raise InputError(
-                    f"{other_name}: cannot be one log with {name}: its {what} is {theirs}, not {ours}"
+                    f"{other_name}: cannot be one log with {name}: its {what} is {theirs}, not "
+                    f"{ours}"
                 )
     segments: list[dict[str, Any]] = []
     times, begin = [], float(first.time[0])

@@ -1,4 +1,5 @@
-"""Reading npz files that anybody may have written: nothing is allocated that the file cannot hold."""
+"""Reading npz files that anybody may have written: nothing is allocated that the file cannot
+hold."""
 
 import math
 import os

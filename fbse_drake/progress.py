@@ -37,7 +37,8 @@ class Interrupted(Exception):
 
 
 class ProgressLines:
-    """Tells the progress of work in lines, and ends the work, once, at a time limit or when it is asked to.
+    """Tells the progress of work in lines, and ends the work, once, at a time limit or when it is
+    asked to.
 
     What is done after that, to write down what is known, is not interrupted again.
     """

@@ -9,7 +9,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def folder(name: str) -> Path:
-    """The folder `models` or `scenarios`: inside an installed package, beside the package in a checkout."""
+    """The folder `models` or `scenarios`: inside an installed package, beside the package in a
+    checkout."""
     installed = _PACKAGE / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
 
@@ -27,7 +28,8 @@ def find(name_or_path: str | Path, *, kind: str) -> Path:
     if path.suffix == "" and named.is_file():
         return named
     raise InputError(
-        f"{name_or_path}: no such file, and no such name in {kind}/ (there are: {', '.join(shipped(kind))})"
+        f"{name_or_path}: no such file, and no such name in {kind}/ (there are: "
+        f"{', '.join(shipped(kind))})"
     )
 
 

@@ -1,15 +1,17 @@
 """Clock ticks of sampled systems.
 
-Drake's discrete plant with sampled output ports steps in an *unrestricted* update, which comes before all *discrete* updates of the same
-time. So a discrete update of another system sees the plant's state of the next tick, an unrestricted one that of the present tick.
-Systems here that remember something from tick to tick do so in unrestricted updates.
+Drake's discrete plant with sampled output ports steps in an *unrestricted* update, which comes
+before all *discrete* updates of the same time. So a discrete update of another system sees the
+plant's state of the next tick, an unrestricted one that of the present tick. Systems here that
+remember something from tick to tick do so in unrestricted updates.
 """
 
 from pydrake.systems.framework import Context, Diagram, DiscreteValues, System
 
 
 def tick_index(time: float, period: float) -> int:
-    """Number of the last tick at or before a time; times within a millionth of a period count as on it."""
+    """Number of the last tick at or before a time; times within a millionth of a period count as on
+    it."""
     return int(time / period + 1e-6)
 
 
@@ -21,8 +23,8 @@ def is_tick(time: float, period: float) -> bool:
 def state_views(system: System, context: Context) -> list[DiscreteValues]:
     """Python's views of the discrete state of a system, or of all systems in a diagram.
 
-    As long as they are kept, a system that asks for its state is given these and no new ones, which would cost each of its ticks half a
-    microsecond.
+    As long as they are kept, a system that asks for its state is given these and no new ones, which
+    would cost each of its ticks half a microsecond.
     """
     if not isinstance(system, Diagram):
         return [context.get_discrete_state()]

@@ -1,6 +1,7 @@
 """What can be said in a scenario file.
 
-A file holds one or more named scenarios. What is left out has the default below; `--set a.b.c=value` goes on top.
+A file holds one or more named scenarios. What is left out has the default below;
+`--set a.b.c=value` goes on top.
 """
 
 import math
@@ -42,7 +43,8 @@ from fbse_drake.walking.walk import Walk
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """A robot's body and the physical effects in it; the same words for the robot and for the model of it."""
+    """A robot's body and the physical effects in it; the same words for the robot and for the model
+    of it."""
 
     # Name or path of a robot description (models/*.yaml).
     description: str = "biped"
@@ -137,7 +139,8 @@ class FallConfig:
 
 @dataclass(frozen=True)
 class RecordingConfig:
-    """How a log is read before its physics is looked at. The defaults are for logs of `fbse simulate`."""
+    """How a log is read before its physics is looked at. The defaults are for logs of
+    `fbse simulate`."""
 
     # The equation of motion is averaged over blocks of this length [s].
     block: float = 0.010
@@ -145,20 +148,26 @@ class RecordingConfig:
     # torque that is held over the step that begins there), or `instantaneous` (all channels sampled
     # together). Whether a simulation made the motion, and in what steps, is told by the log itself.
     rows: str = "per_step"
-    # Joint velocities: `measured`, or `differenced` from the angles, as they are in any case where the log has none.
+    # Joint velocities: `measured`, or `differenced` from the angles, as they are in any case where
+    # the log has none.
     velocity: str = "measured"
-    # All channels go through a low-pass without delay (Butterworth of order 4, forwards and backwards) with this corner [Hz]; 0 for none.
+    # All channels go through a low-pass without delay (Butterworth of order 4, forwards and
+    # backwards) with this corner [Hz]; 0 for none.
     cutoff: float = 0.0
-    # Who recorded the torques has done so already, with this corner [Hz]: predicted torques go through the same before they are compared.
+    # Who recorded the torques has done so already, with this corner [Hz]: predicted torques go
+    # through the same before they are compared.
     recorded_cutoff: float = 0.0
     # White noise of the torque of each joint, standard deviation of a sample [Nm].
     torque_noise: dict[str, float] = field(default_factory=dict)
-    # What such noise has beside, as a share of the torque: a torque that is had from a model of the motor is right but for a share of it.
+    # What such noise has beside, as a share of the torque: a torque that is had from a model of the
+    # motor is right but for a share of it.
     torque_noise_share: dict[str, float] = field(default_factory=dict)
-    # A joint's row counts where the joint moves faster than this [rad/s]: at rest friction is whatever holds the joint, and no law says it.
+    # A joint's row counts where the joint moves faster than this [rad/s]: at rest friction is
+    # whatever holds the joint, and no law says it.
     least_speed: dict[str, float] = field(default_factory=dict)
-    # Rows of the residual, as compare.json names them (* stands for any text), that cannot close, for a channel of theirs is not to be
-    # trusted: nothing is fitted to them, and nothing is said about them.
+    # Rows of the residual, as compare.json names them (* stands for any text), that cannot close,
+    # for a channel of theirs is not to be trusted: nothing is fitted to them, and nothing is said
+    # about them.
     unused_rows: list[str] = field(default_factory=list)
     # Models are fitted to this first share of the log; the rest is set aside to test them.
     train_share: float = 0.8
@@ -176,7 +185,8 @@ class RecordingConfig:
                 )
         if self.cutoff > 0 and self.block * self.cutoff < 0.5:
             raise InputError(
-                f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found {self.block:g} s"
+                f"block: expected at least half a period of cutoff = {self.cutoff:g} Hz, found "
+                f"{self.block:g} s"
             )
         if not 0 < self.train_share <= 1:
             raise InputError(
@@ -190,14 +200,17 @@ class RecordingConfig:
 
 @dataclass(frozen=True)
 class IdentifyConfig:
-    """What of the model's own parameters is not trusted, so that it is identified together with the effects that a log shows."""
+    """What of the model's own parameters is not trusted, so that it is identified together with the
+    effects that a log shows."""
 
     # Bodies whose inertial parameters are not trusted; `all` for every body with a mass.
     inertia: list[str] = field(default_factory=list)
-    # Effects that are not tried, for the recording itself shows that they are not there (see its data hygiene).
+    # Effects that are not tried, for the recording itself shows that they are not there (see its
+    # data hygiene).
     ruled_out: list[str] = field(default_factory=list)
-    # Effects that add less than this share to the torque (root mean square) of every joint that they act in are too small to matter; of the
-    # base and of soles likewise to their forces and motions.
+    # Effects that add less than this share to the torque (root mean square) of every joint that
+    # they act in are too small to matter; of the base and of soles likewise to their forces and
+    # motions.
     tolerance: float = 0.005
 
     def __post_init__(self) -> None:
@@ -264,7 +277,8 @@ class Scenario:
     effect_modules: list[str] = field(default_factory=list)
     # What really happens.
     robot: RobotConfig = field(default_factory=RobotConfig)
-    # What is believed of it (feed-forward, estimators, predictions); by default the robot's body without its effects.
+    # What is believed of it (feed-forward, estimators, predictions); by default the robot's body
+    # without its effects.
     model: RobotConfig | None = None
     # Drake's settings of the robot's plant, whose time_step must be > 0.
     plant: MultibodyPlantConfig = field(default_factory=_plant_config)
@@ -273,8 +287,8 @@ class Scenario:
     reference: ReferenceConfig = field(default_factory=Walk)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     control: PositionLoopConfig = field(default_factory=PositionLoopConfig)
-    # Who estimates the friction: !NoEstimator, !Fbse, a reference (!TrueFriction, !TorqueSensor), or
-    # a rival: !DisturbanceObserver, !FilteredDisturbance, !ExtendedState, !ActuatorFault,
+    # Who estimates the friction: !NoEstimator, !Fbse, a reference (!TrueFriction, !TorqueSensor),
+    # or a rival: !DisturbanceObserver, !FilteredDisturbance, !ExtendedState, !ActuatorFault,
     # !FixedFriction, !FilteredModel, !AdaptiveFriction, !LuGreFriction, !RadialBasisFriction or
     # !FuzzyFriction.
     estimator: Estimator = field(default_factory=NoEstimator)
@@ -301,7 +315,8 @@ class Scenario:
             raise InputError(f"plant: {error}") from None
         if not self.plant.use_sampled_output_ports:
             raise InputError(
-                "plant.use_sampled_output_ports: expected true (sensors measure the plant's last step), found False"
+                "plant.use_sampled_output_ports: expected true (sensors measure the plant's last "
+                "step), found False"
             )
         approximation = self.plant.discrete_contact_approximation
         if approximation == "tamsi":
@@ -320,7 +335,8 @@ class Scenario:
         object.__setattr__(self, "sensors", self.sensors.with_period(usual))
         if self.duration < self.control.period:
             raise InputError(
-                f"duration: expected at least control.period = {self.control.period:g} s, found {self.duration:g}"
+                f"duration: expected at least control.period = {self.control.period:g} s, found "
+                f"{self.duration:g}"
             )
         if self.compensation.uses_estimate and not self.estimator.gives_friction:
             raise InputError("compensation: needs an estimator (estimator: !Fbse {})")
@@ -338,7 +354,8 @@ class Scenario:
             steps = period / self.plant.time_step
             if steps < 1 - 1e-9 or abs(steps - round(steps)) > 1e-6:
                 raise InputError(
-                    f"{key}: expected a whole multiple of plant.time_step = {self.plant.time_step:g} s, found {period:g}"
+                    f"{key}: expected a whole multiple of plant.time_step = "
+                    f"{self.plant.time_step:g} s, found {period:g}"
                 )
 
     def __reduce__(self) -> tuple[Any, ...]:

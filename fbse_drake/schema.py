@@ -1,7 +1,9 @@
-"""Typed YAML: builds frozen dataclasses from a document, with errors that name the file, the key and what is allowed.
+"""Typed YAML: builds frozen dataclasses from a document, with errors that name the file, the key
+and what is allowed.
 
-The document is parsed by `pydrake.common.yaml` (tags choose between alternatives: `reference: !Squat {...}`).
-Its typed loader assigns to attributes, which frozen dataclasses refuse, so the last step, tree to dataclass, is done here.
+The document is parsed by `pydrake.common.yaml` (tags choose between alternatives:
+`reference: !Squat {...}`). Its typed loader assigns to attributes, which frozen dataclasses refuse,
+so the last step, tree to dataclass, is done here.
 """
 
 import collections.abc
@@ -68,7 +70,8 @@ def parse_mapping(text: str, *, file: str) -> dict[str, Any]:
 
 
 def parse(text: str, *, file: str) -> Any:
-    """Parses YAML text into mappings with texts as keys, lists, texts, numbers, true, false and nothing.
+    """Parses YAML text into mappings with texts as keys, lists, texts, numbers, true, false and
+    nothing.
 
     Args:
         file: where it stands, for messages.
@@ -138,7 +141,8 @@ def _check_types(value: Any, file: str, key: str) -> None:
 
 
 def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
-    """`tree` with the values of `override` on top: a mapping with another tag replaces, others merge key by key, null removes."""
+    """`tree` with the values of `override` on top: a mapping with another tag replaces, others
+    merge key by key, null removes."""
     merged = dict(tree)
     for key, value in override.items():
         if value is None:
@@ -183,7 +187,8 @@ def dump(value: Any, *, child_name: str | None = None) -> str:
     """YAML text of a dataclass, as the child of a document or as a document of its own; `build` of
     it gives an equal object.
 
-    Drake's own `yaml_dump_typed` leaves out the tag of the first alternative, which would tie a file to the order of alternatives.
+    Drake's own `yaml_dump_typed` leaves out the tag of the first alternative, which would tie a
+    file to the order of alternatives.
     """
     tree = _tree(type(value), value)
     return yaml.dump(
@@ -288,7 +293,8 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
 
 
 def alternatives_of(schema: Any) -> tuple[Any, ...]:
-    """What an open class can be: its own static method `alternatives` says so. A union says it by itself."""
+    """What an open class can be: its own static method `alternatives` says so. A union says it by
+    itself."""
     return schema.alternatives() if "alternatives" in vars(schema) else ()
 
 

@@ -217,7 +217,8 @@ def signals_of(port: str) -> tuple[Signal, ...]:
 
 
 def is_late(port: str) -> bool:
-    """Does the port tell of the step that ended what its channels have in the row where it began?"""
+    """Does the port tell of the step that ended what its channels have in the row where it
+    began?"""
     return any(row.late for row in signals_of(port))
 
 

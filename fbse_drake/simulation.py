@@ -32,7 +32,8 @@ from fbse_drake.wiring import release
 
 # Why a run failed that was stopped by Ctrl-C.
 INTERRUPTED = "interrupted"
-# The run is looked at (fall, progress, interruption) this often in simulated time [s], and after so many steps of the plant.
+# The run is looked at (fall, progress, interruption) this often in simulated time [s], and after so
+# many steps of the plant.
 _LOOK_PERIOD, _LOOK_STEPS = 0.01, 1000
 
 
@@ -61,7 +62,8 @@ def simulate(
     meshcat: Meshcat | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SimulationResult:
-    """Simulates a scenario to its end, to a fall, or to an interruption (Ctrl-C); what was recorded is returned in any case.
+    """Simulates a scenario to its end, to a fall, or to an interruption (Ctrl-C); what was recorded
+    is returned in any case.
 
     Args:
         name: what the scenario is called in the log.
@@ -82,8 +84,9 @@ def simulate(
 
 @contextmanager
 def _postponed_interruption() -> Iterator[threading.Event]:
-    """Tells of a Ctrl-C instead of raising it, for the run looks at it often enough: inside a callback of a compiler it would be lost.
-    A second one is raised. In other threads than the main one, which get none, nothing changes."""
+    """Tells of a Ctrl-C instead of raising it, for the run looks at it often enough: inside a
+    callback of a compiler it would be lost. A second one is raised. In other threads than the main
+    one, which get none, nothing changes."""
     interrupted = threading.Event()
 
     def interrupt(number: int, frame: object) -> None:
@@ -339,10 +342,12 @@ def _reference_channels(reference: Reference, time: np.ndarray) -> dict[str, np.
 def _truth_channels(
     robot: Robot, state: np.ndarray, acceleration: np.ndarray, pad_force: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of the exact foot forces.
+    """What a real robot would not tell: exact motion of joints, base, CoM and feet, and the ZMP of
+    the exact foot forces.
 
-    Accelerations are the plant's own, over the step that ends at the row's time; base quantities are those of the base frame's origin,
-    in world axes; orientation is a quaternion [w, x, y, z] from base to world.
+    Accelerations are the plant's own, over the step that ends at the row's time; base quantities
+    are those of the base frame's origin, in world axes; orientation is a quaternion [w, x, y, z]
+    from base to world.
     """
     plant, samples, context = robot.plant, len(state), robot.plant.CreateDefaultContext()
     v = state[:, plant.num_positions() :]

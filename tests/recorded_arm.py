@@ -1,5 +1,6 @@
-"""Logs of machines on a fixed base that nobody simulated: a motion is chosen, and the torques that it
-needs are those of its inverse dynamics, sampled at an instant. What the model lacks is put into them."""
+"""Logs of machines on a fixed base that nobody simulated: a motion is chosen, and the torques that
+it needs are those of its inverse dynamics, sampled at an instant. What the model lacks is put into
+them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

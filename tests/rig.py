@@ -1,4 +1,5 @@
-"""Drives estimators by hand: a LeafSystem with made-up inputs, or a whole EstimatorDiagram with the samples of a log."""
+"""Drives estimators by hand: a LeafSystem with made-up inputs, or a whole EstimatorDiagram with the
+samples of a log."""
 
 import dataclasses
 import shutil

@@ -1,4 +1,5 @@
-"""Motors that are not commanded a torque, and motors that give less than their command: laws against closed forms."""
+"""Motors that are not commanded a torque, and motors that give less than their command: laws
+against closed forms."""
 
 import numpy as np
 import pytest

@@ -27,8 +27,8 @@ from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.walking.reference import JointSines, Recorded
 
 TROLLEY, LOAD, LENGTH, G = 6.0, 2.0, 0.5, 9.81
-# A trolley on a rail along x, a rope (a rod here) that swings about y, and a spoon below it that the description does not name. The shapes
-# name meshes that are nowhere.
+# A trolley on a rail along x, a rope (a rod here) that swings about y, and a spoon below it that
+# the description does not name. The shapes name meshes that are nowhere.
 CRANE = f"""
 <robot name="crane">
   <link name="rail"/>
@@ -105,7 +105,8 @@ def rubbing(folder: Path) -> tuple[Scenario, Log]:
 def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(
     folder: Path, rubbing: tuple[Scenario, Log]
 ):
-    """q_swing, x: (m + M) x.. + m l (q.. cos q - q.^2 sin q) = F and m l^2 q.. + m l x.. cos q + m g l sin q = T, plus the spoon's."""
+    """q_swing, x: (m + M) x.. + m l (q.. cos q - q.^2 sin q) = F and m l^2 q.. + m l x.. cos q + m
+    g l sin q = T, plus the spoon's."""
     log = rubbing[1]
     rigid = dataclasses.replace(
         rubbing[0], model=RobotConfig(described(folder, held={"spoon_hinge": np.pi / 2}))
@@ -116,7 +117,8 @@ def test_the_residual_of_a_crane_is_what_its_equation_of_motion_says(
         blocks.joint_velocity.T,
         blocks.joint_acceleration.T,
     )
-    # By a quarter turn about y the spoon's mass lies 0.1 m below the hinge, which is that of the rod.
+    # By a quarter turn about y the spoon's mass lies 0.1 m below the hinge, which is that of the
+    # rod.
     moment = LOAD * LENGTH + 1.0 * 0.1
     inertia = LOAD * LENGTH**2 + 1.0 * 0.1**2
     # A rotation about +y takes what hangs down to -x.
@@ -165,7 +167,8 @@ def test_the_bandwidth_of_a_log_is_that_of_its_motion():
 
 
 def test_what_is_too_small_to_matter_is_said_to_be_so(folder: Path):
-    """A bias that is eleven times as large as its uncertainty, and a third of a percent of the force."""
+    """A bias that is eleven times as large as its uncertainty, and a third of a percent of the
+    force."""
     biased = dataclasses.replace(crane(folder, bias=TorqueBias({"slide": 0.05})), duration=5.0)
     log = simulate(biased).log
     bare = dataclasses.replace(biased, model=RobotConfig(described(folder)))
@@ -182,7 +185,8 @@ def test_what_is_too_small_to_matter_is_said_to_be_so(folder: Path):
 
 @pytest.mark.parametrize("shortfall", [0.0, 0.1])
 def test_noise_of_the_torque_is_no_lag(folder: Path, shortfall: float):
-    """White noise is in the residual and in the columns of what depends on the torque alike: a lag would seem to take it off."""
+    """White noise is in the residual and in the columns of what depends on the torque alike: a lag
+    would seem to take it off."""
     hidden = {"gain": TorqueGain({"swing": shortfall})} if shortfall else {}
     robot = dataclasses.replace(crane(folder, **hidden), duration=4.0)
     log = simulate(robot).log
@@ -299,7 +303,8 @@ def test_the_relative_error_is_that_of_norms_and_the_rest_of_a_log_is_its_end(
 
 
 def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: Path):
-    """A recorder that samples torque and angles at once, every 8 ms, without velocities: exact motions give no residual."""
+    """A recorder that samples torque and angles at once, every 8 ms, without velocities: exact
+    motions give no residual."""
     scenario = dataclasses.replace(
         crane(folder),
         recording=RecordingConfig(
@@ -333,7 +338,8 @@ def test_a_recording_without_velocities_and_with_samples_at_one_instant(folder: 
 
 
 def test_a_position_servo_tells_its_torque_by_its_gains(rubbing: tuple[Scenario, Log]):
-    """A recording of positions alone: the torque follows from what was asked for and the known gains of the loop."""
+    """A recording of positions alone: the torque follows from what was asked for and the known
+    gains of the loop."""
     scenario, log = rubbing
     asked = dataclasses.replace(scenario, reference=Recorded())
     without = Log(

@@ -91,14 +91,16 @@ def test_quaternion_helpers_agree_with_scipy():
 
 
 def test_gravity_filter_is_the_textbook_kalman_filter():
-    """Nine states [gravity, acceleration, bias] with full matrices; the estimator has one covariance for all axes."""
+    """Nine states [gravity, acceleration, bias] with full matrices; the estimator has one
+    covariance for all axes."""
     sensors = replace(USUAL_SENSORS, acceleration_noise=0.1, angular_velocity_noise=2e-3)
     config = AttitudeConfig(**IMU_ONLY, acceleration_bias=0.05)
     attitude = Attitude(sensors=sensors, **IMU_ONLY, acceleration_bias=0.05)
     readings = np.array([0.3, -0.2, 9.8]) + np.random.default_rng(1).normal(
         scale=0.3, size=(400, 3)
     )
-    # A first reading, of which nothing is known but how large its parts may be: P0 H^T (H P0 H^T + R)^-1 y.
+    # A first reading, of which nothing is known but how large its parts may be: P0 H^T
+    # (H P0 H^T + R)^-1 y.
     I3, H = np.eye(3), np.hstack([np.eye(3)] * 3)
     P = np.kron(
         np.diag([GRAVITY**2, config.standing_acceleration**2, config.acceleration_bias**2]), I3
@@ -245,7 +247,8 @@ def test_quaternion_stays_on_one_sheet_through_two_turns(axis: list[float]):
 
 
 def test_correction_is_the_same_on_either_sheet():
-    """After one turn q is minus what the measured quaternion is; an error of the tilt must shrink all the same."""
+    """After one turn q is minus what the measured quaternion is; an error of the tilt must shrink
+    all the same."""
     tilt = []
     for turns in (0, 1):
         attitude = Attitude(**IMU_ONLY, motion_acceleration=0.05)
@@ -262,7 +265,8 @@ def test_correction_is_the_same_on_either_sheet():
 
 
 def test_gyro_bias_is_recovered():
-    """About the horizontal axes from gravity; about the vertical only from a robot that stands at first."""
+    """About the horizontal axes from gravity; about the vertical only from a robot that stands at
+    first."""
     bias, generator = np.array([0.02, -0.03, 0.01]), np.random.default_rng(3)
     sure = {"angular_velocity_bias": 0.05, "motion_acceleration": 0.05}
     walking, standing, blind = (
@@ -298,7 +302,8 @@ def test_level_feet_hold_the_tilt_against_acceleration():
 
 
 def test_innovations_are_as_large_as_believed():
-    """Noise as configured, trunk at rest: the gravity filter's normalized innovation squared has mean 1."""
+    """Noise as configured, trunk at rest: the gravity filter's normalized innovation squared has
+    mean 1."""
     generator = np.random.default_rng(4)
     attitude = Attitude(**IMU_ONLY, motion_acceleration=1e-6, standing_acceleration=1e-6)
     nis = []

@@ -1,4 +1,5 @@
-"""Support and base state: textbook filters, closed forms, and the truth of simulated motions without sensor errors."""
+"""Support and base state: textbook filters, closed forms, and the truth of simulated motions
+without sensor errors."""
 
 import dataclasses
 import math
@@ -61,7 +62,8 @@ class BaseState(Rig):
 
 
 def test_adaptive_filter_is_the_papers():
-    """Equations (17)-(31) for all nine states at once, with full matrices; the estimator has a filter for each axis."""
+    """Equations (17)-(31) for all nine states at once, with full matrices; the estimator has a
+    filter for each axis."""
     ticks, n_r, n_q, T = 1500, 1000, 5000, TICK
     generator = np.random.default_rng(0)
     estimator = BaseState(AdaptiveLipmEstimator, AdaptiveLipm())
@@ -121,7 +123,8 @@ def test_adaptive_filter_is_the_papers():
 
 
 def test_contact_aided_filter_is_a_kalman_filter():
-    """Three states per axis [position, velocity, acceleration error], both measurements at once; the estimator takes one after another."""
+    """Three states per axis [position, velocity, acceleration error], both measurements at once;
+    the estimator takes one after another."""
     config, T, generator = ContactAided(), TICK, np.random.default_rng(1)
     estimator = BaseState(ContactAidedEstimator, config)
     p_BF, J = LEVEL["foot_position"], LEVEL["foot_jacobian"]
@@ -142,7 +145,8 @@ def test_contact_aided_filter_is_a_kalman_filter():
         acceleration = bias + generator.normal(scale=0.05, size=3)
         if k == 0:
             shift = np.zeros(3)
-        # The feet seen from the base, as if it had moved; the model's own linear velocity is that of the feet seen from the base.
+        # The feet seen from the base, as if it had moved; the model's own linear velocity is that
+        # of the feet seen from the base.
         seen = {
             "foot_position": p_BF - shift,
             "velocity": np.concatenate([np.zeros(3), -speed, np.zeros(12)]),
@@ -167,7 +171,8 @@ def test_contact_aided_filter_is_a_kalman_filter():
 
 
 def spin(estimator: BaseState, about: np.ndarray, ticks: int, **inputs: np.ndarray) -> np.ndarray:
-    """A body in free fall of no one: it turns ever faster about a point that rests [m, in base axes], held up against gravity."""
+    """A body in free fall of no one: it turns ever faster about a point that
+    rests [m, in base axes], held up against gravity."""
     axis, growth = np.array([0.6, 0.0, 0.8]), 3.0
     p_I = np.array([0.01, -0.01, 0.02]) - about
     for k in range(ticks):
@@ -181,7 +186,8 @@ def spin(estimator: BaseState, about: np.ndarray, ticks: int, **inputs: np.ndarr
 
 
 def test_lever_arm_of_the_centre_of_mass():
-    """Who spins about the centre of mass does not accelerate it, whatever the IMU feels (eq. 16)."""
+    """Who spins about the centre of mass does not accelerate it, whatever the IMU feels
+    (eq. 16)."""
     about_com = spin(BaseState(AdaptiveLipmEstimator, AdaptiveLipm()), LEVEL["com"], 600)
     np.testing.assert_allclose(about_com["imu_acceleration"], 0, atol=1e-9)
     about_imu = spin(
@@ -203,8 +209,9 @@ def test_lever_arm_of_the_base():
     assert np.linalg.norm(posterior["base_velocity"]) > 0.1
 
 
-# Largest root mean square error of the base's velocity per axis [m/s], measured 1.2e-5, 1.8e-5 and 1.7e-4 m/s (of which most is the ground
-# that yields), and with the paper's 0.006 m/s in a slow sway, 0.03 m/s in a walk: the LIPM knows neither swing legs nor impacts.
+# Largest root mean square error of the base's velocity per axis [m/s], measured 1.2e-5, 1.8e-5 and
+# 1.7e-4 m/s (of which most is the ground that yields), and with the paper's 0.006 m/s in a slow
+# sway, 0.03 m/s in a walk: the LIPM knows neither swing legs nor impacts.
 @pytest.mark.parametrize(
     ("name", "config", "largest"),
     [
@@ -280,7 +287,8 @@ def test_untrusted_sensors_move_nothing():
 
 
 class Support(Rig):
-    """A SensorMonitor over a left foot with a load; the right one carries the rest, or as little as is said."""
+    """A SensorMonitor over a left foot with a load; the right one carries the rest, or as little as
+    is said."""
 
     def __init__(self, **config: float):
         system: System = SensorMonitor(

@@ -1,4 +1,5 @@
-"""Campaigns: every run becomes one row, whatever dies in between, and rows do not depend on who made them."""
+"""Campaigns: every run becomes one row, whatever dies in between, and rows do not depend on who
+made them."""
 
 import os
 import signal
@@ -235,7 +236,10 @@ design: !Random
         ("steps: {a: !Simulate {}}\ndesign: !Grid {values: {a.b: [1]}}", "begins so too"),
         ("steps: {a: !Simulate {}}\ndesign: !Grid {seeds: 0}", "seeds: expected a number > 0"),
         (
-            "steps: {a: !Simulate {}}\ndesign: !Random {runs: 2, values: {b: !Uniform {low: 1, high: 0}}}",
+            (
+                "steps: {a: !Simulate {}}\ndesign: !Random {runs: 2, values: {b: !Uniform {low: 1, "
+                "high: 0}}}"
+            ),
             "high: expected more than low",
         ),
         ("steps: {a: !Simulate {}}", "steps.a: this step needs a scenario"),

@@ -400,7 +400,8 @@ def test_simulate_tells_the_errors_of_estimates(tmp_path: Path, capsys: pytest.C
 def test_a_recording_of_a_robot_is_enough(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
-    """No truth, no plan, no velocities; a tenth of the samples lost, the others late by up to 0.3 ms, on a clock of their own."""
+    """No truth, no plan, no velocities; a tenth of the samples lost, the others late by up to 0.3
+    ms, on a clock of their own."""
     live, random = Log.load(walk / "log.npz"), np.random.default_rng(0)
     kept = np.sort(random.choice(len(live.time), len(live.time) * 9 // 10, replace=False))
     bare = without_estimates(live, "truth/", "reference/", "joint/velocity")
@@ -604,7 +605,8 @@ def test_diagnose_then_add_then_compare(
     assert comments[2].startswith("# TorqueBias in left knee pitch: bias ")
     assert comments[2].endswith("with its 95 % interval")
 
-    # What fbse add wrote may be written again, but not over the scenario that is added to, nor over a file of somebody else.
+    # What fbse add wrote may be written again, but not over the scenario that is added to, nor over
+    # a file of somebody else.
     assert (
         main(
             [

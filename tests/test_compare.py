@@ -1,4 +1,5 @@
-"""Comparison of a model with a log: failures with a known cause, intervals that hold, and silence where there is only noise."""
+"""Comparison of a model with a log: failures with a known cause, intervals that hold, and silence
+where there is only noise."""
 
 import dataclasses
 import json
@@ -26,7 +27,8 @@ JOINTS = ROBOT.joint_names
 
 
 def made_residual(seed: int = 0) -> Residual:
-    """Noise alone, a moving average of order one as differenced white noise leaves it; a walk of steps of 0.7 s."""
+    """Noise alone, a moving average of order one as differenced white noise leaves it; a walk of
+    steps of 0.7 s."""
     random = np.random.default_rng(seed)
     time = (np.arange(BLOCKS) + 0.5) * PERIOD
     shape = (BLOCKS, len(ROWS))

@@ -83,7 +83,8 @@ def test_torque_sensor_measures_command_minus_link_torque():
 
 @pytest.fixture(scope="module")
 def tracking(run: Run) -> dict[str, np.ndarray]:
-    """Root mean square tracking error of each joint [rad] in the first 2 s of the walk with HRP-2's friction."""
+    """Root mean square tracking error of each joint [rad] in the first 2 s of the walk with HRP-2's
+    friction."""
     walk = load_scenario("hrp2_walk_fbse", overrides=("duration=2",))
     ideal = dataclasses.replace(
         walk, compensation=NoCompensation(), robot=dataclasses.replace(walk.robot, effects={})

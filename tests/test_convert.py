@@ -545,11 +545,17 @@ def test_maps_are_checked(tmp_path: Path, text: str, message: str):
     [
         (
             LogMap(),
-            "a map must name the joints and say what the columns are (columns: time, q1, q2, tau1, tau2)",
+            (
+                "a map must name the joints and say what the columns are (columns: time, q1, q2, "
+                "tau1, tau2)"
+            ),
         ),
         (
             with_position(columns=["q1"]),
-            "channels.joint/position: columns: expected 2 in all, one for each of 2 joints, found 1",
+            (
+                "channels.joint/position: columns: expected 2 in all, one for each of 2 joints, found "
+                "1"
+            ),
         ),
         (
             with_position(gains=[1.0]),
@@ -689,7 +695,8 @@ def test_a_ros_1_bag(tmp_path: Path):
 
 
 def test_sensors_are_interpolated_between_neighbours_only(tmp_path: Path):
-    """An IMU at another rate and phase, with a gap: linear signals come back exactly, and nothing is made up in the gap."""
+    """An IMU at another rate and phase, with a gap: linear signals come back exactly, and nothing
+    is made up in the gap."""
     stamps = [STAMPS[0] - 3_000_000 + 7_000_000 * k for k in range(80)]
     gap = (STAMPS[0] + 200_000_000, STAMPS[0] + 260_000_000)
     linear = [(stamp - STAMPS[0]) / 1e9 for stamp in stamps]
@@ -808,7 +815,10 @@ def test_a_type_of_somebody_elses(tmp_path: Path):
     motor = "float32 angle\nbool on\nint16 current\n"
     store.register(
         get_types_from_msg(
-            f"std_msgs/Header header\nstring note\nx/Motor[2] motors\n{'=' * 80}\nMSG: x/Motor\n{motor}",
+            (
+                f"std_msgs/Header header\nstring note\nx/Motor[2] motors\n{'=' * 80}\nMSG: "
+                f"x/Motor\n{motor}"
+            ),
             "x/msg/State",
         )
     )
@@ -959,7 +969,8 @@ def test_bad_conversions_are_one_line_and_status_2(
 def test_a_recording_can_be_given_in_place_of_a_log(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ):
-    """It is converted, with a map if need be; here its joints turn out to be those of another robot."""
+    """It is converted, with a map if need be; here its joints turn out to be those of another
+    robot."""
     (tmp_path / "map.yaml").write_text(
         "joints: [hip, knee]\nchannels: {joint/position: {columns: [q1, q2]}}\n"
     )
@@ -1027,7 +1038,8 @@ def test_real_recordings_convert(files: str, log_map: str | None, rows: int, per
 
 @needs_data
 def test_real_forces_carry_the_weight():
-    """iCub, 33 kg, stands in the first second: the ground pushes its soles upwards, and the IMU feels it."""
+    """iCub, 33 kg, stands in the first second: the ground pushes its soles upwards, and the IMU
+    feels it."""
     log = convert(sorted(Path(DATA).glob("icub_walking/*.mat")), load_map("real/icub"))
     force = sum(log[f"foot/{side}/wrench"][:100, 5].mean() for side in ("left", "right"))
     assert force == pytest.approx(33.1 * 9.81, rel=0.05)
@@ -1038,7 +1050,8 @@ def test_real_forces_carry_the_weight():
 
 @needs_data
 def test_real_duty_cycles_have_a_sign():
-    """XL330: at most all of the supply voltage, in the direction of the error that the servo sees."""
+    """XL330: at most all of the supply voltage, in the direction of the error that the servo
+    sees."""
     log = convert(sorted(Path(DATA).glob("bam_xl330/raw/*.json")), load_map("real/xl330"))
     voltage, error = (
         log["joint/voltage_command"][:, 0],

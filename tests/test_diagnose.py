@@ -1,4 +1,5 @@
-"""What is put into a log is found, with intervals that hold it; what is not is not; and what cannot be seen is said to be so."""
+"""What is put into a log is found, with intervals that hold it; what is not is not; and what cannot
+be seen is said to be so."""
 
 import json
 from collections.abc import Iterator
@@ -144,7 +145,8 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_noise_in_the_regressors_is_not_taken_for_an_effect(seed: int) -> None:
-    """In a squat the feet hardly move: what their accelerations show is noise, and it is in the residual too."""
+    """In a squat the feet hardly move: what their accelerations show is noise, and it is in the
+    residual too."""
     squat = load_scenario("squat", overrides=["duration=4", f"seed={seed}"])
     squat = replace(squat, model=squat.robot)
     names = ("BodyCentreOfMass", "BodyMass", "ReflectedInertia", "ThermalDrift")
@@ -153,7 +155,8 @@ def test_noise_in_the_regressors_is_not_taken_for_an_effect(seed: int) -> None:
 
 
 def injected(log: Log, effect: Effect) -> Log:
-    """The log of a robot whose motors, to move the same way against a further torque, were commanded more."""
+    """The log of a robot whose motors, to move the same way against a further torque, were
+    commanded more."""
     names = Predictor(scenario(), log)
     resolved = effect.resolve(names.robot.description)
     torque, _ = resolved.torque_and_slope(JointMotion(log["truth/joint/velocity"][1:]))
@@ -178,7 +181,8 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
 
 
 def test_a_standing_robot_shows_no_friction() -> None:
-    """Too little excitation reads `not_visible`, never `absent`, with the experiment that would show it."""
+    """Too little excitation reads `not_visible`, never `absent`, with the experiment that would
+    show it."""
     standing = load_scenario(
         "squat", overrides=["duration=2.5", "reference.amplitude=1e-6", "robot.effects=null"]
     )
@@ -235,7 +239,8 @@ def test_two_effects_at_once_are_both_found() -> None:
 
 
 def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
-    """One offset alone explains less than a turned IMU with a moved mass; both together explain all."""
+    """One offset alone explains less than a turned IMU with a moved mass; both together explain
+    all."""
     log = log_with("!EncoderOffset {offset: {hip_roll: 0.007}}")
     candidates = [
         library()[name]
@@ -341,7 +346,8 @@ def test_a_simpler_effect_is_an_alternative_unless_chance_cannot_explain_the_dif
     ["!BodyMass {mass: {left_foot: 3.5}}", "!FootForceLag {time_constant: {right: 0.045}}"],
 )
 def test_what_a_large_effect_leaves_over_is_noise(hidden: str) -> None:
-    """A heavy foot hits the ground harder than smoothed accelerations tell; a foot that reads late seems to stand while it lifts."""
+    """A heavy foot hits the ground harder than smoothed accelerations tell; a foot that reads late
+    seems to stand while it lifts."""
     candidates = [
         library()[name]
         for name in (hidden[1:].split()[0], "CoulombFriction", "TorqueBias", "FootForceGain")
@@ -435,7 +441,8 @@ def test_ground_that_gives_a_little_more_is_nobodys_concern(
 def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
     offset: float, deviation: float, can_be: bool
 ) -> None:
-    """An encoder's zero is off by some hundredths of a radian; an interval that reaches there from 0.62 rad does not make it so."""
+    """An encoder's zero is off by some hundredths of a radian; an interval that reaches there from
+    0.62 rad does not make it so."""
     effect = library()["EncoderOffset"]
     signature = Signature(np.array([0]), np.zeros((5, 1, 1)))
     candidate = Candidate(

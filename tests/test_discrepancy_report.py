@@ -1,4 +1,5 @@
-"""The reports of compare, diagnose and study: they say what was found, and hold everything they show."""
+"""The reports of compare, diagnose and study: they say what was found, and hold everything they
+show."""
 
 import dataclasses
 import re
@@ -161,10 +162,22 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             made_diagnosis(),
             True,
             [
-                "The model lacks Coulomb friction in left and right knee pitch; this log cannot tell that from presliding hysteresis.",
-                "the error of all channels falls from 4.20 to 1.01 times the sensors&#39; noise (1.00 on the data that it was fitted to)",
-                "Presliding hysteresis explains this log as well as Coulomb friction in left and right knee pitch.",
-                "To tell them apart: Move by small amounts. It shows presliding hysteresis. <code>fbse simulate squat",
+                (
+                    "The model lacks Coulomb friction in left and right knee pitch; this log cannot "
+                    "tell that from presliding hysteresis."
+                ),
+                (
+                    "the error of all channels falls from 4.20 to 1.01 times the sensors&#39; noise "
+                    "(1.00 on the data that it was fitted to)"
+                ),
+                (
+                    "Presliding hysteresis explains this log as well as Coulomb friction in left and "
+                    "right knee pitch."
+                ),
+                (
+                    "To tell them apart: Move by small amounts. It shows presliding hysteresis. "
+                    "<code>fbse simulate squat"
+                ),
                 "fbse add paper_walk out/a_walk --out",
                 "<td>1.50 [1.40,\u00a01.60]</td><td>0.00400 [0.00100,\u00a00.00700]</td>",
                 "<td>bias 0.02 Nm; none in right knee pitch</td>",
@@ -176,7 +189,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             UNKNOWN,
             False,
             [
-                "Something is missing that no effect of the library explains, in left knee pitch (follows position).",
+                (
+                    "Something is missing that no effect of the library explains, in left knee pitch "
+                    "(follows position)."
+                ),
                 "register an effect",
             ],
         ),
@@ -184,7 +200,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             made_diagnosis("not_visible", ()),
             False,
             [
-                "This log cannot tell whether something is missing: 1 of 4 effects would not show in it.",
+                (
+                    "This log cannot tell whether something is missing: 1 of 4 effects would not show "
+                    "in it."
+                ),
                 "Record a motion that shows more: Repeat one motion. It shows thermal drift.",
             ],
         ),
@@ -192,7 +211,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             made_diagnosis(ranking=(FRICTION, MASS)),
             True,
             [
-                "The model lacks Coulomb friction in left and right knee pitch and body mass in trunk"
+                "The model lacks Coulomb friction in left and right knee pitch and body mass in "
+                "trunk"
             ],
         ),
     ],
@@ -336,8 +356,8 @@ def test_errors_on_logs_that_were_not_fitted_are_told(
     )
     text = page_text(tmp_path / "report.html")
     assert (
-        "On the log that was fitted 14.2 % before, 7.10 % after; on pulses (not fitted) 25.0 % before, 12.5 % after."
-        in text
+        "On the log that was fitted 14.2 % before, 7.10 % after; on pulses (not fitted) 25.0 % "
+        "before, 12.5 % after." in text
     )
     numbers = "".join(
         f'<td class="number">{value}</td>' for value in ("20.0", "10.0", "30.0", "10.0")
@@ -459,7 +479,8 @@ def test_effects_in_one_place_are_named_together():
     bias = dataclasses.replace(FRICTION, effect="TorqueBias")
     text = reports.diagnosis_outcome(made_diagnosis(ranking=(FRICTION, MASS, bias)))
     assert text.startswith(
-        "The model lacks Coulomb friction and torque bias in left and right knee pitch and body mass in trunk;"
+        "The model lacks Coulomb friction and torque bias in left and right knee pitch and body "
+        "mass in trunk;"
     )
 
 

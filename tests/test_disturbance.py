@@ -1,4 +1,5 @@
-"""Short disturbances are left out and said; what comes again and again, or belongs to a law, is not."""
+"""Short disturbances are left out and said; what comes again and again, or belongs to a law, is
+not."""
 
 from collections.abc import Callable
 

@@ -68,7 +68,8 @@ def test_all_poles_of_the_extended_state_observer_lie_at_its_bandwidth():
 
 
 def test_the_extended_state_meets_what_is_constant_and_lags_behind_what_rises():
-    """Joints that are accelerated by what the model explains, and by a disturbance of f = 2 and 3 t."""
+    """Joints that are accelerated by what the model explains, and by a disturbance of f = 2 and 3
+    t."""
     angle, velocity, states = np.zeros(2), np.array([0.3, -0.2]), np.zeros((3, 2))
     for k in range(1500):
         f, explained = np.array([2.0, 3.0 * (k + 0.5) * TICK]), np.array([np.sin(k * 0.01), 1.0])

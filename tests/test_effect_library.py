@@ -1,4 +1,5 @@
-"""The effects of the library: their laws against closed forms, and the simulated torque against the law over the recorded motion."""
+"""The effects of the library: their laws against closed forms, and the simulated torque against the
+law over the recorded motion."""
 
 import dataclasses
 from pathlib import Path
@@ -140,7 +141,8 @@ def test_memory_at_once_is_that_of_the_steps(
 
 @pytest.mark.parametrize("time_constant", [2e-4, 5e-3, 5e-2])
 def test_lag_is_a_low_pass(time_constant: float):
-    """Over each step the mean of the exact solution, which scipy's filter gives at the steps' ends."""
+    """Over each step the mean of the exact solution, which scipy's filter gives at the steps'
+    ends."""
     keep = np.exp(-H / time_constant)
     ends = lfilter([1 - keep], [1, -keep], M.command - M.command[0], axis=0) + M.command[0]
     starts = np.concatenate([M.command[:1], ends[:-1]])
@@ -174,7 +176,8 @@ def test_hysteresis_loop_encloses_what_it_dissipates(amplitude: float):
     torque = law(effect, JointMotion(velocity[:, None], time_step=H))[:, 0]
     by_cycle = (torque * velocity * H).reshape(4, -1).sum(axis=1)
     assert np.all(by_cycle > 0)
-    # The loop closes once it has settled, inside the rectangle of Coulomb friction, which it fills when it slips.
+    # The loop closes once it has settled, inside the rectangle of Coulomb friction, which it fills
+    # when it slips.
     assert by_cycle[3] == pytest.approx(by_cycle[2], rel=0.05)
     rectangle = 4 * amplitude * 3.0
     assert by_cycle[3] < rectangle
@@ -340,7 +343,8 @@ def test_every_effect_alone_spares_the_joints_that_are_not_named(kind: type[Join
     ids=lambda effect: type(effect).__name__,
 )
 def test_simulated_torque_follows_the_law_of_the_velocity_that_comes_out(effect: JointTorqueEffect):
-    """In all joints of freely swinging legs, some of them light, under a command that is not smooth."""
+    """In all joints of freely swinging legs, some of them light, under a command that is not
+    smooth."""
     log = swinging({"effect": effect}, "duration=1.5")
     loss, predicted = log["truth/joint/friction_torque"][:-1], by_the_law({"effect": effect}, log)
     np.testing.assert_allclose(predicted, log["truth/joint/friction_law_torque"][:-1], atol=1e-9)
@@ -349,7 +353,8 @@ def test_simulated_torque_follows_the_law_of_the_velocity_that_comes_out(effect:
 
 
 def test_links_get_what_is_commanded_less_the_loss():
-    """Drake's inverse dynamics of the motion that came out: (1 - shortfall) command - bias - stiffness angle."""
+    """Drake's inverse dynamics of the motion that came out: (1 - shortfall)
+    command - bias - stiffness angle."""
     effects = {
         "gain": TorqueGain(shortfall={"all": 0.1}),
         "bias": TorqueBias(bias={"all": -1.0}),
@@ -487,7 +492,8 @@ def test_an_effect_of_a_user_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     path, copy = tmp_path / "mine.yaml", tmp_path / "elsewhere" / "copy.yaml"
     path.write_text(
         "mine:\n  duration: 0.05\n  effect_modules: [cable.py]\n"
-        "  robot: {gantry_height: 1.2, effects: {cable: !GravityOfACable {weight: {left_knee_pitch: 3.0}}}}\n"
+        "  robot: {gantry_height: 1.2, effects: {cable: !GravityOfACable {weight: "
+        "{left_knee_pitch: 3.0}}}}\n"
         "  reference: !JointSines {amplitude: {knee_pitch: 0.1}, frequency: {all: 1.0}}\n"
     )
     monkeypatch.chdir("/")

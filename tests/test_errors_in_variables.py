@@ -1,4 +1,5 @@
-"""White noise of a measured torque is in the residual and in the regressors of what depends on the torque alike."""
+"""White noise of a measured torque is in the residual and in the regressors of what depends on the
+torque alike."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +24,8 @@ from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.simulation import simulate
 from fbse_drake.walking.reference import JointSines
 
-# As large as the torque's own deviation, which is what a current sensor gives of a light joint [Nm].
+# As large as the torque's own deviation, which is what a current sensor gives of a light
+# joint [Nm].
 NOISE = 0.4
 _RUNS = 5
 HIDDEN = {

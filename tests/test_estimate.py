@@ -121,7 +121,8 @@ def test_without_joint_velocities(run: Run):
 
 
 def test_differentiation():
-    """A ramp gives its slope, after two time constants in series; a sine its derivative, late by both."""
+    """A ramp gives its slope, after two time constants in series; a sine its derivative, late by
+    both."""
     time = np.arange(2000) * 1e-3
     ramp = differentiate(time, np.outer(time, [1.0, -2.0]), 0.004)
     t = time[1:, None]

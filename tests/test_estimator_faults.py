@@ -28,7 +28,8 @@ ESTIMATORS: dict[str, Estimator] = {
     "observer": DisturbanceObserver(),
     "fixed": FixedFriction(CoulombViscousFriction(coulomb={"all": 1.0}, viscous={"all": 1.0})),
 }
-# The fault falls into the first single support, when the left foot carries everything; 0.5 s later the estimates are looked at.
+# The fault falls into the first single support, when the left foot carries everything; 0.5 s later
+# the estimates are looked at.
 START, END, HEALED, LAST = 700, 900, 1400, 1600
 # Input port, channels and place in the status of each sensor.
 SENSORS = {
@@ -91,8 +92,9 @@ def tilt(result: dict[str, np.ndarray]) -> np.ndarray:
     )
 
 
-# What the estimates differ by from those without the fault [Nm], [m/s], [rad]: friction just after it and when healed, velocity, tilt.
-# Measured with margins of two or more. Filters that nobody tells the vertical but gravity need longer to find it again.
+# What the estimates differ by from those without the fault [Nm], [m/s], [rad]: friction just after
+# it and when healed, velocity, tilt. Measured with margins of two or more. Filters that nobody
+# tells the vertical but gravity need longer to find it again.
 TOLERANCE = {
     "best": (6.0, 0.4, 2e-3, 5e-3),
     "paper": (6.0, 1.0, 0.1, 0.025),
@@ -248,7 +250,8 @@ def test_nothing_to_start_from(walk: Log, name: str):
 
 
 def test_healthy_sensors_are_trusted(run: Run):
-    """No false alarm, neither in a walk with noise nor without: a sensor that is exact may rest at zero."""
+    """No false alarm, neither in a walk with noise nor without: a sensor that is exact may rest at
+    zero."""
     for log in (run("paper_walk_fbse", "duration=3"), run("paper_walk", "duration=3", noise=False)):
         for config in (FixedFriction(), Fbse()):
             replay = Replay(diagram(config, scenario("paper_walk", "duration=3")))
@@ -276,7 +279,8 @@ def test_hard_walks_are_trusted(run: Run, overrides: tuple[str, ...]):
 def recorded(
     walk: Log, config: Estimator, ticks: int
 ) -> tuple[Replay, dict[RecursiveEstimator, dict[str, np.ndarray]]]:
-    """The diagram's systems, each with samples (ticks, size) of all its input ports. They live as long as the diagram."""
+    """The diagram's systems, each with samples (ticks, size) of all its input ports. They live as
+    long as the diagram."""
     replay = Replay(diagram(config, scenario("paper_walk_fbse", "duration=3")))
     systems = [
         system for system in replay.estimator.GetSystems() if isinstance(system, RecursiveEstimator)
@@ -312,9 +316,11 @@ REMAINS = {
 
 @pytest.mark.parametrize("name", ["best", "paper", "observer", "fixed"])
 def test_each_system_alone_survives_what_is_no_number(walk: Log, name: str):
-    """On each of its input ports in turn: the posterior stays finite, the status says so, and all is forgotten soon.
+    """On each of its input ports in turn: the posterior stays finite, the status says so, and all
+    is forgotten soon.
 
-    A support that is no number counts as none; the paper's attitude does not look at the feet, its friction takes the model instead.
+    A support that is no number counts as none; the paper's attitude does not look at the feet, its
+    friction takes the model instead.
     """
     ticks, bad = 90, range(50, 55)
     _, systems = recorded(walk, ESTIMATORS[name], ticks)

@@ -35,7 +35,8 @@ def with_rosbags(path: Path) -> Iterator[tuple[str, int, Any]]:
 
 
 def with_mcap(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """The container by `mcap`; types from the definitions that the file itself carries are checked by `with_rosbags`."""
+    """The container by `mcap`; types from the definitions that the file itself carries are checked
+    by `with_rosbags`."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)

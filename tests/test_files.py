@@ -1,4 +1,5 @@
-"""Files: whole or not at all, also where programs are killed and disks are full; JSON by its standard."""
+"""Files: whole or not at all, also where programs are killed and disks are full; JSON by its
+standard."""
 
 import fcntl
 import json
@@ -139,7 +140,8 @@ def test_a_folder_that_cannot_be_written_to_is_refused(log: Path, capsys: pytest
 
 
 def test_no_home_an_old_locale_and_nobody_who_reads_along(log: Path):
-    """Names that the terminal cannot show, and `| head` that has seen enough: the file is written."""
+    """Names that the terminal cannot show, and `| head` that has seen enough: the file is
+    written."""
     read, write = os.pipe()
     os.close(read)
     environment = {

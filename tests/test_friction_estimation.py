@@ -1,4 +1,5 @@
-"""From measured friction to its estimate, against textbook filters and the truth of simulated motions."""
+"""From measured friction to its estimate, against textbook filters and the truth of simulated
+motions."""
 
 import dataclasses
 import math
@@ -56,7 +57,8 @@ def regressor(velocity: np.ndarray, transition: float = 0.01) -> np.ndarray:
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.995])
 def test_recursive_least_squares_of_all_parameters_at_once(forgetting: float):
-    """Equations (64)-(67) with the paper's 12 parameters of a leg in one covariance, and batch least squares (63)."""
+    """Equations (64)-(67) with the paper's 12 parameters of a leg in one covariance, and batch
+    least squares (63)."""
     generator = np.random.default_rng(2)
     truth, ticks = generator.uniform(0.5, 5, size=12), 300
     theta, P = np.zeros(12), 10 * np.eye(12)
@@ -144,7 +146,8 @@ def test_recursive_least_squares_takes_the_measurement_in_stance_and_the_model_i
 
 
 def test_model_aided_filter_is_the_textbook_kalman_filter():
-    """State [impulse s, parameters, disturbance, noise e of the velocity], which is new in each tick.
+    """State [impulse s, parameters, disturbance, noise e of the velocity], which is new in each
+    tick.
 
     s' = s + T (friction at the true velocity, the measured one less e), linearised; measured is
     s - inertia e with white noise. The measured impulse is the sum of T times the residuals; what
@@ -231,8 +234,8 @@ def test_friction_tells_how_fast_a_light_joint_turns():
 
 
 def believed_world(believed: float) -> tuple[float, float, float]:
-    """Mean normalized innovation squared of the model-aided filter in its first 0.1 s and after 0.5 s,
-    and the friction's rms error over that of the residual.
+    """Mean normalized innovation squared of the model-aided filter in its first 0.1 s and after 0.5
+    s, and the friction's rms error over that of the residual.
 
     Args:
         believed: the filter's noise over the true one.
@@ -264,8 +267,8 @@ def believed_world(believed: float) -> tuple[float, float, float]:
 
 def test_model_aided_filter_is_consistent():
     first, nis, ratio = believed_world(1.0)
-    # 12000 values of chi-square with one degree of freedom, 4 sigma; and a little less, for what looks like more noise is learned and
-    # what looks like less is not.
+    # 12000 values of chi-square with one degree of freedom, 4 sigma; and a little less, for what
+    # looks like more noise is learned and what looks like less is not.
     assert 0.9 < nis < 1 + 4 * math.sqrt(2 / 12000)
     assert ratio < 0.2
     # It believes in a third of the noise at first, and learns.
@@ -297,7 +300,8 @@ def friction_error(log: Log, result: Log) -> np.ndarray:
 
 
 def test_friction_of_a_walk_is_estimated(run: Run):
-    """Measured, mean over the joints: 12 % of the friction by the best variant, 36 % by the disturbance observer, 93 % by the paper's."""
+    """Measured, mean over the joints: 12 % of the friction by the best variant, 36 % by the
+    disturbance observer, 93 % by the paper's."""
     log = run("paper_walk_fbse", "duration=3")
     truth = np.sqrt(np.mean(log["truth/joint/friction_torque"][300:] ** 2, axis=0))
     best = friction_error(log, log)
@@ -308,7 +312,8 @@ def test_friction_of_a_walk_is_estimated(run: Run):
 
 
 def test_no_friction_no_estimate(run: Run):
-    """The negative case: the robot has no friction. Measured at most 0.06 Nm, 0.40 Nm by the observer."""
+    """The negative case: the robot has no friction. Measured at most 0.06 Nm, 0.40 Nm by the
+    observer."""
     log = part(run("paper_walk", "duration=3", "robot.effects=null"), 2.0)
     assert np.all(log["truth/joint/friction_torque"] == 0)
     for config, largest in ((Fbse(), 0.12), (DisturbanceObserver(), 0.8)):

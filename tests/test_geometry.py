@@ -1,4 +1,5 @@
-"""Links that are longer than the model says. Truth: models whose joints are placed elsewhere in the file."""
+"""Links that are longer than the model says. Truth: models whose joints are placed elsewhere in the
+file."""
 
 import dataclasses
 from pathlib import Path

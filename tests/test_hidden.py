@@ -1,4 +1,5 @@
-"""Blind exercises: what is drawn, that it is in the log and nowhere else, and how answers are scored."""
+"""Blind exercises: what is drawn, that it is in the log and nowhere else, and how answers are
+scored."""
 
 import base64
 import itertools
@@ -50,7 +51,8 @@ def diagnosis(
     verdict: str = "effect_found",
     unexplained: tuple[str, ...] = (),
 ) -> dict:
-    """What diagnosis.json has of such findings: effect, targets, and intervals or `confusable_with`."""
+    """What diagnosis.json has of such findings: effect, targets, and intervals or
+    `confusable_with`."""
     ranking = []
     for effect, targets, more in findings:
         parameters = {
@@ -225,7 +227,8 @@ def test_bad_wishes_are_refused(walk: Scenario, arguments: dict, message: str):
 
 
 def test_hidden_bias_is_what_the_command_has_more():
-    """In a gantry the joint follows its reference, so the motor must be told to give the missing torque as well."""
+    """In a gantry the joint follows its reference, so the motor must be told to give the missing
+    torque as well."""
     swing = load_scenario("leg_swing_gantry", overrides=["duration=1"])
     hidden = make_exercise(swing, "swing", 5, what="TorqueBias", size="large")
     without = make_exercise(swing, "swing", 5, what="decoy")

@@ -150,7 +150,8 @@ def test_forces_that_come_late_are_told_from_forces_behind_a_low_pass(run: Run) 
 
 
 def test_a_torque_after_its_motion_is_a_clock_before_it_the_robot_s_own(run: Run) -> None:
-    """No motor moves a joint before it is told to; that it does so later is a delay as robots have it."""
+    """No motor moves a joint before it is told to; that it does so later is a delay as robots have
+    it."""
     log = run(*GANTRY)
     torque = log["joint/torque_command"]
     after = of_kind(
@@ -222,7 +223,8 @@ def test_scale_of_the_torque(run: Run, factor: float, severity: str) -> None:
 
 
 def test_duty_cycle_in_the_place_of_a_torque(run: Run) -> None:
-    """A weak motor behind much back-EMF: what its driver gives is the speed rather than the torque."""
+    """A weak motor behind much back-EMF: what its driver gives is the speed rather than the
+    torque."""
     log = run(*GANTRY)
     resistance, constant, supply = 0.2, 8.0, 12.0
     volts = resistance / constant * log["joint/torque_command"] + constant * log["joint/velocity"]

@@ -1,4 +1,5 @@
-"""Inertial parameters from motion: what a log shows, and values that a body can have. Truth: closed forms of a planar two-link arm."""
+"""Inertial parameters from motion: what a log shows, and values that a body can have. Truth: closed
+forms of a planar two-link arm."""
 
 import dataclasses
 from collections.abc import Callable
@@ -38,7 +39,8 @@ from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, bu
 
 G, LENGTH, PERIOD = 9.81, 0.4, 0.005
 BODIES = ("upper", "lower")
-# Mass, centre of mass in the plane, and rotational inertia about the centre of mass of each link: as believed, and as they are.
+# Mass, centre of mass in the plane, and rotational inertia about the centre of mass of each link:
+# as believed, and as they are.
 BELIEVED = {"upper": (4.0, 0.20, 0.0, 0.06), "lower": (2.5, 0.15, 0.0, 0.03)}
 TRUE = {"upper": (5.0, 0.17, 0.03, 0.09), "lower": (1.8, 0.22, -0.02, 0.02)}
 COULOMB, VISCOUS = np.array([1.5, 0.8]), np.array([0.6, 0.9])
@@ -112,7 +114,8 @@ def motion(duration: float = 16.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 
 def planar(links: dict[str, tuple[float, float, float, float]]) -> np.ndarray:
-    """The six combinations that a planar arm shows: mx1 + m2 l, mz1, I1 + m2 l^2, mx2, mz2, I2, about the joints."""
+    """The six combinations that a planar arm shows: mx1 + m2 l, mz1, I1 + m2 l^2, mx2, mz2, I2,
+    about the joints."""
     (m1, x1, z1, i1), (m2, x2, z2, i2) = links.values()
     first = [m1 * x1 + m2 * LENGTH, m1 * z1, i1 + m1 * (x1**2 + z1**2) + m2 * LENGTH**2]
     return np.array([*first, m2 * x2, m2 * z2, i2 + m2 * (x2**2 + z2**2)])
@@ -182,7 +185,8 @@ def test_true_combinations_and_friction_lie_in_their_intervals(identified: Ident
 
 
 def test_the_completed_model_predicts_what_was_not_fitted(identified: Identification) -> None:
-    """Down to the noise of the torque, averaged over a block, and the friction's jumps within one."""
+    """Down to the noise of the torque, averaged over a block, and the friction's jumps within
+    one."""
     assert identified.before["rest"].relative > 0.2
     assert identified.after["rest"].relative < 0.01
     assert max(identified.after["rest"].rms.values()) < 3 * NOISE / np.sqrt(10)
@@ -195,7 +199,8 @@ def test_what_the_plane_does_not_show_stays_with_the_model(identified: Identific
     for name in ("my", "ixy", "iyz"):
         assert inertia.uncertainty[:, PARAMETERS.index(name)].min() > 0.999, name
         assert np.abs(inertia.change[:, PARAMETERS.index(name)]).max() < 1e-6
-    # Masses are seen only with moments, and inertia about the other axes only as far as all belong to one distribution of mass.
+    # Masses are seen only with moments, and inertia about the other axes only as far as all belong
+    # to one distribution of mass.
     for name in ("mass", "ixx", "izz", "ixz"):
         assert inertia.uncertainty[:, PARAMETERS.index(name)].min() > 0.1, name
     assert not inertia.at_the_edge
@@ -215,7 +220,8 @@ def test_identified_bodies_are_physical_and_the_scenario_holds_them(
 
 
 def test_bodies_at_the_edge_of_what_is_physical(folder: Path) -> None:
-    """Torques of a lower link with a moment but next to no inertia: least squares alone gives a body that cannot be."""
+    """Torques of a lower link with a moment but next to no inertia: least squares alone gives a
+    body that cannot be."""
     impossible = {**TRUE, "lower": (1.8, 0.22, 0.0, 0.02 - 1.8 * 0.22**2)}
     _, q, v, a = motion()
     log = recording()
@@ -231,7 +237,8 @@ def test_bodies_at_the_edge_of_what_is_physical(folder: Path) -> None:
 
 
 def test_consistent_parameters_against_a_closed_form() -> None:
-    """One body, of which only the mass is seen, and wrong by more than it has: the least mass that is allowed. And one that is inside."""
+    """One body, of which only the mass is seen, and wrong by more than it has: the least mass that
+    is allowed. And one that is inside."""
     own = np.eye(4)[None]
     X = np.zeros((1, 11))
     # The last coordinate is the lower right element of Z.
@@ -254,7 +261,8 @@ def test_base_columns_say_what_the_others_are() -> None:
 
 
 def test_an_inertia_effect_makes_the_body_that_another_file_describes(folder: Path) -> None:
-    """Drake's inverse dynamics of a URDF with the true links, and of the believed ones with the changes."""
+    """Drake's inverse dynamics of a URDF with the true links, and of the believed ones with the
+    changes."""
     changes = {name: {} for name in PARAMETERS}
     robots = [make_robot(str(folder / f"{name}.yaml"))[0] for name in ("believed", "true")]
     for body in BODIES:
@@ -313,7 +321,8 @@ def test_four_point_masses_have_any_inertia() -> None:
 
 
 def test_wrench_of_a_spinning_dumbbell() -> None:
-    """Two equal masses at +-r on x that spin about z: no force, no moment; turning faster needs 2 m r^2 alpha, lifting 2 m a."""
+    """Two equal masses at +-r on x that spin about z: no force, no moment; turning faster needs 2 m
+    r^2 alpha, lifting 2 m a."""
     m, r, spin = 1.5, 0.3, 4.0
     phi = np.zeros(10)
     phi[[PARAMETERS.index(n) for n in ("mass", "iyy", "izz")]] = 2 * m, 2 * m * r**2, 2 * m * r**2
@@ -333,7 +342,8 @@ def test_wrench_of_a_spinning_dumbbell() -> None:
 
 
 def test_columns_of_a_floating_robot_are_what_changing_the_model_does() -> None:
-    """All rows of the biped, base rows too: the residual's change with the inertia effect, which goes through Drake's inverse dynamics."""
+    """All rows of the biped, base rows too: the residual's change with the inertia effect, which
+    goes through Drake's inverse dynamics."""
     random = np.random.default_rng(4)
     bare = build_robot(RobotConfig("biped"))
     n, body = len(bare.joint_names), "trunk"
@@ -378,7 +388,8 @@ def test_friction_is_found_beside_inertia_that_is_not_trusted(
 
 
 def test_friction_that_is_trusted_away_is_not_named(folder: Path) -> None:
-    """A robot without friction, whose inertia is wrong: inertia alone explains it, and nothing else is named."""
+    """A robot without friction, whose inertia is wrong: inertia alone explains it, and nothing else
+    is named."""
     result = diagnose(
         Predictor(scenario(folder), recording(friction=False)),
         [library()[name] for name in EFFECTS],
@@ -388,7 +399,8 @@ def test_friction_that_is_trusted_away_is_not_named(folder: Path) -> None:
 
 
 def test_load_dependent_friction_is_told_from_torque_that_explains_itself(folder: Path) -> None:
-    """Friction of 12 % of the load in the shoulder. A share of the measured torque near 1 would explain any log, inertia being free."""
+    """Friction of 12 % of the load in the shoulder. A share of the measured torque near 1 would
+    explain any log, inertia being free."""
     _, q, v, a = motion()
     sign = np.tanh(v / 0.01)
     tau = torque(planar(TRUE), q, v, a) + COULOMB * sign + VISCOUS * v
@@ -425,7 +437,8 @@ def test_a_study_ends_with_one_change_of_inertia(folder: Path) -> None:
 
 
 def test_torques_that_were_filtered_by_who_recorded_them(folder: Path) -> None:
-    """Friction jumps, recorded torques do not: read as they are the rest is many times larger than through the same low-pass."""
+    """Friction jumps, recorded torques do not: read as they are the rest is many times larger than
+    through the same low-pass."""
     log = recording(cutoff=3.0)
     as_is, through = (
         identify(scenario(folder, recorded_cutoff=corner), log) for corner in (0.0, 3.0)

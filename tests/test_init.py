@@ -146,7 +146,8 @@ def described(tmp_path: Path, urdf: Path):
 
 
 def standing(robot: Robot) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Where its feet are in the base in the proposed posture, and how far they are turned from up."""
+    """Where its feet are in the base in the proposed posture, and how far they are turned from
+    up."""
     names, context = robot.description, robot.plant.CreateDefaultContext()
     robot.set_joint_positions(context, names.per_joint(names.stance, key="stance", default=0.0))
     poses = {

@@ -1,4 +1,5 @@
-"""The rows of a log pair a held torque with the motion that it belongs to, whatever made the motion."""
+"""The rows of a log pair a held torque with the motion that it belongs to, whatever made the
+motion."""
 
 from dataclasses import replace
 from functools import cache

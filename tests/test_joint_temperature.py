@@ -278,7 +278,8 @@ def test_a_sensor_that_does_not_fit_the_robot_gets_one_line(
     (tmp_path / "strain.py").write_text(MINE.replace(old, new))
     path = tmp_path / "mine.yaml"
     path.write_text(
-        "mine:\n  effect_modules: [strain.py]\n  robot: {description: pendulum}\n  reference: !JointSines {}\n"
+        "mine:\n  effect_modules: [strain.py]\n  robot: {description: pendulum}\n  reference: "
+        "!JointSines {}\n"
         "  sensors: {more: {gauges: !StrainGauge {}}}\n"
     )
     with pytest.raises(InputError, match=message):

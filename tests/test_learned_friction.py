@@ -37,7 +37,8 @@ def name(law: LearnedFriction) -> str:
 
 
 def learn(law: LearnedFriction, velocity: np.ndarray, friction: np.ndarray) -> list[np.ndarray]:
-    """Posteriors while a joint moves, of whose friction the observer tells what its filter passes."""
+    """Posteriors while a joint moves, of whose friction the observer tells what its filter
+    passes."""
     types = FrictionLearner.input_types(ROBOT)
     rig = Rig(FrictionLearner(law, ROBOT, **types, clock=CLOCK))
     keep, behind, posteriors = np.exp(-2 * np.pi * law.bandwidth * TICK), 0.0, []
@@ -57,7 +58,8 @@ def stribeck(velocity: np.ndarray) -> np.ndarray:
 
 
 def test_no_step_moves_parameters_away_from_the_true_ones():
-    """At any rate, whatever the motion; the step is the projection that Goodwin and Sin prove it for."""
+    """At any rate, whatever the motion; the step is the projection that Goodwin and Sin prove it
+    for."""
     generator = np.random.default_rng(0)
     truth = generator.normal(size=(3, 4))
     for gain in (1e-3, 1.0, 1e6):
@@ -72,7 +74,8 @@ def test_no_step_moves_parameters_away_from_the_true_ones():
 
 
 def test_adaptive_friction_learns_the_sizes_of_a_law_of_its_shape():
-    """The truth comes from the effect library. Slowly, for what is fast fits each sample by itself."""
+    """The truth comes from the effect library. Slowly, for what is fast fits each sample by
+    itself."""
     effect = CoulombViscousFriction(
         coulomb={"all": 1.2}, viscous={"all": 0.7}, transition={"all": 0.01}
     )

@@ -119,7 +119,8 @@ def test_best_filter_errs_as_much_and_another_one_more() -> None:
 
 
 def one_joint(rows: int, slope: float, prior: FrictionPrior, noise: float) -> WalkModel:
-    """A joint of 0.2 kg m^2 with friction of one parameter, and no other sensor than its encoder."""
+    """A joint of 0.2 kg m^2 with friction of one parameter, and no other sensor than its
+    encoder."""
     nothing = np.zeros((rows, 0, 6, 1))
     return WalkModel(
         period=PERIOD,

@@ -1,4 +1,5 @@
-"""Joint accelerations and link torque, against textbook algebra, Drake, and the truth of simulated motions."""
+"""Joint accelerations and link torque, against textbook algebra, Drake, and the truth of simulated
+motions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -92,7 +93,8 @@ def test_fusion_is_weighted_least_squares():
 def test_link_torque_is_drakes_wherever_the_base_is(seed: int):
     """The estimator knows neither attitude nor velocity of the base; Drake does, and says the same.
 
-    So neither an error of the estimated attitude nor one of the base's velocity can spoil the link torque.
+    So neither an error of the estimated attitude nor one of the base's velocity can spoil the link
+    torque.
     """
     generator = np.random.default_rng(seed)
     robot, plant = BASE.robot, BASE.robot.plant
@@ -233,7 +235,8 @@ def test_joint_accelerations_keep_standing_feet_where_they_are(method: str):
 
 
 def residual_error(log: Log, result: Log) -> np.ndarray:
-    """Measured minus true friction, where no foot is just touching the ground. (There the model does without forces below the noise.)"""
+    """Measured minus true friction, where no foot is just touching the ground. (There the model
+    does without forces below the noise.)"""
     loads = np.stack([log[f"foot/{side}/pad_force"][:, :, 2].sum(axis=1) for side in log.sides])
     swings = (
         np.abs(np.stack([log[f"foot/{side}/pad_force"] for side in log.sides])).max(axis=(2, 3))
@@ -250,7 +253,8 @@ def residual_error(log: Log, result: Log) -> np.ndarray:
 def test_residual_is_the_friction_where_sensors_are_exact(run: Run):
     """Measured: half of the ticks within 0.7 mNm, all within 4 mNm.
 
-    What is left: the IMU gives the specific force in its axes at the step's end, the posture is that of its start.
+    What is left: the IMU gives the specific force in its axes at the step's end, the posture is
+    that of its start.
     """
     log = part(run("paper_walk", "duration=3", noise=False), 1.6)
     friction = rms(log["truth/joint/friction_torque"])
@@ -259,7 +263,8 @@ def test_residual_is_the_friction_where_sensors_are_exact(run: Run):
     assert friction > 0.2
     assert np.median(fused) < 2e-3
     assert fused.max() < 1e-2
-    # In double support the paper's condition leaves nine unknowns to six equations for each foot, in single support it drops the swing leg.
+    # In double support the paper's condition leaves nine unknowns to six equations for each foot,
+    # in single support it drops the swing leg.
     shortest = residual_error(
         log,
         estimated(
@@ -282,7 +287,8 @@ def heavier(urdf: str, link: str) -> str:
 def test_residual_does_not_know_the_trunks_mass(run: Run, tmp_path: Path):
     """The joint rows of a leg hold only what hangs on it.
 
-    The invariant filter learns the accelerometer's bias from the foot forces and the whole mass, so this is about the other.
+    The invariant filter learns the accelerometer's bias from the foot forces and the whole mass, so
+    this is about the other.
     """
     log = part(run("paper_walk", "duration=3", noise=False), 0.8)
     config = Fbse(support=PlannedSupport(), base_state=ContactAided())

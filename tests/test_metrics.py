@@ -32,7 +32,8 @@ SETTLING = 200
 
 
 def made_log(**further: np.ndarray) -> Log:
-    """Two legs of two joints, 2 s: the left leg stands in the first second, the right one in the second; friction is a sine."""
+    """Two legs of two joints, 2 s: the left leg stands in the first second, the right one in the
+    second; friction is a sine."""
     time = np.arange(SAMPLES) * 0.001
     friction = np.sin(7 * time)[:, None] * np.array([1.0, 2.0, 3.0, 4.0])
     left = time < 1.0
@@ -229,7 +230,8 @@ def test_base_velocity_is_compared_at_the_same_time():
 
 
 def innovations(scale: float) -> dict[str, np.ndarray]:
-    """White innovations of the attitude's filters, `scale` times as large as they are said to be; no level feet."""
+    """White innovations of the attitude's filters, `scale` times as large as they are said to be;
+    no level feet."""
     random = np.random.default_rng(1)
     deviation = np.array([0.1, 0.1, 0.1, 2.0, 2.0, 2.0])
     innovation = np.hstack(
@@ -251,7 +253,8 @@ def test_consistent_filters_are_within_the_bounds_and_others_are_not():
         assert found.count == 3 * (SAMPLES - SETTLING)
         assert found.lower < found.nis < found.upper
         assert bad[part].nis == pytest.approx(4 * found.nis)
-    # Half the width of the bounds is about 1.96 standard deviations of the mean of squares of normal variables.
+    # Half the width of the bounds is about 1.96 standard deviations of the mean of squares of
+    # normal variables.
     assert (found.upper - found.lower) / 2 == pytest.approx(
         1.96 * math.sqrt(2 / found.count), rel=0.01
     )

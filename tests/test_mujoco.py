@@ -116,7 +116,8 @@ def test_mass_matrix_and_bias_are_drakes(description: str) -> None:
 
 @needs_mujoco
 def test_a_payload_is_where_the_effect_has_it() -> None:
-    """Mass matrix and gravity of the arm with a ball, and of Drake's with the effect that is the answer."""
+    """Mass matrix and gravity of the arm with a ball, and of Drake's with the effect that is the
+    answer."""
     ball = Payload("link_6", 2.0, (0.12, 0.03, 0.0))
     (answer,) = ball.answers
     values = {name: dict(of_target) for name, of_target in answer.parameters.items()}

@@ -1,4 +1,5 @@
-"""Noise that is larger than believed is said once, and used; it is not taken for an effect, and hides none."""
+"""Noise that is larger than believed is said once, and used; it is not taken for an effect, and
+hides none."""
 
 from dataclasses import replace
 from functools import cache
@@ -106,7 +107,8 @@ def test_effect_is_found_beside_more_noise(torque: float, velocity: float) -> No
 
 
 def test_noise_of_a_sensor_is_told_from_that_of_the_torque() -> None:
-    """The channel of a sensor shows its noise by itself; what the rows have beyond it is the torque's."""
+    """The channel of a sensor shows its noise by itself; what the rows have beyond it is the
+    torque's."""
     scenario, log = run()
     by_torque, by_velocity = (
         Predictor(scenario, noisy(log, 3, *times)).noise for times in ((3.0, 1.0), (1.0, 3.0))

@@ -18,7 +18,8 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path
 
 
 class ThisInterpretersKernel(AsyncKernelManager):
-    """Starts kernels with the interpreter that runs the tests, whatever else the machine calls python3."""
+    """Starts kernels with the interpreter that runs the tests, whatever else the machine calls
+    python3."""
 
     @property
     def kernel_spec(self) -> KernelSpec:

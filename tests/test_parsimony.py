@@ -1,6 +1,8 @@
-"""The smallest explanation: effective samples, laws that contain simpler ones, pooling, and what does not pay.
+"""The smallest explanation: effective samples, laws that contain simpler ones, pooling, and what
+does not pay.
 
-Truth comes from planned motions and from torques that are added to them here, by formulas of this file.
+Truth comes from planned motions and from torques that are added to them here, by formulas of this
+file.
 """
 
 from collections.abc import Callable, Mapping
@@ -65,7 +67,8 @@ def coulomb(size: float) -> Law:
 
 
 def test_blocks_per_sample_is_the_integrated_autocorrelation_time():
-    """White noise: 1. A first-order autoregression: (1 + a) / (1 - a); times a wave, 1 / its spectrum there."""
+    """White noise: 1. A first-order autoregression: (1 + a) / (1 - a); times a wave, 1 / its
+    spectrum there."""
     random, count = np.random.default_rng(0), 20_000
     white = random.standard_normal((count, 3))
     coloured = white.copy()
@@ -161,7 +164,8 @@ def test_knees_that_agree_are_one_finding_and_knees_that_differ_are_two(
 
 
 def test_slow_errors_of_the_model_are_no_findings(swing: tuple[Scenario, Log]):
-    """A friction that is found, beside a slow random walk of the torque that the library does not have."""
+    """A friction that is found, beside a slow random walk of the torque that the library does not
+    have."""
     walk = np.cumsum(np.random.default_rng(1).standard_normal(len(swing[1].time)))
     walk *= 0.5 / walk.std()
     effects = (*FRICTION, "TorqueRipple", "JointSpring", "QuadraticDrag", "ThermalDrift")
@@ -188,7 +192,8 @@ def test_a_law_names_a_row_only_if_it_explains_half_of_it(
 def friction_in_all_joints(
     swing: tuple[Scenario, Log], size: float
 ) -> tuple[Proposals, Explanation]:
-    """Coulomb friction, so many times slow random walks of the torques of all joints, and its fit."""
+    """Coulomb friction, so many times slow random walks of the torques of all joints, and its
+    fit."""
     scenario, log = swing
     random = np.random.default_rng(3)
     torque = log["joint/torque_command"].copy()

@@ -1,5 +1,5 @@
-"""Loads at any body: found by their mass and place, without being told where. Truth: models with one more link, through Drake's inverse
-dynamics."""
+"""Loads at any body: found by their mass and place, without being told where. Truth: models with
+one more link, through Drake's inverse dynamics."""
 
 import dataclasses
 import os
@@ -92,7 +92,8 @@ def described(folder: Path, name: str, urdf: str, joints: list[str]) -> str:
 
 
 def arm(name: str) -> tuple[str, list[str]]:
-    """URDF and joints of an arm; `light_hand` is the `arm` with a last link of a tenth of the mass."""
+    """URDF and joints of an arm; `light_hand` is the `arm` with a last link of a tenth of the
+    mass."""
     if name == "ur10":
         folder = os.environ.get("FBSE_DATA_DIR")
         if not folder:
@@ -121,7 +122,8 @@ def swung(
     duration: float = 6.0,
     speed: float = 1.0,
 ) -> tuple[Scenario, Log]:
-    """An arm that swings all axes, some of them held still, with noise in torques and encoders; and what is believed of it."""
+    """An arm that swings all axes, some of them held still, with noise in torques and encoders; and
+    what is believed of it."""
     urdf, joints = arm(name)
     believed = described(folder, "believed", urdf, joints)
     true = described(
@@ -216,7 +218,8 @@ def test_a_load_is_found_with_its_place(name: str, load: Load, tmp_path: Path) -
 
 
 def test_a_load_on_a_shank_of_a_walking_robot_is_found(tmp_path: Path) -> None:
-    """Of a floating base: its weight is in the forces under the feet, its place in joints and moments."""
+    """Of a floating base: its weight is in the forces under the feet, its place in joints and
+    moments."""
     load = Load("left_shank", 2.0, (0.05, 0.03, -0.15))
     scenario = load_scenario(
         "frictionless_walk", overrides=["duration=3.0", "reference.single_supports=2"]
@@ -264,7 +267,8 @@ def test_an_arm_that_carries_nothing_has_no_load(tmp_path: Path) -> None:
 
 
 def test_what_a_slow_arm_does_not_show_of_a_load_stays_small(tmp_path: Path) -> None:
-    """Its mass and place are seen by their weight; how it is spread is not, and does not make it implausible."""
+    """Its mass and place are seen by their weight; how it is spread is not, and does not make it
+    implausible."""
     load = Load("link_6", 2.0, (0.1, -0.05, 0.02))
     scenario, log = swung(tmp_path, "arm", load, seed=6, speed=0.2)
     diagnosis = diagnose(Predictor(scenario, log), EFFECTS)
@@ -287,7 +291,8 @@ def test_a_joint_at_rest_does_not_tell_which_of_its_bodies_carries_a_load(tmp_pa
 
 
 def test_identification_is_not_held_back_by_the_model(tmp_path: Path) -> None:
-    """A load of 25 times the hand's own mass: as least squares on the same rows, whose columns nobody believes anything of."""
+    """A load of 25 times the hand's own mass: as least squares on the same rows, whose columns
+    nobody believes anything of."""
     load = Load("link_6", 3.0, (0.1, 0.03, 0.05))
     scenario, log = swung(tmp_path, "light_hand", load, seed=4)
     scenario = dataclasses.replace(scenario, identify=IdentifyConfig(["link_6"]))
@@ -321,7 +326,8 @@ def test_a_payload_is_the_mass_that_it_says() -> None:
 
 
 def test_bodies_that_are_fixed_to_each_other_carry_one_load(tmp_path: Path) -> None:
-    """And what is fixed to the world carries none; a mass is suspected where there is much of it."""
+    """And what is fixed to the world carries none; a mass is suspected where there is much of
+    it."""
     urdf, joints = arm("arm")
     grip = Load("link_6", 0.3, (0.05, 0.0, 0.0)).xml
     description = described(tmp_path, "grip", urdf.replace("</robot>", f"{grip}</robot>"), joints)
@@ -339,7 +345,8 @@ def test_a_fit_takes_no_more_mass_off_a_body_than_it_has() -> None:
 
 
 def test_a_load_lies_within_reach_of_its_body() -> None:
-    """However well one a body's length away would fit, as it may where feet are measured wrongly."""
+    """However well one a body's length away would fit, as it may where feet are measured
+    wrongly."""
     unsure = dataclasses.replace(ARM, torque_noise=tuple(20 * noise for noise in ARM.torque_noise))
     predictor = unsure.predictor(unsure.log(unsure.course()))
     fits = Fits(Dictionary(predictor, [Payload]))

@@ -89,7 +89,8 @@ def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
 
 
 def tumbling_energy_drift(time_step: float) -> float:
-    """Largest change of the total energy of a freely falling robot with moving joints, relative to its kinetic energy."""
+    """Largest change of the total energy of a freely falling robot with moving joints, relative to
+    its kinetic energy."""
     builder = DiagramBuilder()
     robot, _ = make_robot(
         "biped", builder=builder, config=MultibodyPlantConfig(time_step=time_step)
@@ -132,9 +133,11 @@ def test_friction_takes_energy_out_of_every_joint(run: Run, name: str):
 
 
 def closure(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """What is left of the equation of motion in each step: on the joints against the injected friction, and on the base.
+    """What is left of the equation of motion in each step: on the joints against the injected
+    friction, and on the base.
 
-    Uses logged channels, true accelerations over the same step and Drake's model, nothing of the simulation.
+    Uses logged channels, true accelerations over the same step and Drake's model, nothing of the
+    simulation.
     """
     config = scenario(name).robot
     robot, _ = make_robot(
@@ -188,7 +191,8 @@ def closure(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_closure_without_contact(run: Run):
-    """To rounding, but in the few steps that Drake's solver ends at its relative tolerance of 1e-6, as where the law has a corner."""
+    """To rounding, but in the few steps that Drake's solver ends at its relative tolerance of 1e-6,
+    as where the law has a corner."""
     joint_error, _ = closure(run("leg_swing_gantry", "duration=3", noise=False), "leg_swing_gantry")
     assert np.mean(joint_error.max(axis=1) < 1e-9) > 0.99
     assert joint_error.max() < 2e-3
@@ -196,9 +200,11 @@ def test_closure_without_contact(run: Run):
 
 @pytest.mark.parametrize("name", ["squat", "paper_walk", "hrp2_friction_walk"])
 def test_closure_with_contact(run: Run, name: str):
-    """The model returns the friction as exactly as Drake's contact solver closes the six unactuated equations.
+    """The model returns the friction as exactly as Drake's contact solver closes the six unactuated
+    equations.
 
-    The solver stops at a relative tolerance of 1e-6 of the momentum; what it leaves over shows in the base rows, where nothing else is.
+    The solver stops at a relative tolerance of 1e-6 of the momentum; what it leaves over shows in
+    the base rows, where nothing else is.
     """
     joint_error, base_error = (
         error.max(axis=1) for error in closure(run(name, "duration=3", noise=False), name)
@@ -212,7 +218,8 @@ def test_closure_with_contact(run: Run, name: str):
 
 @pytest.mark.parametrize("name", ["paper_walk", "hrp2_friction_walk", "strider_walk"])
 def test_friction_does_not_ring(run: Run, name: str):
-    """Of noise-free walks no more than a hundredth of the friction's power is above a quarter of the tick rate; hip yaws stick."""
+    """Of noise-free walks no more than a hundredth of the friction's power is above a quarter of
+    the tick rate; hip yaws stick."""
     friction = run(name, "duration=3", noise=False)["truth/joint/friction_torque"]
     power = np.abs(np.fft.rfft(friction - friction.mean(axis=0), axis=0)) ** 2
     share = power[len(power) // 2 :].sum(axis=0) / power.sum(axis=0)
@@ -224,8 +231,8 @@ def test_friction_does_not_ring(run: Run, name: str):
     [("squat", 0.99), ("sway", 0.99), ("paper_walk", 0.9), ("hrp2_friction_walk", 0.9)],
 )
 def test_closure_with_exactly_solved_contact(run: Run, name: str, share: float):
-    """Drake's `sap` contact is linear as long as pads keep standing or sliding, and joints between the
-    corners of their laws; then its solver's last step is exact."""
+    """Drake's `sap` contact is linear as long as pads keep standing or sliding, and joints between
+    the corners of their laws; then its solver's last step is exact."""
     joint_error, _ = closure(
         run(name, "duration=3", "plant.discrete_contact_approximation=sap", noise=False), name
     )

@@ -64,7 +64,8 @@ def test_help_waits_for_nothing_heavy() -> None:
     code = (
         "import sys\nfrom fbse_drake.cli import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([name for name in ('pydrake', 'numpy', 'numba', 'scipy', 'rich', 'dask', 'pyarrow') if name in sys.modules])"
+        "print([name for name in ('pydrake', 'numpy', 'numba', 'scipy', 'rich', 'dask', 'pyarrow') "
+        "if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

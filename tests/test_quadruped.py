@@ -1,4 +1,5 @@
-"""A robot with four legs of three joints on point feet: it stands, sways and trots on the same code."""
+"""A robot with four legs of three joints on point feet: it stands, sways and trots on the same
+code."""
 
 import numpy as np
 import pytest
@@ -127,7 +128,8 @@ def test_a_weight_in_the_middle_is_shared_evenly():
 def test_where_no_cone_is_in_the_way_forces_are_the_smallest():
     wrench = np.array([4.0, -6.0, 1.0, 5.0, -3.0, 100.0])
     forces = forces_under(wrench, np.ones(4))
-    # Moments count with the mean distance of the points; the wrench is met exactly, so no scale matters.
+    # Moments count with the mean distance of the points; the wrench is met exactly, so no scale
+    # matters.
     smallest = np.linalg.pinv(grasp_map(CORNERS)) @ wrench
     np.testing.assert_allclose(forces.ravel(), smallest, atol=0.01)
 

@@ -1,5 +1,5 @@
-"""The double pendulum of the DFKI, measured: inertia and plain friction, and what the diagnosis adds to it. Fitted is the first 70 % of one
-record, the rest is for the test."""
+"""The double pendulum of the DFKI, measured: inertia and plain friction, and what the diagnosis
+adds to it. Fitted is the first 70 % of one record, the rest is for the test."""
 
 import os
 from pathlib import Path
@@ -24,7 +24,8 @@ pytestmark = pytest.mark.skipif(
     not RECORD.is_file(), reason="FBSE_DATA_DIR does not hold the records of the double pendulum"
 )
 MAP = Path(__file__).parent.parent / "scenarios" / "real" / "double_pendulum.map.yaml"
-# Of the library, those that decide and some that do not; `fbse study real/double_pendulum` tries all of it.
+# Of the library, those that decide and some that do not; `fbse study real/double_pendulum` tries
+# all of it.
 EFFECTS = (
     "CoulombFriction",
     "ViscousFriction",
@@ -58,7 +59,8 @@ def found(recording: tuple[Scenario, Log, Log]) -> Study:
 
 
 def test_the_model_is_the_published_one(recording: tuple[Scenario, Log, Log]) -> None:
-    """Without friction its equation of motion in closed form, with the makers' parameters, leaves the same."""
+    """Without friction its equation of motion in closed form, with the makers' parameters, leaves
+    the same."""
     scenario, train, _ = recording
     predictor = Predictor(scenario, train)
     at, g = predictor.motion.steps, 9.81
@@ -120,6 +122,7 @@ def test_no_round_makes_the_rest_worse(found: Study) -> None:
 
 
 def test_the_model_keeps_what_the_search_promised(found: Study) -> None:
-    """The search predicts the held-out error with a law made linear in its parameters; the model has the law itself."""
+    """The search predicts the held-out error with a law made linear in its parameters; the model
+    has the law itself."""
     step = found.steps[1]
     assert step.train_rmse < 1.1 * step.held_out_rmse

@@ -1,5 +1,6 @@
-"""EMPS, a carriage on a ball screw, as recorded for a benchmark (Janot, Gautier and Brunot 2019): what its publishers identified, and what
-they missed. The record with force pulses is never fitted."""
+"""EMPS, a carriage on a ball screw, as recorded for a benchmark (Janot, Gautier and Brunot 2019):
+what its publishers identified, and what they missed. The record with force pulses is never
+fitted."""
 
 import os
 from pathlib import Path
@@ -94,7 +95,8 @@ def test_their_model_leaves_what_they_say(
 
 
 def test_what_they_missed_is_named_and_holds_on_the_pulses(found: Study) -> None:
-    """Friction that grows faster with speed backwards than forwards, which they took for an offset; and a force that comes late."""
+    """Friction that grows faster with speed backwards than forwards, which they took for an offset;
+    and a force that comes late."""
     first, last = found.steps[0].errors, found.steps[-1].errors
     assert first["train"].relative > 0.6
     assert last["train"].relative < 0.031
@@ -107,7 +109,8 @@ def test_what_they_missed_is_named_and_holds_on_the_pulses(found: Study) -> None
 
 
 def test_the_model_keeps_what_the_search_promised(found: Study) -> None:
-    """The search predicts the held-out error with a law made linear in its parameters; the model has the law itself."""
+    """The search predicts the held-out error with a law made linear in its parameters; the model
+    has the law itself."""
     step = found.steps[1]
     assert step.train_rmse < 1.1 * step.held_out_rmse
 

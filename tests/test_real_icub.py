@@ -1,4 +1,5 @@
-"""The walk of a real iCub: no joint torques, so that only the six rows of the base and the standing soles say something."""
+"""The walk of a real iCub: no joint torques, so that only the six rows of the base and the standing
+soles say something."""
 
 import os
 from pathlib import Path
@@ -186,7 +187,8 @@ def estimated(scenario: Scenario, log: Log) -> EstimationResult:
 
 
 def own_pose_is_fresh(log: Log) -> np.ndarray:
-    """Rows in which the recording's own pose is neither held for more than 40 ms nor about to jump, (N,) bool.
+    """Rows in which the recording's own pose is neither held for more than 40 ms nor about to jump,
+    (N,) bool.
 
     Eight times it stands still for a quarter of a second while the gyro shows a turning base.
     """

@@ -1,4 +1,5 @@
-"""A UR10's exciting trajectory, from its bag: inertia is identified with friction, and tested on the part that was not fitted."""
+"""A UR10's exciting trajectory, from its bag: inertia is identified with friction, and tested on
+the part that was not fitted."""
 
 import os
 from pathlib import Path
@@ -42,7 +43,8 @@ def identified(recording: tuple[Scenario, Log, Log]) -> Identification:
 def test_all_base_parameters_of_six_links_are_excited(
     recording: tuple[Scenario, Log, Log], identified: Identification
 ) -> None:
-    """This arm, whose first joint is upright, has 36 (Gautier and Khalil 1990); what the fit leaves over hides some of them."""
+    """This arm, whose first joint is upright, has 36 (Gautier and Khalil 1990); what the fit leaves
+    over hides some of them."""
     scenario, train, _ = recording
     inertia = untrusted_inertia(Predictor(scenario, train).motion, scenario.identify.inertia)
     columns = inertia.columns.reshape(-1, len(inertia.model))
@@ -52,7 +54,8 @@ def test_all_base_parameters_of_six_links_are_excited(
 
 
 def test_plain_friction_and_inertia(identified: Identification) -> None:
-    """The relative torque error of a plain fit is 5.4 % on what is fitted, and 16 % on the first joint's rest."""
+    """The relative torque error of a plain fit is 5.4 % on what is fitted, and 16 % on the first
+    joint's rest."""
     assert identified.before["train"].relative == pytest.approx(0.453, abs=0.005)
     assert identified.after["train"].relative < 0.038
     assert identified.after["rest"].relative_by_joint[FIRST] < 0.054

@@ -1,4 +1,5 @@
-"""A real servo that swings a pendulum: from the motor's constants alone to the friction that it has, and simulated against its records."""
+"""A real servo that swings a pendulum: from the motor's constants alone to the friction that it
+has, and simulated against its records."""
 
 import os
 from pathlib import Path
@@ -24,7 +25,8 @@ pytestmark = pytest.mark.skipif(
     "FBSE_DATA_DIR" not in os.environ or not DATA.is_dir(),
     reason="needs the recordings bam_xl330 in the folder that FBSE_DATA_DIR names",
 )
-# Of the effects that are tried, those that concern a joint of a motor with a gear; the whole library takes minutes.
+# Of the effects that are tried, those that concern a joint of a motor with a gear; the whole
+# library takes minutes.
 FEW = [
     LoadDependentFriction,
     TorqueRollOff,
@@ -72,7 +74,8 @@ def mean_error(error: RolloutError | None) -> float:
 
 
 def test_the_firmware_commands_what_the_model_of_it_says(train: Log, believed: Scenario):
-    """Duty cycle over position error, in every record: the recorded command is the position loop's."""
+    """Duty cycle over position error, in every record: the recorded command is the position
+    loop's."""
     for segment in train.meta["segments"]:
         rows = (
             (train.time >= segment["start"])

@@ -30,7 +30,8 @@ def white_of(values: np.ndarray) -> WhitenedResidual:
 
 
 def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
-    """In single rows and in all, with and without an offset, a belief and a bound; of very different units."""
+    """In single rows and in all, with and without an offset, a belief and a bound; of very
+    different units."""
     return [
         Signature(np.array([0]), 1e-4 * rng.normal(size=(blocks, 1, 2))),
         Signature(np.array([1]), rng.normal(size=(blocks, 1, 1)), rng.normal(size=(blocks, 1))),
@@ -44,7 +45,8 @@ def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
 def plain_least_squares(
     white: WhitenedResidual, signatures: Sequence[Signature], held_out: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and what is left (B, R), from the columns one below the other; rows are weighted as `Regression` says."""
+    """Parameters and what is left (B, R), from the columns one below the other; rows are weighted
+    as `Regression` says."""
     size = sum(s.values.shape[2] for s in signatures)
     X, y = np.zeros((*white.y.shape, size)), white.y.copy()
     prior, lowest, start = np.zeros(size), np.full(size, -np.inf), 0
@@ -79,7 +81,8 @@ def plain_least_squares(
 
 @pytest.mark.parametrize("noise", [1.0, 1e-6])
 def test_fits_by_inner_products_are_those_of_plain_least_squares(noise: float) -> None:
-    """Also where a residual of some thousands of noises is explained to the last millionth: squares must not cancel."""
+    """Also where a residual of some thousands of noises is explained to the last millionth: squares
+    must not cancel."""
     rng = np.random.default_rng(4)
     signatures = some_signatures(rng, 500)
     values = noise * rng.normal(size=(500, ROWS))

@@ -1,4 +1,5 @@
-"""The report of a run: what it shows, that it holds everything it shows, and that it copes with logs that lack channels."""
+"""The report of a run: what it shows, that it holds everything it shows, and that it copes with
+logs that lack channels."""
 
 import base64
 import dataclasses
@@ -36,7 +37,8 @@ PADS = np.array([[0.1, 0.05, 0.0], [0.1, -0.05, 0.0], [-0.1, 0.05, 0.0], [-0.1, 
 
 
 def walking_log(samples: int = SAMPLES, *, fell: bool = False) -> Log:
-    """Two legs of two joints: a quarter of the time on both feet, then on the left, on both and on the right one."""
+    """Two legs of two joints: a quarter of the time on both feet, then on the left, on both and on
+    the right one."""
     joints = ["left_hip", "left_knee", "right_hip", "right_knee"]
     time = np.arange(samples) * 0.01
     wave = np.sin(time)[:, None] * np.arange(1, 5)
@@ -91,7 +93,8 @@ def joints_only_log() -> Log:
 
 
 def estimated_log(scenario: str = "walk: {estimator: !Fbse {}}") -> Log:
-    """`walking_log` with estimates: friction 10 % too large, roll wrong by half a degree, filters that are consistent."""
+    """`walking_log` with estimates: friction 10 % too large, roll wrong by half a degree, filters
+    that are consistent."""
     log, random = walking_log(), np.random.default_rng(0)
     truth = log["truth/joint/friction_torque"]
     tilt = math.radians(0.5) / 2

@@ -1,4 +1,5 @@
-"""Reports and recordings of runs in a real browser, headless Chromium: they need nothing outside themselves, and show all they hold."""
+"""Reports and recordings of runs in a real browser, headless Chromium: they need nothing outside
+themselves, and show all they hold."""
 
 import io
 import math
@@ -247,8 +248,10 @@ def test_recording_of_a_run_shows_the_robot(visit: Visitor, folder: Path):
 
 def test_what_is_wrong_with_a_page_is_seen(visit: Visitor, tmp_path: Path):
     (tmp_path / "bad.html").write_text(
-        "<h2>a</h2><img src='http://localhost:1/picture.png'><img src='data:image/png;base64,broken'>"
-        "<script>new WebSocket('ws://localhost:1'); throw new Error('thrown')</script><div style='width: 2000px'>wide</div>"
+        "<h2>a</h2><img src='http://localhost:1/picture.png'><img "
+        "src='data:image/png;base64,broken'>"
+        "<script>new WebSocket('ws://localhost:1'); throw new Error('thrown')</script><div "
+        "style='width: 2000px'>wide</div>"
     )
     (seen,) = visit(tmp_path / "bad.html", (1280, "light"))
     assert {"http://localhost:1/picture.png", "ws://localhost:1/"} <= set(seen.requests)

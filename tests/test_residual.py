@@ -1,4 +1,5 @@
-"""The residual is what the sensors' noise makes it when nothing is missing, and shows what is missing when something is."""
+"""The residual is what the sensors' noise makes it when nothing is missing, and shows what is
+missing when something is."""
 
 from dataclasses import replace
 

@@ -87,7 +87,8 @@ def test_an_elastic_elbow_is_no_encoder_offset_and_no_lag(arm: Course) -> None:
 
 
 def test_noise_of_the_torque_is_no_motion_of_an_elastic_joint(arm: Course) -> None:
-    """With its elasticity in the model nothing is left but noise, which the twist raises by half at most."""
+    """With its elasticity in the model nothing is left but noise, which the twist raises by half at
+    most."""
     course, torque = elastic(arm, 1, 4000.0)
     log, believed = ARM.log(course, torque), ARM.scenario
     effect = TransmissionElasticity({"axis_2": 1 / 4000}, {"all": 4e-3})
@@ -122,7 +123,8 @@ def test_a_tether_is_unknown(arm: Course) -> None:
 
 
 def test_play_with_the_encoder_on_the_link_is_backlash(arm: Course) -> None:
-    """Where the torque changes its sign, the rotor crosses the gap, in some 40 ms; the link does not feel it."""
+    """Where the torque changes its sign, the rotor crosses the gap, in some 40 ms; the link does
+    not feel it."""
     torque, own = arm.torque.copy(), arm.torque[:, 0]
     crossing = own / (np.abs(arm.rate(own)).std() * 0.04)
     gap = 0.005 * np.tanh(3 * crossing)
@@ -153,7 +155,8 @@ def test_a_crooked_imu_is_no_bias_and_no_slope(crooked: Predictor) -> None:
 
 
 def test_a_rival_is_compared_where_it_fits(crooked: Predictor) -> None:
-    """A rotation is linear for small angles only: at 2 deg its slope at zero leaves what the rotation does not."""
+    """A rotation is linear for small angles only: at 2 deg its slope at zero leaves what the
+    rotation does not."""
     fits = Fits(Dictionary(crooked, [ImuMisalignment]))
     at_zero = fits.explain(fits.fixed_candidates)
     there = fitted(fits, at_zero)

@@ -1,4 +1,5 @@
-"""Effects on inertia, in sensors and in contact: what they do to plants, readings and standing soles."""
+"""Effects on inertia, in sensors and in contact: what they do to plants, readings and standing
+soles."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -210,7 +211,8 @@ def test_inertia_that_no_body_has_is_refused():
 
 
 def lift(robot: Robot, body: str, q: np.ndarray) -> np.ndarray:
-    """How fast the centre of mass of a body rises per rate of each joint, with the base level and at rest, (n,) [m]."""
+    """How fast the centre of mass of a body rises per rate of each joint, with the base level and
+    at rest, (n,) [m]."""
     plant, context = robot.plant, robot.plant.CreateDefaultContext()
     robot.set_state(context, q, np.zeros(12), RigidTransform())
     frame, com, world = (
@@ -354,7 +356,8 @@ def test_foot_force_errors(plain: Robot):
 
 
 def wrenches(robot: Robot, force: np.ndarray) -> np.ndarray:
-    """By hand: [moment, force] of each foot from the forces on its pads or corners, (..., feet, 6)."""
+    """By hand: [moment, force] of each foot from the forces on its pads or corners,
+    (..., feet, 6)."""
     places = [robot.pad_positions(side) for side in robot.description.sides]
     parts = np.split(force, np.cumsum([len(p) for p in places])[:-1], axis=-2)
     return np.stack(
@@ -502,7 +505,8 @@ def sole_motion(robot: Robot, log: Log, side: str) -> tuple[np.ndarray, np.ndarr
 def recovered(
     effect: type[ContactEffect], robot: Robot, log: Log, side: str, rows: slice, axes: Sequence[int]
 ) -> tuple[float, float]:
-    """Parameter with which the predicted motion of a standing sole fits the true one best, and the share of that motion which it explains.
+    """Parameter with which the predicted motion of a standing sole fits the true one best, and the
+    share of that motion which it explains.
 
     Args:
         axes: of [rotation, displacement].

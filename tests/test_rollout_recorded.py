@@ -1,4 +1,5 @@
-"""A model simulated against a recording, with the recording's own reference: exact for the true model, closed forms for others."""
+"""A model simulated against a recording, with the recording's own reference: exact for the true
+model, closed forms for others."""
 
 import dataclasses
 import multiprocessing
@@ -29,7 +30,8 @@ KP, KD = 8.0, 0.1
 def pendulum(
     model: dict[str, Effect], robot: dict[str, Effect] | None = None, kp: float = KP, gain: str = ""
 ) -> Scenario:
-    """A pendulum with a position loop and a recorded reference, or (with effects of a robot) one that swings slowly."""
+    """A pendulum with a position loop and a recorded reference, or (with effects of a robot) one
+    that swings slowly."""
     return Scenario(
         duration=4.0,
         robot=RobotConfig("pendulum", effects=robot or {}),
@@ -84,7 +86,8 @@ def test_the_true_model_does_what_the_robot_did(log: Log):
 
 
 def test_a_missing_friction_costs_its_torque_over_the_stiffness(log: Log):
-    """Slow motion: kp (reference - q) = m g l sin q + friction, so that friction is worth friction / (kp + m g l cos q) of position."""
+    """Slow motion: kp (reference - q) = m g l sin q + friction, so that friction is worth
+    friction / (kp + m g l cos q) of position."""
     error = rollout(pendulum({"motor": TRUE["motor"]}), log)
     moving = np.abs(log["joint/velocity"][:, 0]) > 0.2
     late = np.abs(error.position_error[moving, 0])
@@ -167,7 +170,8 @@ def test_nobody_knows_what_was_asked_for():
 
 
 def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
-    """A flywheel at full voltage: w = V / kt (1 - exp(-t / tau)) with tau = J R / kt^2, from the stall torque kt V / R on."""
+    """A flywheel at full voltage: w = V / kt (1 - exp(-t / tau)) with tau = J R / kt^2, from the
+    stall torque kt V / R on."""
     kt, resistance, voltage, inertia = 0.35, 3.4, 7.4, 0.02
     (tmp_path / "wheel.urdf").write_text(f"""
 <robot name="wheel">
@@ -211,7 +215,8 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
 
 
 def test_what_compensates_friction_moves_the_model_too():
-    """The robot's friction was fed forward: the true model does the same, one that is not compensated does not."""
+    """The robot's friction was fed forward: the true model does the same, one that is not
+    compensated does not."""
     law = CoulombViscousFriction(
         coulomb={"all": 0.08}, viscous={"all": 0.0}, transition={"all": 0.02}
     )
@@ -241,7 +246,8 @@ def test_an_estimate_that_is_only_watched_is_left_out_of_a_rollout(
 
 
 def test_a_walk_is_simulated_with_its_estimator_and_compensation():
-    """The estimator of a rollout believes what it believed when the log was made: frictionless joints."""
+    """The estimator of a rollout believes what it believed when the log was made: frictionless
+    joints."""
     walk = load_scenario("hrp2_walk_fbse", overrides=("duration=0.3",))
     log = simulate(walk).log
     model = dataclasses.replace(walk, model=walk.robot)

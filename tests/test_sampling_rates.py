@@ -29,7 +29,8 @@ def decimated(log: Log, every: int) -> Log:
     return Log(kept, log.meta | {"period": every * log.meta["period"]})
 
 
-# Measured: 0.08, 0.10, 0.23, 0.29, 0.52; 0.7, 0.8, 1.0, 1.4, 1.8 mm/s; 0.01, 0.01, 0.02, 0.02, 0.04 deg.
+# Measured: 0.08, 0.10, 0.23, 0.29, 0.52; 0.7, 0.8, 1.0, 1.4, 1.8 mm/s; 0.01, 0.01, 0.02, 0.02, 0.04
+# deg.
 @pytest.mark.parametrize(
     ("every", "friction", "velocity", "tilt"),
     [

@@ -1,4 +1,5 @@
-"""A robot that shares nothing with the biped: names, order, axes and lengths of its joints, six-axis sensors in its feet."""
+"""A robot that shares nothing with the biped: names, order, axes and lengths of its joints,
+six-axis sensors in its feet."""
 
 import dataclasses
 import shutil
@@ -129,7 +130,8 @@ def test_it_walks(log: Log):
 
 
 def test_wrenches_change_the_momentum(log: Log):
-    """Newton: what the feet feel in a step is the weight and what the centre of mass's velocity changes in it."""
+    """Newton: what the feet feel in a step is the weight and what the centre of mass's velocity
+    changes in it."""
     force = sum(log[f"truth/foot/{side}/wrench"][1:, 3:] for side in log.sides)
     change = 50.0 * np.diff(log["truth/com/velocity"], axis=0) / 1e-3
     np.testing.assert_allclose(force.mean(axis=0), change.mean(axis=0) + [0, 0, WEIGHT], atol=0.3)
@@ -168,7 +170,8 @@ def test_wrench_is_that_of_drakes_contacts():
 
 
 def test_corners_are_as_good_as_pads(run, tmp_path: Path):
-    """The paper's biped, its four pads under each foot replaced by a six-axis sensor with corners in the same places."""
+    """The paper's biped, its four pads under each foot replaced by a six-axis sensor with corners
+    in the same places."""
 
     def feels_wrenches(d: dict) -> dict:
         places = [[x, y, 0.0] for x in (0.11, -0.11) for y in (0.05, -0.05)]
@@ -277,7 +280,8 @@ def test_the_noise_floor_is_that_of_six_axis_sensors():
     dynamic = [k for k, row in enumerate(residual.rows) if row.kind in ("joint", "base")]
     ratio = row_rms(residual.value, residual.known)[dynamic] / residual.noise_floor[dynamic]
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)
-    # Of one sensor's noise alone, it is that of the wrench through the leg: on level soles the base's rows add up both feet.
+    # Of one sensor's noise alone, it is that of the wrench through the leg: on level soles the
+    # base's rows add up both feet.
     forces = dataclasses.replace(
         case, sensors=dataclasses.replace(SensorsConfig(), foot_force=case.sensors.foot_force)
     )

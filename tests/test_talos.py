@@ -122,7 +122,8 @@ def test_it_walks_and_its_friction_is_estimated(talos: dict, tmp_path: Path):
 
 
 def test_driven_elbows_are_estimated_too(talos: dict, tmp_path: Path):
-    """Before the walk begins the elbows are moved by nothing but the body's sway; their friction is small, and so is the error."""
+    """Before the walk begins the elbows are moved by nothing but the body's sway; their friction is
+    small, and so is the error."""
     posture = "{arm_left_4_joint: -0.5, arm_right_4_joint: -0.5}"
     log = simulate(
         walking(

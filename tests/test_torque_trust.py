@@ -1,4 +1,5 @@
-"""What is said of torques that are not what they are called, and what is not said where a machine's own physics looks alike."""
+"""What is said of torques that are not what they are called, and what is not said where a machine's
+own physics looks alike."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -111,7 +112,8 @@ def test_a_scale_is_asserted_where_nothing_else_explains_it(arm: Course, scale: 
 
 
 def test_a_pendulum_s_scale_may_be_its_weight(pendulum: Course) -> None:
-    """A heavier or longer weight needs a torque in proportion: nothing tells it from another unit."""
+    """A heavier or longer weight needs a torque in proportion: nothing tells it from another
+    unit."""
     finding = only(said(PENDULUM, PENDULUM.log(pendulum, 1.6 * pendulum.torque)))
     assert (finding.kind, finding.severity) == ("torque_or_model", "note")
     assert finding.size == pytest.approx(1.6, rel=0.02)
@@ -181,7 +183,8 @@ def test_saturated_torque_is_clipped_and_of_no_other_scale(arm: Course) -> None:
 
 
 def test_chances_are_what_they_say() -> None:
-    """Of two readings that are equally good the one is called better than the other as often as stated."""
+    """Of two readings that are equally good the one is called better than the other as often as
+    stated."""
     random, blocks, alarms = np.random.default_rng(3), 300, []
     stretch = np.arange(blocks) // 15
     for _ in range(2000):
@@ -198,7 +201,8 @@ def test_chances_are_what_they_say() -> None:
 
 
 def test_rows_that_are_not_to_be_trusted_are_not_explained(arm: Course) -> None:
-    """A dead torque is no motor of which a share of -700 % arrives; friction of its neighbour is found all the same."""
+    """A dead torque is no motor of which a share of -700 % arrives; friction of its neighbour is
+    found all the same."""
     torque = of_one(arm, np.zeros_like)
     torque[:, 2] += 6.0 * np.tanh(arm.velocity[:, 2] / 0.01)
     log = ARM.log(arm, torque)

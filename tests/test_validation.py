@@ -1,4 +1,5 @@
-"""Data that was set aside before anything was fitted: errors with intervals, and what heads a result."""
+"""Data that was set aside before anything was fitted: errors with intervals, and what heads a
+result."""
 
 import dataclasses
 import functools
@@ -96,7 +97,8 @@ def test_errors_are_those_of_norms_and_the_change_is_surer_than_either(
     )
     assert result.change.value == pytest.approx(ratio)
     assert result.change.value == pytest.approx(result.after.value / result.before.value)
-    # A bias that is tiny beside all else does not show beyond doubt, nor does a model beside itself.
+    # A bias that is tiny beside all else does not show beyond doubt, nor does a model beside
+    # itself.
     same = validated(given, given)
     assert same.course == "unclear"
     assert same.change.interval == pytest.approx((1.0, 1.0))
@@ -123,7 +125,8 @@ FEW = [CoulombFriction, TorqueBias]
 def test_a_study_is_headed_by_what_was_set_aside(
     swing: tuple[Scenario, Log], at_the_end: float, course: str
 ):
-    """What held-out blocks of the fitted part say is not enough: friction whose sign changes later on."""
+    """What held-out blocks of the fitted part say is not enough: friction whose sign changes later
+    on."""
     scenario, log = swing
     train, rest = train_and_rest(scenario, rubbing(log, 2.0, at_the_end))
     result = study(scenario, train, FEW, rollouts=False, tests={"rest of the log": rest})

@@ -2,8 +2,9 @@
 
     python -m benchmarks.fuzz [--inputs 20000] [--seed 0] [--only KIND] [--out out/fuzz]
 
-Nothing may end in a traceback, hang, leave a half-written file or run code. What does is kept in DIR, each input in a folder
-with its command and what happened. Inputs follow from seed and number: the same number is the same input.
+Nothing may end in a traceback, hang, leave a half-written file or run code. What does is kept in
+DIR, each input in a folder with its command and what happened. Inputs follow from seed and number:
+the same number is the same input.
 """
 
 import argparse
@@ -26,7 +27,8 @@ import fbse_drake.commands  # noqa: F401  (once, and not in every process)
 from benchmarks.fuzz.attack import TimeLimit, Verdict, attack
 from benchmarks.fuzz.files import KINDS, right_files
 
-# What an input may take of a processor's time [s], and until its process is ended, however busy the machine is [s].
+# What an input may take of a processor's time [s], and until its process is ended, however busy the
+# machine is [s].
 LIMIT, PATIENCE = 20.0, 150.0
 # Address space of a process [bytes].
 _MEMORY = 6 * 2**30
@@ -35,7 +37,8 @@ _BATCH = 500
 
 
 def _limited(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    """Does what somebody would who waits: Ctrl-C, which keeps what is known; it is a hang if nothing is."""
+    """Does what somebody would who waits: Ctrl-C, which keeps what is known; it is a hang if
+    nothing is."""
     if Path("out").is_dir() and signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         signal.setitimer(signal.ITIMER_PROF, LIMIT)
         signal.raise_signal(signal.SIGINT)

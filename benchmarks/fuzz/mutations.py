@@ -147,7 +147,8 @@ def gently_changed(text: str, random: np.random.Generator) -> str:
 
 
 def changed(tree: Any, random: np.random.Generator) -> Any:
-    """A tree with a few places changed: other values, keys that are missing, renamed or too many."""
+    """A tree with a few places changed: other values, keys that are missing, renamed or too
+    many."""
     tree = copy.deepcopy(tree)
     for _ in range(random.integers(1, 3)):
         places = list(_places(tree))
