@@ -12,19 +12,25 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test docs lint format bench fuzz fbse rivals hidden clean
+.PHONY: walk test docs lint kernels format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
 
 # A file's tests share its runs, so they stay on one worker.
-test: lint
+test: $(INSTALLED)
+	$(MAKE) --jobs 2 lint kernels
 	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+# Compiles the estimators of two legs and of four, which nearly all tests need, once for all workers.
+kernels: $(INSTALLED)
+	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
+		[simulate(load(walk, overrides=['duration=0.01'])) for walk in ('paper_walk_fbse', 'quadruped_trot')]"
 
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .
