@@ -42,9 +42,9 @@ def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:
     return result if noise else dataclasses.replace(result, sensors=SensorsConfig())
 
 
-def swinging_legs(duration: float, noise: float) -> tuple[Scenario, Log]:
+def swinging_legs(duration: float, noise: float, *changes: str) -> tuple[Scenario, Log]:
     """Legs that swing in a gantry without any friction, as planned; believed to be noisy [Nm]."""
-    overrides = [f"duration={duration}", "log.period=0.01"]
+    overrides = [f"duration={duration}", "log.period=0.01", *changes]
     scenario = load_scenario("leg_swing_gantry", overrides=overrides)
     bare = dataclasses.replace(scenario.robot, effects={})
     believed = dataclasses.replace(scenario, robot=bare, model=bare)

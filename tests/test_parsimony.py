@@ -66,6 +66,21 @@ def coulomb(size: float) -> Law:
     return lambda velocity: size * np.tanh(velocity / 0.01)
 
 
+def test_a_joint_that_rests_has_no_law_of_its_motion():
+    """Where a velocity is noise alone, a torque that goes with it is no friction."""
+    joint = "left_hip_yaw"
+    scenario, log = swinging_legs(4, NOISE, "reference.amplitude.hip_yaw=0")
+    place, random = log.joints.index(joint), np.random.default_rng(7)
+    channels = {name: values.copy() for name, values in log.channels.items()}
+    noise = 5e-3 * random.standard_normal(len(log.time))
+    channels["joint/velocity"][:, place] += noise
+    channels["joint/torque_command"][:, place] += 20 * noise
+    resting = scenario, Log(channels, log.meta)
+    assert not np.ptp(channels["joint/position"][:, place])
+    diagnosis = diagnosis_of(resting, {LEFT: coulomb(0.5)}, (*FRICTION, "ThermalDrift"))
+    assert found(diagnosis) == {"CoulombFriction": (LEFT,)}
+
+
 def test_blocks_per_sample_is_the_integrated_autocorrelation_time():
     """White noise: 1. A first-order autoregression: (1 + a) / (1 - a); times a wave, 1 / its
     spectrum there."""

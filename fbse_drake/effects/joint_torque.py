@@ -98,6 +98,8 @@ class JointTorqueEffect(Effect):
     has_memory: ClassVar[bool] = False
     # Does the torque depend on nothing but the velocity? (Then it is simulated faster.)
     of_velocity_alone: ClassVar[bool] = False
+    # Can it be told in a joint that rests, as what the drive makes of its command can?
+    shows_at_rest: ClassVar[bool] = False
     # Simpler laws that it contains, the simplest first: a diagnosis names the smallest that holds.
     reductions: ClassVar[tuple[Reduction, ...]] = ()
 
@@ -145,16 +147,16 @@ class JointTorqueEffect(Effect):
         """Memory at the end of the step, shape (rows, ..., n)."""
         raise NotImplementedError
 
-    @staticmethod
-    def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | bool:  # noqa: ARG004
+    @classmethod
+    def shows_within(cls, travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray | bool:  # noqa: ARG003
         """Does a joint that moves through a range of angles show what the effect is, and not just
         its value and slope there?
 
         Args:
-            travel: from the smallest to the largest angle, shape (n,) [rad].
+            travel: from the smallest to the largest angle, 0 of a joint that rests, (n,) [rad].
             nonlinear: values of the nonlinear parameters, shape (m,) or (m, n).
         """
-        return True
+        return cls.shows_at_rest or travel > 0
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004

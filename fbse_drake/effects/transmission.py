@@ -49,8 +49,8 @@ class TorqueRipple(JointTorqueEffect):
         angle = nonlinear[0] * motion.position
         return (np.sin(angle), np.cos(angle)), (0.0, 0.0)
 
-    @staticmethod
-    def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+    @classmethod
+    def shows_within(cls, travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
         """Half a wave at least: less of it is a spring."""
         return nonlinear[0] * travel > np.pi
 

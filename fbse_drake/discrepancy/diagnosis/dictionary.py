@@ -15,6 +15,7 @@ from fbse_drake.discrepancy.identification.inertial import (
     untrusted_inertia,
 )
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
+from fbse_drake.discrepancy.residual.evidence import travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
@@ -59,7 +60,7 @@ class Dictionary:
         # In a log per step it is not known at which velocity within the step a law holds: what such a law leaves is weak evidence.
         self.per_step = predictor.scenario.recording.rows == "per_step"
         self.joints = predictor.robot.joint_names
-        self.travel = np.ptp(predictor.motion.signals.joint_position, axis=0)
+        self.travel = travel_of(predictor.motion.signals.joint_position)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
         self._untrusted = set(untrusted)

@@ -7,6 +7,7 @@ from scipy.signal import welch
 from scipy.special import comb
 
 from fbse_drake.discrepancy.residual.evidence import (
+    STILL,
     Evidence,
     HygieneFinding,
     NoiseLevel,
@@ -44,8 +45,6 @@ _DIFFERENCE = 6
 _QUIET_SAMPLES, _QUIET = 100, 0.25
 # Measured noise may be below the believed by this factor.
 _NOISE_FACTOR = 3.0
-# A joint that moves less than this does not move [rad or m].
-STILL = 1e-4
 
 
 def check_sampling(evidence: Evidence) -> Iterable[HygieneFinding]:

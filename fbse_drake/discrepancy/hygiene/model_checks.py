@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import binary_erosion, uniform_filter1d
 
-from fbse_drake.discrepancy.hygiene.channel_checks import SPECTRUM, STILL
+from fbse_drake.discrepancy.hygiene.channel_checks import SPECTRUM
 from fbse_drake.discrepancy.hygiene.sanity import rate_by_legs
 from fbse_drake.discrepancy.hygiene.torque_checks import check_torque
 from fbse_drake.discrepancy.hygiene.torque_readings import (
@@ -19,7 +19,13 @@ from fbse_drake.discrepancy.hygiene.torque_readings import (
     fitted,
     gain,
 )
-from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding, remark, remarks
+from fbse_drake.discrepancy.residual.evidence import (
+    Evidence,
+    HygieneFinding,
+    remark,
+    remarks,
+    travel_of,
+)
 from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, rms
 
 # Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation from which on a delay can be told.
@@ -191,9 +197,9 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 def check_resting_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
     """Joints that do not move."""
-    travel = np.ptp(evidence.log["joint/position"], axis=0)
-    resting = travel < np.maximum(STILL, 3 * evidence.quantum["joint/position"])
-    at_rest = {joint: float(travel[k]) for k, joint in enumerate(evidence.joints) if resting[k]}
+    position = evidence.log["joint/position"]
+    resting, size = travel_of(position) == 0, np.ptp(position, axis=0)
+    at_rest = {joint: float(size[k]) for k, joint in enumerate(evidence.joints) if resting[k]}
     text = "{where} does not move ({size}); nothing can be said of its friction"
     yield from remarks(
         "no_motion", "note", "joint/position", at_rest, evidence.units["joint/position"], text

@@ -13,6 +13,8 @@ Severity = Literal["note", "warning", "untrustworthy"]
 
 # Samples at which channels are compared at the log's own rate.
 _SAMPLES = 4000
+# A joint that moves less than this does not move [rad or m]; nor one that moves by few of its encoder's steps.
+STILL, _STEPS = 1e-4, 3
 # A foot is in the air while it carries less than this share of the weight and the others more than that one.
 _UNLOADED, _LOADED = 0.06, 0.85
 
@@ -205,6 +207,16 @@ def remarks(
             kind, severity, channel, sizes[first], unit, text.format(where=named, size=size), where
         )
     ]
+
+
+def travel_of(position: np.ndarray) -> np.ndarray:
+    """How far joints move in measured positions (N, n), from the smallest to the largest, (n,) [rad or m].
+
+    It is 0 where their sensors do not tell it from rest.
+    """
+    travel = np.ptp(position, axis=0)
+    least = [max(STILL, _STEPS * step_of(column)) for column in position.T]
+    return np.where(travel < least, 0.0, travel)
 
 
 def step_of(column: np.ndarray) -> float:
