@@ -184,7 +184,15 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
                 "<td>not visible</td><td>change none in left and right knee pitch</td>",
             ],
         ),
-        (NOTHING, True, ["Nothing is missing", "no effect makes it smaller on held-out data"]),
+        (
+            NOTHING,
+            True,
+            [
+                "Nothing is missing",
+                "1 of 4 effects would not show in this log.",
+                "no effect makes it smaller on held-out data",
+            ],
+        ),
         (
             UNKNOWN,
             False,

@@ -164,12 +164,21 @@ def _verdict(diagnosis: Diagnosis) -> str:
             name for finding in diagnosis.chosen for name in finding.confusable_with
         )
         return f"The model lacks {found}{f'; this log cannot tell that from {either_effect(doubtful)}' if doubtful else ''}."
+    statuses = applicable(diagnosis.effects)
+    hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
-        return f"Nothing is missing: what the model leaves over is the sensors' noise ({number(diagnosis.held_out_before)} times it)."
+        unseen = (
+            f"; {hidden} of {len(statuses)} effects would not show in this log" if hidden else ""
+        )
+        return (
+            "Nothing is missing: what the model leaves over is the sensors' noise "
+            f"({number(diagnosis.held_out_before)} times it){unseen}."
+        )
     if diagnosis.verdict == "not_visible":
-        statuses = applicable(diagnosis.effects)
-        hidden = sum(status.verdict == "not_visible" for status in statuses.values())
-        return f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} effects would not show in it."
+        return (
+            f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} "
+            "effects would not show in it."
+        )
     known = f" The model also lacks {found}." if found else ""
     return f"{_unexplained(diagnosis)}{known}"
 
