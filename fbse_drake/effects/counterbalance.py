@@ -43,8 +43,8 @@ class Counterbalance(JointTorqueEffect):
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         return (np.cos(motion.position), np.sin(motion.position)), (0.0, 0.0)
 
-    @staticmethod
-    def shows_within(travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
+    @classmethod
+    def shows_within(cls, travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG003
         """A quarter of a turn at least, over which its slope changes by all of itself: less of it
         is a spring."""
         return travel > 0.5 * np.pi
