@@ -1,7 +1,7 @@
 """Runs a scenario's estimator over a recorded log."""
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.estimator import make_estimator
+from fbse_drake.estimators.estimator import Estimator, make_estimator
 from fbse_drake.estimators.recursive import start_share
 from fbse_drake.log import Log
 from fbse_drake.results import RunResult
@@ -75,6 +75,26 @@ def estimate(
     return EstimationResult(estimated, tick_time, replay.remarks, scenario, name)
 
 
+def friction_estimates(
+    scenario: Scenario, estimators: Sequence[Estimator], log: Log
+) -> list[np.ndarray]:
+    """Friction that several estimators tell over one log, (N, n) each [Nm].
+
+    Each is what `estimate` gives for it alone; but what they have in common is done once.
+
+    Raises:
+        InputError: see `estimate`; or one of them estimates no friction.
+    """
+    first, *beside = estimators
+    replay = Replay(replace(scenario, estimator=first), log, beside)
+    ports = replay.estimator.friction_ports
+    if len(ports) < len(estimators):
+        raise InputError("estimator: expected estimators of the friction only")
+    frictions = replay.frictions()
+    release(replay.estimator)
+    return frictions
+
+
 def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:
     """What a station's ports told when the log was recorded, (N, size) each, if the log says it."""
     if log.joints != robot.joint_names:
@@ -125,7 +145,8 @@ def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
 class Replay:
     """A scenario's estimator and a log that it runs over; see `estimate`."""
 
-    def __init__(self, scenario: Scenario, log: Log):
+    def __init__(self, scenario: Scenario, log: Log, beside: Sequence[Estimator] = ()):
+        """Builds the estimator, and others that run beside it, see `EstimatorDiagram`."""
         with located("model: "):
             robot = build_robot(scenario.believed)
         inputs = _inputs(scenario, robot, log)
@@ -139,6 +160,7 @@ class Replay:
             reading=_reading_time(scenario),
             sensors=sensors,
             knows_torque=knows_torque,
+            beside=beside,
         )
         if estimator is None:
             raise InputError("estimator: the scenario has none (estimator: !Fbse {})")
@@ -179,6 +201,17 @@ class Replay:
         two states.)"""
         self.estimator.CalcForcedUnrestrictedUpdate(self.context, self._next)
         self.context.SetDiscreteState(self._next_values)
+
+    def frictions(self) -> list[np.ndarray]:
+        """The friction that each of the estimators tells, (N, n) each [Nm]."""
+        ports = [self.estimator.GetOutputPort(name) for name in self.estimator.friction_ports]
+        values = [np.empty((len(self.time), port.size())) for port in ports]
+        for k in range(len(self.time)):
+            self.feed(k)
+            for port, friction in zip(ports, values, strict=True):
+                friction[k] = port.Eval(self.context)
+            self.update()
+        return values
 
     def run(
         self, progress: Callable[[float], None] | None = None

@@ -14,7 +14,9 @@ from fbse_drake import Log, build_station, load_scenario
 from fbse_drake.cli import BAD_INPUT, DONE, main
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
 from fbse_drake.errors import InputError
+from fbse_drake.estimation import estimate, friction_estimates
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
+from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.estimators.radial_basis import RadialBasisFriction
@@ -71,6 +73,27 @@ def test_all_are_tuned_by_the_same_budget_within_their_ranges():
     # More trials begin with the fewer.
     observer = RadialBasisFriction()
     assert list(trials(observer, 9))[:6] == list(trials(observer, 6))
+
+
+def test_side_by_side_each_tells_what_it_tells_alone(run: Run):
+    """Those that share the base, one with another base, one with none, and one twice."""
+    log = run("paper_walk", "duration=0.3")
+    estimators = [
+        DisturbanceObserver(),
+        Fbse(),
+        Fbse.paper(),
+        FixedFriction(),
+        DisturbanceObserver(bandwidth=5.0),
+        RadialBasisFriction(),
+        Fbse(),
+    ]
+    together = friction_estimates(WALK, estimators, log)
+    for estimator, friction in zip(estimators, together, strict=True):
+        alone = estimate(replace(WALK, estimator=estimator), log).log
+        np.testing.assert_array_equal(friction, alone["estimate/joint/friction_torque"])
+    assert not np.array_equal(together[0], together[4])
+    with pytest.raises(InputError, match="expected estimators of the friction only"):
+        friction_estimates(WALK, [Fbse(), NoEstimator()], log)
 
 
 def test_the_walk_that_is_tuned_on_is_none_of_those_compared():
@@ -237,9 +260,7 @@ def test_runs_tune_watch_and_feed_back(monkeypatch: pytest.MonkeyPatch, tmp_path
         done(runs.tuning(Material(0, values), text, str(tmp_path / "log.npz"), 4))
     )
     tried = {
-        estimator.cutoff: rival_methods.score(
-            runs.estimate(replace(walk, estimator=estimator), log).log
-        )
+        estimator.cutoff: rival_methods.score(estimate(replace(walk, estimator=estimator), log).log)
         for estimator in trials(TorqueSensor(), 4)
     }
     assert tuned.method.estimator.cutoff == min(tried, key=tried.__getitem__)

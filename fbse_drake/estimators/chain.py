@@ -1,8 +1,9 @@
 """Estimators wired into one diagram, each fed by what others of it estimate."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
-from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort, System
 from pydrake.systems.primitives import Demultiplexer
 
 from fbse_drake.errors import InputError
@@ -12,6 +13,20 @@ from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.plant import Robot
 from fbse_drake.signals import estimates
 from fbse_drake.walking.plan import TaskPlan
+
+S = TypeVar("S", bound=System)
+
+
+class Workshop:
+    """A diagram that chains are built in, side by side."""
+
+    def __init__(self) -> None:
+        self.builder = DiagramBuilder()
+        self.chains = 0
+        # Inputs of the diagram by signal.
+        self.inputs: dict[str, InputPort] = {}
+        # What chains have in common: of what it was made, and its systems by name.
+        self.parts: list[tuple[object, dict[str, RecursiveEstimator]]] = []
 
 
 class Chain:
@@ -30,7 +45,9 @@ class Chain:
         plan: TaskPlan | None,
         *,
         knows_torque: bool,
+        workshop: Workshop | None = None,
     ):
+        workshop = workshop or Workshop()
         # The model that is believed.
         self.robot = robot
         self.clock = clock
@@ -40,10 +57,13 @@ class Chain:
         self.plan = plan
         # Are the torque commands known?
         self.knows_torque = knows_torque
-        self.builder = DiagramBuilder()
+        self.builder = workshop.builder
+        self._workshop = workshop
+        # Sets names of this chain's systems and ports apart from those of others.
+        self._suffix = f"_{workshop.chains}" if workshop.chains else ""
+        workshop.chains += 1
         self._systems: dict[str, RecursiveEstimator] = {}
         self._fields: dict[str, Demultiplexer] = {}
-        self._signals: dict[str, InputPort] = {}
 
     @property
     def is_empty(self) -> bool:
@@ -54,6 +74,31 @@ class Chain:
     def knows_friction(self) -> bool:
         """Is there a system that estimates the friction?"""
         return "friction" in self._systems
+
+    @property
+    def friction_port(self) -> str:
+        """Name of the diagram's output port for the friction."""
+        return f"friction_estimate{self._suffix}"
+
+    def share(self, part: object, add: Callable[[], None]) -> None:
+        """Has systems added to this chain, or takes those that another chain has of the same part.
+
+        Nothing that is added later may feed them, or chains would hear each other.
+
+        Args:
+            part: all that the systems depend on beside robot, clock, plan and beliefs of the
+                sensors; equal for equal ones.
+            add: adds them.
+        """
+        part = (part, self.sensors)
+        for known, systems in self._workshop.parts:
+            if known == part:
+                self._systems |= systems
+                return
+        before = set(self._systems)
+        add()
+        added = {name: of for name, of in self._systems.items() if name not in before}
+        self._workshop.parts.append((part, added))
 
     def add(
         self, name: str, make: Callable[..., RecursiveEstimator], **sources: str
@@ -76,10 +121,14 @@ class Chain:
         """
         types = {port: self._system(source).posterior_type for port, source in sources.items()}
         system = make(**types, clock=self.clock)
-        self._systems[name] = self.builder.AddNamedSystem(name, system)
+        self._systems[name] = self.add_plain(name, system)
         for port, source in sources.items():
             self.connect(source, f"{name}.{port}")
         return system
+
+    def add_plain(self, name: str, system: S) -> S:
+        """Adds a system that is no estimator, and that nobody calls by its name."""
+        return self.builder.AddNamedSystem(f"{name}{self._suffix}", system)
 
     def alias(self, system: str, name: str) -> None:
         """Gives a system a second name, as one that does the work of two."""
@@ -93,11 +142,12 @@ class Chain:
 
     def feed(self, signal: str, port: InputPort) -> None:
         """Connects an input port to a signal, an input of the whole diagram."""
-        if signal in self._signals:
-            self.builder.ConnectToSame(self._signals[signal], port)
+        inputs = self._workshop.inputs
+        if signal in inputs:
+            self.builder.ConnectToSame(inputs[signal], port)
         else:
             self.builder.ExportInput(port, signal)
-            self._signals[signal] = port
+            inputs[signal] = port
 
     def finish(self) -> dict[str, tuple[int, ...]]:
         """Makes inputs and outputs of the diagram of what is to be seen of it.
@@ -118,11 +168,12 @@ class Chain:
                 raise InputError(
                     f"estimator: friction: expected a posterior with a field friction ({n},)"
                 )
-            self.builder.ExportOutput(self._field("friction", "friction"), "friction_estimate")
+            self.builder.ExportOutput(self._field("friction", "friction"), self.friction_port)
         for row in estimates():
             size = self._sizes(row.estimator).get(row.field)
             if size is not None:
-                self.builder.ExportOutput(self._field(row.estimator, row.field), row.port)
+                port = f"{row.port}{self._suffix}"
+                self.builder.ExportOutput(self._field(row.estimator, row.field), port)
                 channels[row.channel] = row.sample_shape(n, size)
         return channels
 
@@ -146,7 +197,7 @@ class Chain:
         if name not in self._fields:
             # The estimator has such a port itself, which is Python's and costs more.
             split = Demultiplexer(list(sizes.values()))
-            self._fields[name] = self.builder.AddNamedSystem(f"{name}_fields", split)
+            self._fields[name] = self.add_plain(f"{name}_fields", split)
             posterior = self._systems[name].GetOutputPort("posterior")
             self.builder.Connect(posterior, split.get_input_port())
         return self._fields[name].get_output_port(list(sizes).index(field))

@@ -11,7 +11,7 @@ An estimator of a user's own is such a class in a module that the scenario names
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
@@ -19,7 +19,7 @@ from pydrake.systems.framework import Diagram
 
 from fbse_drake.errors import located
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
-from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.chain import Chain, Workshop
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.library import require_new
 from fbse_drake.log import Log
@@ -132,22 +132,32 @@ class EstimatorDiagram(Diagram):
         output_ports:
         - friction_estimate
         - (one for each channel)
+        - friction_estimate_1
+        - (one for each further chain)
 
     Inputs are the signals that the estimator needs: `TorqueSensor` has `measured_torque` besides,
     `TrueFriction` `torque_loss`. `friction_estimate` (n,) [Nm] is that of the tick that ends now.
     The other outputs are named like the log channels they become, see `channels`. An `Fbse` that is
     not told the torque commands has neither `torque_command` nor `friction_estimate`.
+
+    Further chains estimate side by side with the first, and what several have in common is done
+    once. Ports and systems of the second are called as those of the first, with `_1`.
     """
 
     # Log channels, which are also names of output ports, and the shape of one sample.
     channels: dict[str, tuple[int, ...]]
     # Whether it estimates the friction.
     knows_friction: bool
+    # Names of the ports that tell the friction, one for each chain that knows it.
+    friction_ports: list[str]
 
-    def __init__(self, chain: Chain):
-        """Takes over the chain's systems."""
+    def __init__(self, chain: Chain, *further: Chain):
+        """Takes over the systems of chains of one workshop."""
         super().__init__()
         self.channels, self.knows_friction = chain.finish(), chain.knows_friction
+        for other in further:
+            other.finish()
+        self.friction_ports = [of.friction_port for of in (chain, *further) if of.knows_friction]
         chain.builder.BuildInto(self)
 
 
@@ -161,6 +171,7 @@ def make_estimator(
     reading: float | None = None,
     sensors: SensorBeliefs = USUAL_SENSORS,
     knows_torque: bool = True,
+    beside: Sequence[Estimator] = (),
 ) -> EstimatorDiagram | None:
     """Builds a friction estimator, or None where there is nothing to it (`NoEstimator`).
 
@@ -174,13 +185,17 @@ def make_estimator(
             by default the tick.
         sensors: what is believed of them where the config says nothing.
         knows_torque: the torque commands are known; without them an `Fbse` estimates no friction.
+        beside: further ones, see `EstimatorDiagram`.
 
     Raises:
         InputError: an estimator that does not fit the robot.
     """
     shortest = 1e-9 if every_sample else period * (1 - 1e-6)
     clock = Clock(period, shortest, period if reading is None else reading)
-    believed = config.believed_sensors(sensors)
-    chain = Chain(robot, clock, believed, plan, knows_torque=knows_torque)
-    config.add(chain)
-    return None if chain.is_empty else EstimatorDiagram(chain)
+    workshop, chains = Workshop(), list[Chain]()
+    for one in (config, *beside):
+        believed = one.believed_sensors(sensors)
+        chain = Chain(robot, clock, believed, plan, knows_torque=knows_torque, workshop=workshop)
+        one.add(chain)
+        chains.append(chain)
+    return None if chains[0].is_empty else EstimatorDiagram(*chains)

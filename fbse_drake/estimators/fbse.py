@@ -106,7 +106,7 @@ class Fbse(Estimator):
         )
 
     def add_base(self, chain: Chain) -> None:
-        """Adds `sensor_monitor`, `model`, `attitude` and `base_state`.
+        """Adds `sensor_monitor`, `model`, `attitude` and `base_state`, which chains share.
 
         Raises:
             InputError: a robot without a floating base and feet, or a planned support without a
@@ -117,9 +117,13 @@ class Fbse(Estimator):
             raise InputError(
                 "estimator: needs a robot with a floating base and feet (no gantry_height)"
             )
+        stages = (self.sensor_monitor, self.support, self.attitude, self.base_state)
+        chain.share(stages, partial(self._add_stages, chain))
+
+    def _add_stages(self, chain: Chain) -> None:
         feeds_back = self.base_state.feeds_back
         self.sensor_monitor.add(chain, self.support, hears_doubt=feeds_back)
-        make_model = partial(FloatingBaseModel, robot, knows_bias=feeds_back)
+        make_model = partial(FloatingBaseModel, chain.robot, knows_bias=feeds_back)
         chain.add("model", make_model, measurements="sensor_monitor")
         self.base_state.add(chain, self.attitude, _middle_of_feet(chain))
 

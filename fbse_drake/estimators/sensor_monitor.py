@@ -101,7 +101,7 @@ class SensorMonitorConfig:
             "measured_imu": 6,
             "measured_pad_force": 3 * len(FootPads(robot).foot),
         }
-        sensors = chain.builder.AddNamedSystem("sensors", Multiplexer(list(sizes.values())))
+        sensors = chain.add_plain("sensors", Multiplexer(list(sizes.values())))
         chain.builder.Connect(sensors.get_output_port(), monitor.GetInputPort("sensors"))
         for i, signal in enumerate(sizes):
             chain.feed(signal, sensors.get_input_port(i))

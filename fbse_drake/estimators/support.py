@@ -36,7 +36,7 @@ class PlannedSupport:
         plan, sides = chain.plan, chain.robot.description.sides
         support = np.stack([plan.support(side) for side in sides], axis=1).astype(float)
         signal = held_signal(support, float(plan.time[1] - plan.time[0]))
-        source = chain.builder.AddNamedSystem("planned_support", signal)
+        source = chain.add_plain("planned_support", signal)
         chain.builder.Connect(source.get_output_port(), monitor.GetInputPort("planned_support"))
 
 

@@ -87,7 +87,7 @@ class Comparison:
         for method, watched in result["watched"].items():
             by_case = self.nrmse.setdefault(case, {})
             by_case.setdefault(method, {})[seed] = watched["nrmse"]
-            if case == NOMINAL:
+            if "tick" in watched:
                 self.ticks.setdefault(method, {})[seed] = watched["tick"]
         if result["failure"] is not None:
             self.failures.setdefault(case, {})[seed] = result["failure"]

@@ -1,7 +1,7 @@
 """Methods that are compared, and how they are tuned: each in as many trials, on another walk."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from fbse_drake import schema
 from fbse_drake.errors import InputError
-from fbse_drake.estimation import estimate
+from fbse_drake.estimation import friction_estimates
 from fbse_drake.estimators.estimator import Estimator, library, make_estimator
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import friction_nrmse
@@ -151,9 +151,15 @@ def tune(method: Method, scenario: Scenario, log: Log, count: int) -> Tuned:
         count: trials.
     """
     tried = list(trials(method.estimator.identified(log), count))
-    scores = [score(estimate(replace(scenario, estimator=e), log).log) for e in tried]
+    scores = [score(estimated) for estimated in with_friction(scenario, tried, log)]
     best = int(np.argmin(scores))
     return Tuned(replace(method, estimator=tried[best]), len(tried), scores[0], scores[best])
+
+
+def with_friction(scenario: Scenario, estimators: Sequence[Estimator], log: Log) -> Iterator[Log]:
+    """The log with the friction that each of several estimators tells."""
+    for friction in friction_estimates(scenario, estimators, log):
+        yield Log(log.channels | {"estimate/joint/friction_torque": friction}, log.meta)
 
 
 def score(log: Log) -> float:
