@@ -156,6 +156,7 @@ from .estimators.friction import ModelAided as ModelAided
 from .estimators.friction import ModelAidedEstimator as ModelAidedEstimator
 from .estimators.fuzzy import FuzzyFriction as FuzzyFriction
 from .estimators.lugre import LuGreFriction as LuGreFriction
+from .estimators.network_friction import NetworkFriction as NetworkFriction
 from .estimators.radial_basis import RadialBasisFriction as RadialBasisFriction
 from .estimators.torque_sensor import TorqueSensor as TorqueSensor
 from .estimators.true_friction import TrueFriction as TrueFriction
