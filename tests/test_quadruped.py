@@ -1,6 +1,9 @@
 """A robot with four legs of three joints on point feet: it stands, sways and trots on the same
 code."""
 
+from dataclasses import replace
+from itertools import combinations
+
 import numpy as np
 import pytest
 from conftest import scenario
@@ -8,7 +11,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from rig import Base, rms
 
 from fbse_drake import Log
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.residual.residual import (
+    EquationOfMotion,
+    Instants,
+    RecordedMotion,
+    residual_rows,
+)
+from fbse_drake.effects.contact import GroundCompliance
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.joint_acceleration import no_slip_condition, still_rows
 from fbse_drake.estimators.records import record
@@ -220,5 +230,82 @@ def test_the_equation_of_motion_of_the_base_closes_on_point_feet(log: Log):
     white = residual.value[:, base] / np.sqrt(residual.variance[:, base])
     assert rms(white) < 2.0
     # How a point foot is turned nobody knows.
-    kinematic = [k for k, row in enumerate(residual.rows) if row.kind == "kinematic"]
-    assert not residual.known[:, kinematic].any()
+    soles = [k for k, row in enumerate(residual.rows) if "_sole/" in row.name]
+    assert not residual.known[:, soles].any()
+
+
+def test_between_two_point_feet_all_but_a_turn_about_their_line_shows(robot: Robot):
+    """Relative velocities are w x (p - q) and what the legs' joints do, by Drake's places of the feet."""
+    random = np.random.default_rng(3)
+    q = np.tile([0.05, 0.7, -1.3], 4) + random.uniform(-0.2, 0.2, 12)
+    rate, w, lean = random.normal(size=(3, 12)), random.normal(size=(3, 3)), 1e-6
+    context = robot.plant.CreateDefaultContext()
+
+    def place(side: str, angles: np.ndarray) -> np.ndarray:
+        robot.set_state(context, angles, np.zeros(12), RigidTransform(), np.zeros(6))
+        return robot.sole(side).CalcPoseInWorld(context).translation()
+
+    sides = robot.description.sides
+    here = {side: place(side, q) for side in sides}
+    motion = EquationOfMotion(robot)
+    rows = residual_rows(robot)
+    zeros = {"joint_acceleration": (3, 12), "angular_acceleration": (3, 3), "pad_force": (3, 4, 3)}
+    at = Instants(
+        joint_position=np.tile(q, (3, 1)),
+        joint_velocity=rate,
+        angular_velocity=w @ motion.R_BI,
+        specific_force=np.zeros((3, 3)),
+        torque_command=np.zeros((3, 12)),
+        **{name: np.zeros(shape) for name, shape in zeros.items()},
+    )
+
+    def relative(at: Instants, one: str, other: str) -> np.ndarray:
+        index = [k for k, row in enumerate(rows) if row.feet == (one, other)]
+        return motion.residual(at)[:, index]
+
+    for one, other in combinations(sides, 2):
+        by_joints = [
+            (place(one, q + lean * r) - place(other, q + lean * r)) / lean
+            - (here[one] - here[other]) / lean
+            for r in rate
+        ]
+        line = here[one] - here[other]
+        found = relative(at, one, other)
+        np.testing.assert_allclose(found, np.cross(w, line) + by_joints, atol=1e-5)
+        turned = replace(at, angular_velocity=at.angular_velocity + line @ motion.R_BI)
+        np.testing.assert_allclose(relative(turned, one, other), found, atol=1e-12)
+
+
+def test_pairs_of_feet_say_a_motion_once(log: Log):
+    """Of feet that stand one row less than they are; none of a foot that swings."""
+    config = scenario("quadruped_trot", *SHORT)
+    motion = RecordedMotion(build_robot(config.believed), config.sensors, config.recording, log)
+    rows = residual_rows(motion.robot)
+    pairs = [k for k, row in enumerate(rows) if row.name.endswith("relative_velocity_z")]
+    counts = motion.known[:, pairs].sum(axis=1)
+    assert counts.max() == 3
+    assert (counts <= np.maximum(motion.standing.sum(axis=1) - 1, 0)).all()
+    for k in pairs:
+        feet = [motion.robot.description.sides.index(side) for side in rows[k].feet]
+        assert motion.standing[motion.known[:, k]][:, feet].all()
+
+
+@pytest.mark.parametrize("compliance", [0.0, 2e-6])
+def test_soft_ground_shows_between_point_feet(run, compliance: float):
+    """Least squares over the rows finds what is simulated, and on firm ground nothing; noise is white."""
+    soft = f"robot.effects.soft=!GroundCompliance {{compliance: {compliance}}}"
+    log = run("quadruped_trot", *SHORT, *([soft] if compliance else []))
+    config = scenario("quadruped_trot", *SHORT)
+    predictor = Predictor(replace(config, model=config.robot), log)
+    residual = predictor.residual
+    rows = [k for k, row in enumerate(residual.rows) if "relative_velocity" in row.name]
+    known = residual.known[:, rows]
+    deviation = np.sqrt(residual.variance[:, rows])[known]
+    signature = predictor.signature(GroundCompliance, "robot", np.zeros(0))
+    places = [list(signature.rows).index(k) for k in rows]
+    column = signature.values[:, places, 0][known] / deviation
+    value = residual.value[:, rows][known] / deviation
+    found, error = (column @ value) / (column @ column), 1 / np.sqrt(column @ column)
+    assert error < 0.05 * 2e-6
+    assert abs(found - compliance) < 4 * error + 0.05 * compliance
+    assert rms(value - found * column) < 1.4

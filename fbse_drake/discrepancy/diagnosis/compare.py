@@ -275,7 +275,7 @@ class _RowErrors:
                 by_name = {
                     name: load
                     for name, load in by_name.items()
-                    if self.row.name.startswith((f"{name.split()[0]}_", "soles/"))
+                    if name.removesuffix(" foot load") in self.row.feet
                 }
         found += [
             _Variable(name, values, plus, self._edges(values, _QUANTILES))

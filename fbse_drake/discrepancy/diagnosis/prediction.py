@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
+from pydrake.math import RotationMatrix
 from scipy.ndimage import shift
 from scipy.signal import savgol_filter, welch
 
@@ -18,6 +19,7 @@ from fbse_drake.discrepancy.residual.residual import (
     Residual,
     averaged,
     block_means,
+    foot_pairs,
     joint_velocity_noise,
     residual_rows,
     rms,
@@ -607,8 +609,12 @@ class Predictor:
         return self._split_feet(self.motion.signals.pad_force)
 
     def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pad forces (N, P, 3) with their springs' share as normal component, and places (P, 3) of each foot."""
+        """Force (N, P, 3) on the pads of each foot, of which the normal component is their springs'
+        share, and places (P, 3) of these; in the axes of its contact, see `_contact_rotations`."""
         pads, force = self.motion.equation.pads, pad_force.copy()
+        for foot, R_LF in self._point_feet.items():
+            of_foot = pads.foot == foot
+            force[:, of_foot] = np.einsum("nij,npj->npi", R_LF, force[:, of_foot])
         force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
         return list(zip(pads.split(force), pads.split(pads.position), strict=True))
 
@@ -616,7 +622,8 @@ class Predictor:
         """Kinematic rows for soles that move like this.
 
         Args:
-            motions: rotation vector and displacement of each sole against level, still ground, in its frame, (N, 3) each.
+            motions: rotation vector and displacement of each sole against level, still ground, in
+                the axes of its contact, (N, 3) each.
         """
         motion, length, period = self.motion, self.motion.length, self.motion.period
         result = np.zeros((len(motion.time), self.rows))
@@ -643,18 +650,40 @@ class Predictor:
             )
             velocities.append(block_means(_later(moving, rate)[:-1], length))
             place += 6
-        if len(motions) == 2:
-            left, right = (
-                np.einsum("bij,bj->bi", R_BF, v)
-                for R_BF, v in zip(self._sole_rotations, velocities, strict=True)
-            )
-            result[:, place:] = left - right
+        moving = [
+            np.einsum("bij,bj->bi", R_BC, v)
+            for R_BC, v in zip(self._contact_rotations, velocities, strict=True)
+        ]
+        for one, other in foot_pairs(self.robot):
+            result[:, place : place + 3] = moving[one] - moving[other]
+            place += 3
         return result
 
     @cached_property
-    def _sole_rotations(self) -> list[np.ndarray]:
-        """R_BF of each sole in every block, (B, 3, 3)."""
-        return self.motion.equation.sole_rotations(self.motion.blocks)
+    def _contact_rotations(self) -> list[np.ndarray]:
+        """Axes of each foot's contact in every block, (B, 3, 3), in base axes: those of its sole; of
+        a point foot, which stands at any angle, level ones."""
+        rotations = self.motion.equation.sole_rotations(self.motion.blocks.joint_position)
+        for foot in self._point_feet:
+            rotations[foot] = np.broadcast_to(self._level, rotations[foot].shape)
+        return rotations
+
+    @cached_property
+    def _point_feet(self) -> dict[int, np.ndarray]:
+        """R_LF of every point foot in level axes L, (N, 3, 3)."""
+        points = [k for k, leg in enumerate(self.robot.description.legs.values()) if leg.is_point]
+        if not points:
+            return {}
+        equation = self.motion.equation
+        rotations = equation.sole_rotations(self.motion.signals.joint_position)
+        return {foot: self._level.T @ rotations[foot] for foot in points}
+
+    @cached_property
+    def _level(self) -> np.ndarray:
+        """R_BL of axes whose z is up in the mean over the log; a base without tilt has them itself."""
+        motion = self.motion
+        up = motion.equation.R_BI @ motion.signals.specific_force.mean(axis=0)
+        return RotationMatrix.MakeFromOneVector(up, 2).matrix()
 
     @cached_property
     def _contact(self) -> PadContact:

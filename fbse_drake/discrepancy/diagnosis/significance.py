@@ -36,7 +36,7 @@ class Significance:
                 ("base/force", _length(wrench[:, 3:])),
                 ("sole/angular_velocity", _length(legs[:, :3])),
                 ("sole/specific_force", equation.gravity),
-                ("soles/relative_velocity", _length(legs[:, 3:])),
+                ("relative_velocity", _length(legs[:, 3:])),
             ):
                 self._sizes[[kind in row.name for row in rows]] = size
 

@@ -323,7 +323,7 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
     at, (required, _) = motion.blocks, evidence.over_blocks
     kinematic = motion.equation.residual(at)[:, n + 6 :]
     for foot, (side, R_BF) in enumerate(
-        zip(evidence.sides, motion.equation.sole_rotations(at), strict=True)
+        zip(evidence.sides, motion.equation.sole_rotations(at.joint_position), strict=True)
     ):
         alone = np.all(
             [evidence.aloft[other] for other in range(len(evidence.sides)) if other != foot], axis=0

@@ -151,7 +151,7 @@ def rate_by_legs(motion: RecordedMotion, at: Instants) -> tuple[np.ndarray, np.n
     is_flat = [not leg.is_point for leg in motion.robot.description.legs.values()]
     standing = motion.equation.standing(at.pad_force) & np.array(is_flat)
     rates = np.zeros((len(standing), 3))
-    for foot, R_BF in enumerate(motion.equation.sole_rotations(at)):
+    for foot, R_BF in enumerate(motion.equation.sole_rotations(at.joint_position)):
         here = standing[:, foot] & ~standing[:, :foot].any(axis=1)
         rates[here] = -np.einsum("mij,mj->mi", R_BF, of_soles[:, 6 * foot : 6 * foot + 3])[here]
     return rates, standing.any(axis=1)

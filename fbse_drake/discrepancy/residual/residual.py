@@ -6,7 +6,8 @@ Per plant step, with the base's origin at rest and the measured specific force i
                                                                   six unactuated rows [Nm, N], which no joint effect can touch
     kinematic rows        of every standing sole but a point foot's, in its frame: angular velocity, and specific force less that of a
                           level resting sole;
-                          while both feet stand also the velocity of one sole relative to the other
+                          while both feet stand also the velocity of one sole relative to the other; on more than two feet,
+                          of one standing point foot relative to the next that stands
 
 All are averaged over blocks of time. Averages of one and the same window have one group delay, telescope what is differentiated, and leave
 noise whose covariance is known: white noise (accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
@@ -17,7 +18,7 @@ import fnmatch
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -38,8 +39,9 @@ from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
 
 # Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
 _ORDER, _PADDING = 4, 100
-# A sole stands still while it carries more than this share of the weight, and each of its pads this one.
-_STANDING = 0.15
+# A sole stands still while it carries more than this share of what it would if all carried alike,
+# and each of its pads this share of the weight.
+_STANDING = 0.3
 _STANDING_PAD = 0.01
 # Soles settle for this long at the start of a recording [s]. A foot that has just touched down, or is
 # about to lift, may still roll over an edge: its sole is not at rest in this time [s].
@@ -59,6 +61,23 @@ class Row:
     # `joint`, `base` or `kinematic`.
     kind: str
     unit: str
+    # Sides of the feet whose soles it is about.
+    feet: tuple[str, ...] = ()
+
+
+def foot_pairs(robot: Robot) -> list[tuple[int, int]]:
+    """Places of the feet whose velocity relative to each other is in rows: of two feet both, of more
+    all pairs of point feet. How a point foot is turned while it stands is not known, but that it
+    does not move."""
+    legs = robot.description.legs
+    if len(legs) == 2:
+        return [(0, 1)]
+    points = [
+        foot
+        for foot, (side, leg) in enumerate(legs.items())
+        if leg.is_point and np.allclose(robot.pad_positions(side), 0.0, atol=1e-6)
+    ]
+    return list(combinations(points, 2))
 
 
 def residual_rows(robot: Robot) -> list[Row]:
@@ -77,12 +96,17 @@ def residual_rows(robot: Robot) -> list[Row]:
     for side in robot.description.sides:
         kinds = (("angular_velocity", "rad/s"), ("specific_force", "m/s^2"))
         rows += [
-            Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit)
+            Row(f"{side}_sole/{kind}_{axis}", "kinematic", unit, (side,))
             for kind, unit in kinds
             for axis in _AXES
         ]
-    if len(robot.description.sides) == 2:
-        rows += [Row(f"soles/relative_velocity_{axis}", "kinematic", "m/s") for axis in _AXES]
+    sides = robot.description.sides
+    for pair in foot_pairs(robot):
+        feet = tuple(sides[foot] for foot in pair)
+        name = "soles" if len(sides) == 2 else "-".join(feet)
+        rows += [
+            Row(f"{name}/relative_velocity_{axis}", "kinematic", "m/s", feet) for axis in _AXES
+        ]
     return rows
 
 
@@ -309,21 +333,22 @@ class EquationOfMotion:
             if robot.has_floating_base
             else []
         )
+        self._pairs = foot_pairs(robot) if robot.has_floating_base else []
         # An effect that is tried changes some signals; what depends on the others is not computed again.
         self._inverse_dynamics = _LastResults()
         self._jacobians = _LastResults()
         self._bias_accelerations = _LastResults()
 
-    def sole_rotations(self, at: Instants) -> list[np.ndarray]:
-        """R_BF of each sole, (M, 3, 3) each."""
+    def sole_rotations(self, joint_position: np.ndarray) -> list[np.ndarray]:
+        """R_BF of each sole, (M, 3, 3) each, in postures (M, n)."""
         plant, context, soles = (
             self.robot.plant,
             self._context,
             [self.robot.sole(side) for side in self.robot.description.sides],
         )
-        result = np.empty((len(soles), len(at.joint_position), 3, 3))
+        result = np.empty((len(soles), len(joint_position), 3, 3))
         positions = self._upright.copy()
-        for k, q in enumerate(at.joint_position):
+        for k, q in enumerate(joint_position):
             positions[self.robot.position_index] = q
             plant.SetPositions(context, positions)
             for foot, sole in enumerate(soles):
@@ -347,10 +372,11 @@ class EquationOfMotion:
 
     def standing(self, pad_force: np.ndarray) -> np.ndarray:
         """Which soles stand on all their pads, (M, feet), bool."""
-        result = np.zeros((len(pad_force), len(self.robot.grasp_maps)), dtype=bool)
+        feet = len(self.robot.grasp_maps)
+        result, share = np.zeros((len(pad_force), feet), dtype=bool), _STANDING / max(feet, 1)
         for foot, force in enumerate(self.pads.split(pad_force)):
             normal = force[:, :, 2]
-            result[:, foot] = (normal.sum(axis=1) > _STANDING * self.weight) & (
+            result[:, foot] = (normal.sum(axis=1) > share * self.weight) & (
                 normal.min(axis=1) > _STANDING_PAD * self.weight
             )
         return result
@@ -391,10 +417,9 @@ class EquationOfMotion:
                     for foot in range(len(J))
                     for rows in (velocity[..., :3], specific_force)
                 ]
-                if len(J) == 2:
-                    # The base's columns of J hold R_FB.
-                    left, right = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
-                    kinematic_rows.append(left - right)
+                # The base's columns of J hold R_FB.
+                moving = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
+                kinematic_rows += [moving[one] - moving[other] for one, other in self._pairs]
         # Joints first.
         joints = at.torque_command - generalized[:, self._joints]
         return np.concatenate(
@@ -526,8 +551,10 @@ class EquationOfMotion:
                 differenced[k, place + 3 : place + 6] = ((J[3:] * scale) ** 2).sum(axis=1)
                 relative.append(J[3:, 3:6].T @ J[3:])
                 place += 6
-            if len(soles) == 2:
-                white[k, place:] = (((relative[0] - relative[1]) * scale) ** 2).sum(axis=1)
+            for one, other in self._pairs:
+                apart = (relative[one] - relative[other]) * scale
+                white[k, place : place + 3] = (apart**2).sum(axis=1)
+                place += 3
         return white, differenced
 
 
@@ -729,7 +756,13 @@ class RecordedMotion:
             # How a point foot is turned while it stands is not known.
             still = at_rest[:, foot, None] & (not leg.is_point)
             known[:, [row.name.startswith(f"{side}_sole/") for row in rows]] &= still
-        known[:, [row.name.startswith("soles/") for row in rows]] &= at_rest.all(axis=1)[:, None]
+        # Of feet that stand, the velocities of each relative to the next one say all.
+        pairs = foot_pairs(self.robot)
+        for one, other in pairs:
+            between = [foot for foot in range(one + 1, other) if (one, foot) in pairs]
+            still = at_rest[:, one] & at_rest[:, other] & ~at_rest[:, between].any(axis=1)
+            feet = tuple(self.robot.description.sides[foot] for foot in (one, other))
+            known[:, [row.feet == feet for row in rows]] &= still[:, None]
         return known
 
     def torque_variance(self, torque: np.ndarray) -> np.ndarray:
