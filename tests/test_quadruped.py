@@ -294,7 +294,9 @@ def test_pairs_of_feet_say_a_motion_once(log: Log):
 def test_soft_ground_shows_between_point_feet(run, compliance: float):
     """Least squares over the rows finds what is simulated, and on firm ground nothing; noise is white."""
     soft = f"robot.effects.soft=!GroundCompliance {{compliance: {compliance}}}"
-    log = run("quadruped_trot", *SHORT, *([soft] if compliance else []))
+    log = run(
+        "quadruped_trot", *SHORT, "estimator=!NoEstimator {}", *([soft] if compliance else [])
+    )
     config = scenario("quadruped_trot", *SHORT)
     predictor = Predictor(replace(config, model=config.robot), log)
     residual = predictor.residual
