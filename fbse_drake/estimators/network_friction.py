@@ -184,10 +184,9 @@ class NetworkLaw:
         sizes = {(len(of.slopes), len(of.slopes[0])) for of in given} or {(1, 1)}
         if len(sizes) > 1:
             raise InputError("estimator.networks: expected networks of one size in all joints")
-        nothing = np.zeros(next(iter(sizes)))
-        none = JointNetworks(
-            *[nothing.tolist()] * 3, nothing[:, 0].tolist(), [0.0, 0.0], config.unknown
-        )
+        nothing = np.zeros(next(iter(sizes))).tolist()
+        offsets = [0.0] * len(nothing)
+        none = JointNetworks(nothing, nothing, nothing, offsets, [0.0, 0.0], config.unknown)
         of_joint = [config.networks.get(joint, none) for joint in joints]
         # (n, members, units) each, and (n, members).
         self._slopes, self._shifts, self._torques, self._offsets = (
