@@ -419,6 +419,33 @@ def _parser() -> argparse.ArgumentParser:
 
     run = _add_command(
         commands,
+        "report",
+        help="runs beside each other in one report",
+        description="Puts the figures of runs side by side, the best of each marked, and their "
+        "pictures with the same axes; writes report.json and report.html.",
+        examples=(
+            "fbse report out/paper_walk out/paper_walk_fbse",
+            "fbse report out/a out/b/log.npz monday.npz --out out/week",
+        ),
+    )
+    run.add_argument(
+        "runs",
+        metavar="RUN",
+        type=Path,
+        nargs="+",
+        help="a folder that simulate or estimate wrote, or a log; differences are from the first",
+    )
+    run.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("out/report"),
+        help="where the files go (default: out/report)",
+    )
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+    run = _add_command(
+        commands,
         "campaign",
         help="many runs at once, on this machine or a Dask cluster",
         description="Does the runs of a campaign that are not done, each of which becomes a row of a table; the same command goes on.",

@@ -46,7 +46,7 @@ from fbse_drake.report.identification import base_table
 from fbse_drake.report.metrics import worst_joint
 from fbse_drake.report.run import law_step
 from fbse_drake.report.sentences import Inputs, parameter_text
-from fbse_drake.results import RunResult
+from fbse_drake.results import RunResult, made_folder
 from fbse_drake.scenario import Scenario, check_joints, dump_scenario, read_scenario
 from fbse_drake.scenario_keys import json_schema
 from fbse_drake.simulation import SimulationResult, simulate
@@ -159,6 +159,22 @@ def _identify(options: argparse.Namespace) -> bool:
 def _tests(options: argparse.Namespace) -> dict[str, Log]:
     """Logs to test models on, by name."""
     return {path.stem: read_log(path, options.map) for path in options.test}
+
+
+def _report(options: argparse.Namespace) -> bool:
+    from fbse_drake.report.runs import merit_table, merits, read_runs, runs_json, write_runs_report
+
+    console = Console(quiet=options.quiet)
+    with console.status("reading") as status:
+        runs = read_runs(options.runs)
+        out = made_folder(options.out)
+        status.update("writing the report")
+        logs = [run.file for run in runs]
+        write_json(out / "report.json", origin(logs) | runs_json(runs))
+        write_runs_report(out / "report.html", runs)
+    console.print(_printed(merit_table(runs, merits(runs)), "side by side"))
+    console.print(f"Report: {out / 'report.html'}", soft_wrap=True)
+    return True
 
 
 def _convert(options: argparse.Namespace) -> bool:
@@ -698,6 +714,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "diagnose": _diagnose,
     "study": _study,
     "identify": _identify,
+    "report": _report,
     "convert": _convert,
     "add": _add,
     "hide": _hide,

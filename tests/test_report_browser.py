@@ -15,6 +15,7 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 from test_any_plant import CRANE, crane
 from test_discrepancy_report import FRICTION, INPUTS, NOTHING, made_diagnosis
+from test_report import joints_only_log
 
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.compare import compare
@@ -27,6 +28,7 @@ from fbse_drake.report import discrepancy as reports
 from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
 from fbse_drake.report.run import write_run_report
+from fbse_drake.report.runs import read_runs, write_runs_report
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
@@ -228,6 +230,14 @@ def test_report_of_a_run(visit: Visitor, run: Callable[..., Log], folder: Path):
         [SUMMARY, "Motion", "Joints", "Foot forces", "Friction", "Sensors", "Scenario"],
         10,
     )
+
+
+def test_runs_beside_each_other(visit: Visitor, folder: Path):
+    for name in ("monday", "tuesday"):
+        joints_only_log().save(folder / f"{name}.npz")
+    runs = read_runs([folder / "monday.npz", folder / "tuesday.npz"])
+    write_runs_report(folder / "runs.html", runs)
+    check(visit, folder / "runs.html", ["Runs", "Figures", "Joints"], 4)
 
 
 def test_recording_of_a_run_shows_the_robot(visit: Visitor, folder: Path):

@@ -33,14 +33,30 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Measure:
+    """A number in a table beside others of its kind."""
+
+    value: float
+    # As a difference from another one.
+    note: str = ""
+    best: bool = False
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (number(self.value), self.note) if part)
+
+
+Cell = str | float | Step | Measure
+
+
+@dataclass(frozen=True)
 class Table:
-    """Rows of texts, numbers and steps under a header; numbers are shown by `number`.
+    """Rows of texts, numbers, measures and steps under a header; numbers are shown by `number`.
 
     Without a header the first column names the rows.
     """
 
     header: tuple[str, ...]
-    rows: tuple[tuple[str | float | Step, ...], ...]
+    rows: tuple[tuple[Cell, ...], ...]
     # What it shows, one or two sentences.
     caption: str = ""
     # Folded away behind its caption, after the figures.
@@ -54,6 +70,20 @@ class FigureBlock:
     title: str
     caption: str
     figure: Figure
+
+    @property
+    def pictures(self) -> tuple[tuple[str, Figure], ...]:
+        """The only one, without a name of its own."""
+        return (("", self.figure),)
+
+
+@dataclass(frozen=True)
+class FigureRow:
+    """Pictures of the same thing beside each other, each with its name."""
+
+    title: str
+    caption: str
+    pictures: tuple[tuple[str, Figure], ...]
 
 
 @dataclass(frozen=True)
@@ -72,7 +102,7 @@ class Section:
     title: str
     text: str | Step = ""
     tables: tuple[Table, ...] = ()
-    figures: tuple[FigureBlock, ...] = ()
+    figures: tuple[FigureBlock | FigureRow, ...] = ()
     details: tuple[Details, ...] = ()
 
 
@@ -137,6 +167,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters["number"] = number
     environment.filters["png"] = _png_uri
+    environment.tests["measure"] = lambda cell: isinstance(cell, Measure)
     return environment
 
 

@@ -18,7 +18,7 @@ from fbse_drake.log import Log
 _STANDING_SHARE = 0.05
 # The beginning of a log that no figure of an estimate counts: the filters start from wide priors and settle [s].
 _SETTLING_TIME = 0.2
-_PHASES = ("stance", "swing")
+PHASES = ("stance", "swing")
 # A joint's simulated torque follows its law if it differs by at most this share of the law's rms.
 LAW_TOLERANCE = 0.01
 
@@ -338,7 +338,7 @@ def _base_state_parts(log: Log, components: int) -> list[str]:
 
 
 def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, float]]:
-    figures = {phase: dict.fromkeys(log.joints, math.nan) for phase in _PHASES}
+    figures = {phase: dict.fromkeys(log.joints, math.nan) for phase in PHASES}
     if "estimate/joint/friction_torque" not in log or "truth/joint/friction_torque" not in log:
         return figures
     error, truth = friction_error(log), ended_step(log["truth/joint/friction_torque"])
@@ -348,7 +348,7 @@ def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, floa
         if side is not None and side not in stands:
             continue
         stand = never if side is None else stands[side]
-        for phase, counted in zip(_PHASES, (rows & stand, rows & ~stand), strict=True):
+        for phase, counted in zip(PHASES, (rows & stand, rows & ~stand), strict=True):
             rmse = float(_rms(error[counted, joint]))
             size = float(_rms(truth[counted, joint])) if normalised else 1.0
             figures[phase][name] = rmse / size if size > 0 else math.nan

@@ -77,6 +77,7 @@ def _steps(metrics: Mapping[str, Any], folder: Path) -> tuple[Step, ...]:
     study = f"fbse study {folder}/scenario.yaml {folder}/log.npz"
     steps = [
         Step("Find the physics that the scenario's model lacks:", study),
+        Step("See it beside other runs:", f"fbse report {folder} ANOTHER_RUN"),
     ]
     if law := law_step(metrics["friction_law_error"]):
         steps.insert(0, law)
