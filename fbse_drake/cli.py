@@ -512,9 +512,19 @@ def _parser() -> argparse.ArgumentParser:
         description="Proposes what must be said of a robot from its URDF, writes it with a "
         "scenario that runs, and tries that. A robot on two legs of six joints squats, and so does "
         "one on two or three pairs of legs of three; of any other the joints swing.",
-        examples=("fbse init my_robot.urdf", "fbse init robots/g1.urdf --name g1 --out g1"),
+        examples=(
+            "fbse init my_robot.urdf",
+            "fbse init robots/g1.urdf --name g1 --out g1",
+            "fbse init my_robot.urdf --recording monday.mcap",
+        ),
     )
     run.add_argument("urdf", metavar="URDF", type=Path, help="the robot's model")
+    run.add_argument(
+        "--recording",
+        metavar="BAG",
+        type=Path,
+        help="a bag (.mcap, .db3, .bag, or the folder of one), for whose topics the map is made",
+    )
     run.add_argument("--name", help="what the robot is called (default: as the file)")
     run.add_argument(
         "--out", metavar="DIR", type=Path, help="where the files go (default: the robot's name)"

@@ -544,7 +544,7 @@ def _write_lines(path: Path, lines: Sequence[Sequence[object]]) -> None:
 def _init(options: argparse.Namespace) -> bool:
     console = Console(quiet=options.quiet)
     with console.status("looking at the robot"):
-        made = init_robot(options.urdf, options.out, name=options.name)
+        made = init_robot(options.urdf, options.out, name=options.name, recording=options.recording)
     table = Table(title=made.description.stem, show_header=False, title_justify="left")
     for what, path in (
         ("description", made.description),

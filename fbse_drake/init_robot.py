@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 
 from fbse_drake.errors import InputError
 from fbse_drake.files import write_atomically, write_text
+from fbse_drake.interop.bag_map import propose_map
+from fbse_drake.interop.mapping import LogMap
 from fbse_drake.log import Log
 from fbse_drake.report.robot_figure import robot_figure
 from fbse_drake.robot.description import RobotDescription
@@ -52,7 +54,9 @@ class Made:
     problems: list[str]
 
 
-def init_robot(urdf: Path, out: Path | None = None, *, name: str | None = None) -> Made:
+def init_robot(
+    urdf: Path, out: Path | None = None, *, name: str | None = None, recording: Path | None = None
+) -> Made:
     """Proposes description, scenario and recording map of a robot, writes and tries them.
 
     Args:
@@ -60,9 +64,11 @@ def init_robot(urdf: Path, out: Path | None = None, *, name: str | None = None) 
         out: the folder that they are written to, which is made if need be; by default one that is
             called like the robot.
         name: what the robot is called; by default as the URDF's file.
+        recording: a bag, for whose topics the map is made; by default it is one of a table.
 
     Raises:
-        InputError: no URDF, a foot that cannot be found, or a description that exists already.
+        InputError: no URDF, a foot that cannot be found, a description that exists already, or a bag
+            that cannot be read or names no joint of the robot.
     """
     name = name or urdf.stem
     if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name):
@@ -76,6 +82,10 @@ def init_robot(urdf: Path, out: Path | None = None, *, name: str | None = None) 
     write_text(description, _description_text(proposal.description, name, proposal.remarks))
     try:
         robot, _ = make_robot(description)
+        map_text, about_map = _map_text(robot), []
+        if recording is not None:
+            log_map, about_map = propose_map(recording, robot.description)
+            map_text = _bag_map_text(log_map, recording)
         legged = bool(proposal.description.legs)
         stands = _standing(robot) if legged else None
         text = _squat(robot, name, stands) if stands else _swing(robot, name)
@@ -85,13 +95,14 @@ def init_robot(urdf: Path, out: Path | None = None, *, name: str | None = None) 
         raise
     scenario = folder / f"{name}_{'squat' if stands else 'swing'}.yaml"
     write_text(scenario, text)
-    log_map = folder / f"{name}.map.yaml"
-    write_text(log_map, _map_text(robot))
+    map_path = folder / f"{name}.map.yaml"
+    write_text(map_path, map_text)
     figure = robot_figure(robot, posture)
     picture = folder / f"{name}.png"
     write_atomically(picture, lambda partial: _save(figure, partial))
     remarks, problems = _tried(scenario)
-    return Made(description, scenario, log_map, picture, [*proposal.remarks, *remarks], problems)
+    said = [*proposal.remarks, *about_map, *remarks]
+    return Made(description, scenario, map_path, picture, said, problems)
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -345,3 +356,15 @@ def _map_text(robot: Robot) -> str:
         "channels": channels,
     }
     return _MAP_HEADER + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _bag_map_text(log_map: LogMap, recording: Path) -> str:
+    name = " ".join(recording.name.split())
+    tree = {
+        "joints": log_map.joints,
+        "recorded_joints": log_map.recorded_joints,
+        "topics": log_map.topics,
+        "channels": {key: {"topic": channel.topic} for key, channel in log_map.channels.items()},
+    }
+    body = yaml.safe_dump(_given(tree), sort_keys=False, default_flow_style=None, width=100)
+    return f"# What the topics of {name} mean. Use: fbse convert BAG run.npz --map FILE\n{body}"

@@ -614,16 +614,15 @@ def wrench(stamp: int, force: Any, torque: Any, types: dict[str, Any] = ROS2.typ
     )
 
 
-def imu(stamp: int, gyro: Any, acceleration: Any) -> Any:
-    types = ROS2.types
+def imu(stamp: int, gyro: Any, acceleration: Any, types: dict[str, Any] = ROS2.types) -> Any:
     upright = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     return types["sensor_msgs/msg/Imu"](
-        header(stamp),
+        header(stamp, types),
         upright,
         np.arange(9.0),
-        vector(gyro),
+        vector(gyro, types),
         np.arange(9.0),
-        vector(acceleration),
+        vector(acceleration, types),
         np.arange(9.0),
     )
 

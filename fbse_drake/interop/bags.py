@@ -29,12 +29,12 @@ JOINT_STATE, IMU, WRENCH = (
 # channels.
 ARRAY, METADATA = "std_msgs/msg/Float64MultiArray", "fbse_drake"
 # Channel -> field of the standard message.
-_JOINT_STATE_FIELDS = {
+JOINT_STATE_FIELDS = {
     "joint/position": "position",
     "joint/velocity": "velocity",
     "joint/torque_command": "effort",
 }
-_IMU_FIELDS = {
+IMU_FIELDS = {
     "imu/linear_acceleration": "linear_acceleration",
     "imu/angular_velocity": "angular_velocity",
 }
@@ -72,6 +72,14 @@ class Bag:
             self._connections.setdefault(connection.topic, connection)
         self._first: dict[str, Layout] = {}
 
+    def topics(self) -> dict[str, str]:
+        """Those that have messages, with the messages' type."""
+        return {
+            topic: connection.msgtype
+            for topic, connection in self._connections.items()
+            if connection.msgcount
+        }
+
     def channels(self, log_map: LogMap) -> tuple[dict[str, ChannelMap], list[str]]:
         """Channels of the standard messages, with the map's on top; what was left out, in words.
 
@@ -79,11 +87,7 @@ class Bag:
             InputError: a topic that the map names is not there, it is not clear which is meant, or
                 there are no joint positions.
         """
-        present = {
-            topic: connection.msgtype
-            for topic, connection in self._connections.items()
-            if connection.msgcount
-        }
+        present = self.topics()
         mapped = {
             name: c
             for name, c in log_map.channels.items()
@@ -122,7 +126,7 @@ class Bag:
     ) -> tuple[dict[str, ChannelMap], list[str]]:
         channels: dict[str, ChannelMap] = {}
         left_out = []
-        for kind, fields in ((JOINT_STATE, _JOINT_STATE_FIELDS), (IMU, _IMU_FIELDS)):
+        for kind, fields in ((JOINT_STATE, JOINT_STATE_FIELDS), (IMU, IMU_FIELDS)):
             chosen = dict.fromkeys(
                 mapped[name].topic for name in fields if name in mapped and mapped[name].topic
             )
