@@ -1,17 +1,25 @@
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from fbse_drake import InputError, Log
 from fbse_drake.interop.convert import read_log
 from fbse_drake.interop.export import write_csv, write_mcap
+from fbse_drake.resources import folder
+from fbse_drake.robot.plant import make_robot
 
 WALK = ("paper_walk", "duration=1")
 FIELDS = {"position": "position", "velocity": "velocity", "effort": "torque_command"}
@@ -61,11 +69,13 @@ def test_a_bag_is_read_back_equal(
     standard = {"/joint_states", "/imu", "/foot/left/wrench", "/foot/right/wrench"}
     others = set(log) - {"time", *(f"joint/{name}" for name in FIELDS.values())}
     others -= {"imu/angular_velocity", "imu/linear_acceleration"}
-    assert set(topics) == standard | {f"/{name}" for name in others}
+    once = {"/tf_static", "/robot_description"}
+    assert set(topics) == standard | once | {"/tf"} | {f"/{name}" for name in others}
+    assert [times[topic] for topic in once] == [[round(1e9 * log.time[0])]] * 2
     for name in ("reference/zmp", "truth/foot/left/pad_force", "truth/joint/friction_torque"):
         values = np.array([message.data for message in topics[f"/{name}"]])
         np.testing.assert_array_equal(values.reshape(log[name].shape), log[name])
-    for stamps in times.values():
+    for stamps in (times[topic] for topic in set(times) - once):
         np.testing.assert_array_equal(stamps, np.rint(1e9 * log.time))
     states = topics["/joint_states"]
     assert all(state.name == log.joints for state in states)
@@ -97,6 +107,112 @@ def test_a_bag_is_read_back_equal(
                 sum(pad.rotational() for pad in pads),
                 atol=1e-12,
             )
+
+
+def found_by(transforms: list[Any], names: list[str]) -> dict[str, RigidTransform]:
+    """Poses of frames in the world, by going up from each one."""
+    parents = {}
+    for transform in transforms:
+        p, q = transform.transform.translation, transform.transform.rotation
+        X = RigidTransform(Quaternion(q.w, q.x, q.y, q.z), vector(p))
+        parents[transform.child_frame_id] = (transform.header.frame_id, X)
+    poses = {}
+    for name in names:
+        pose, parent = RigidTransform(), name
+        while parent != "world":
+            parent, X = parents[parent]
+            pose = X @ pose
+        poses[name] = pose
+    return poses
+
+
+@pytest.mark.parametrize("name", ["walk", "arm"])
+def test_transforms_are_drakes_forward_kinematics(
+    name: str, log: Log, run: Callable[..., Log], tmp_path: Path
+):
+    """On a floating base, and on one that is fixed; every link, sole and the IMU."""
+    recorded = log if name == "walk" else run("bsc_arm", "duration=0.3")
+    description = "biped" if name == "walk" else "arm"
+    write_mcap(recorded, tmp_path / "log.mcap")
+    messages = list(with_mcap(tmp_path / "log.mcap"))
+    fixed = next(message for topic, _, message in messages if topic == "/tf_static").transforms
+    moving = [message for topic, _, message in messages if topic == "/tf"]
+    robot, _ = make_robot(description, gantry_height=None)
+    plant, context = robot.plant, robot.plant.CreateDefaultContext()
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(robot.base.model_instance())]
+    frames = {body.name(): body.body_frame() for body in bodies}
+    frames |= {f"{side}_sole": robot.sole(side) for side in recorded.sides}
+    frames |= {"imu": robot.imu} if recorded.sides else {}
+    for row in (0, len(moving) // 2, len(moving) - 1):
+        quaternion, place = np.array([1.0, 0, 0, 0]), np.zeros(3)
+        if robot.has_floating_base:
+            quaternion = recorded["truth/base/orientation"][row]
+            place = recorded["truth/base/position"][row]
+        X_WB = RigidTransform(Quaternion(quaternion / np.linalg.norm(quaternion)), place)
+        q = recorded["truth/joint/position"][row]
+        robot.set_state(context, q, np.zeros(len(q)), X_WB if robot.has_floating_base else None)
+        found = found_by([*fixed, *moving[row].transforms], list(frames))
+        for frame, pose in found.items():
+            known = frames[frame].CalcPoseInWorld(context)
+            assert pose.IsNearlyEqualTo(known, 1e-12), frame
+        stamps = {
+            t.header.stamp.sec * 10**9 + t.header.stamp.nanosec for t in moving[row].transforms
+        }
+        assert stamps == {round(1e9 * recorded.time[row])}
+
+
+def test_the_robots_description_is_its_model_with_shapes(bag: Path):
+    text = next(m.data for topic, _, m in with_mcap(bag) if topic == "/robot_description")
+    known, _ = make_robot("biped")
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(text, "urdf")
+    plant.Finalize()
+    mass = plant.CalcTotalMass(plant.CreateDefaultContext())
+    assert mass == pytest.approx(known.plant.CalcTotalMass(known.plant.CreateDefaultContext()))
+    assert plant.num_actuated_dofs() == len(known.joint_names)
+    shapes = sum(len(link.findall("visual")) for link in ElementTree.fromstring(text).iter("link"))
+    shipped = ElementTree.parse(folder("models") / "biped.urdf")
+    assert shapes == sum(len(link.findall("visual")) for link in shipped.iter("link")) > 10
+
+
+def test_a_layout_names_topics_that_are_there_and_is_not_replaced(bag: Path):
+    beside = bag.with_suffix(".layout.json")
+    layout = json.loads(beside.read_text())
+    with bag.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    topics = {channel.topic for channel in summary.channels.values()}
+    panels = layout["configById"]
+    plots = [panel for name, panel in panels.items() if name.startswith("Plot!")]
+    named = {line["value"].partition(".")[0] for panel in plots for line in panel["paths"]}
+    named |= {layer["topic"] for layer in panels["3D!robot"]["layers"].values()}
+    assert named <= topics
+    assert len(plots) == 4
+
+    def leaves(tree: Any) -> list[str]:
+        return [tree] if isinstance(tree, str) else leaves(tree["first"]) + leaves(tree["second"])
+
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    beside.write_text("mine")
+    write_mcap(read_log(bag), bag)
+    assert beside.read_text() == "mine"
+
+
+def test_a_log_of_an_unknown_robot_has_no_frames(log: Log, tmp_path: Path):
+    """No scenario, one of a robot that is not there, or with code, which must not run."""
+    code = tmp_path / "effect.py"
+    code.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    scenario = log.meta["scenario"]
+    texts = (
+        "",
+        scenario.replace("description: biped", "description: nobody"),
+        scenario.replace("  description: biped", f"  description: {code}")
+        + f"  effect_modules: [{code}]\n",
+    )
+    for text in texts:
+        write_mcap(Log(log.channels, {**log.meta, "scenario": text}), tmp_path / "log.mcap")
+        topics = {topic for topic, _, _ in with_mcap(tmp_path / "log.mcap")}
+        assert not topics & {"/tf", "/tf_static", "/robot_description"}
+    assert not (tmp_path / "ran").exists()
 
 
 def vector(message: Any) -> list[float]:

@@ -5,7 +5,7 @@ inertia, viscous friction and Coulomb friction. What they cannot say, as a delay
 in a comment. Shapes are left out: they are in the original.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,13 +92,29 @@ def write_urdf(config: RobotConfig, path: str | Path) -> None:
         InputError: see `build_robot`.
         OSError: the file cannot be written.
     """
+    write_text(Path(path), urdf_of(config, Path(path).stem))
+
+
+def urdf_of(config: RobotConfig, name: str, shapes: Sequence[Element] = ()) -> str:
+    """The same as text.
+
+    Args:
+        name: of the robot.
+        shapes: links, whose visual shapes are taken over by name, and materials of a URDF.
+
+    Raises:
+        InputError: see `build_robot`.
+    """
     links, unsaid = links_of(config)
-    root = Element("robot", name=Path(path).stem)
+    root = Element("robot", name=name)
+    root.extend(part for part in shapes if part.tag == "material")
+    seen = {part.get("name"): part.findall("visual") for part in shapes if part.tag == "link"}
     _comment(root, unsaid)
     if any(link.parent == _WORLD for link in links):
         SubElement(root, "link", name=_WORLD)
     for link in links:
         element = SubElement(root, "link", name=link.name)
+        element.extend(seen.get(link.name, []))
         if link.inertia is not None:
             com, moments = _central(link.inertia)
             inertial = SubElement(element, "inertial")
@@ -109,7 +125,7 @@ def write_urdf(config: RobotConfig, path: str | Path) -> None:
             SubElement(inertial, "inertia", {name: repr(value) for name, value in values})
         if link.parent is not None:
             _urdf_joint(root, link, link.parent)
-    _write(root, path)
+    return _text_of(root)
 
 
 def write_mjcf(config: RobotConfig, path: str | Path) -> None:
@@ -145,7 +161,7 @@ def write_mjcf(config: RobotConfig, path: str | Path) -> None:
                 mass=repr(link.inertia.get_mass()),
                 fullinertia=_text(moments),
             )
-    _write(root, path)
+    write_text(Path(path), _text_of(root))
 
 
 _Resistance = ViscousFriction | CoulombFriction | CoulombViscousFriction
@@ -310,6 +326,6 @@ def _text(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
 
 
-def _write(root: Element, path: str | Path) -> None:
+def _text_of(root: Element) -> str:
     ElementTree.indent(root)
-    write_text(Path(path), ElementTree.tostring(root, encoding="unicode") + "\n")
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
