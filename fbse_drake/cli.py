@@ -1,11 +1,9 @@
-# PYTHON_ARGCOMPLETE_OK
 """The `fbse` command line. Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input."""
 
 import argparse
 import errno
 import io
 import os
-import signal
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -13,10 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fbse_command import FAILED, INTERRUPTED, end_as_at_ctrl_c, keep_what_is_known
 from fbse_drake.errors import InputError, on_one_line
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
-_INTERRUPTED = "interrupted; no file was left half-written"
+DONE, BAD_INPUT = 0, 2
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 # What can be listed.
 LISTED = ("scenarios", "robots", "effects", "estimators", "sensors", "compensations")
@@ -46,15 +44,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # What the commands need takes seconds to import: `fbse --help` must not wait for it.
         from fbse_drake.commands import COMMANDS
 
-        # From here on there may be something to keep.
-        if signal.getsignal(signal.SIGINT) is _end_at_once:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        keep_what_is_known()
         return DONE if COMMANDS[options.command](options) else FAILED
     except InputError as error:
         _complain(str(error))
         return BAD_INPUT
     except KeyboardInterrupt:
-        _complain(_INTERRUPTED)
+        _complain(INTERRUPTED)
     except MemoryError:
         _complain("there is not enough memory for this; no file was left half-written")
     except OSError as error:
@@ -69,21 +65,9 @@ def _complain(line: str) -> None:
     print(f"fbse: {on_one_line(line)}", file=sys.stderr)
 
 
-def _end_at_once(number: int, frame: object) -> NoReturn:  # noqa: ARG001
-    """Ends the program. An exception would not do: extension modules that are being imported make
-    errors of their own of it."""
-    _complain(_INTERRUPTED)
-    os._exit(FAILED)
-
-
 def entry() -> None:
-    """The console script. It ends at SIGTERM and SIGHUP as it does at Ctrl-C."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        # What `nohup` ignores stays ignored.
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _end_at_once)
+    """The command. It ends at SIGTERM and SIGHUP as it does at Ctrl-C."""
+    end_as_at_ctrl_c()
     for stream in (sys.stdout, sys.stderr):
         # What a terminal of an old locale cannot show becomes a question mark.
         if isinstance(stream, io.TextIOWrapper):

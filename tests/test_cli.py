@@ -201,6 +201,31 @@ cli.entry()
     assert done.stderr == "fbse: interrupted; no file was left half-written\n"
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("ignored", [False, True])
+def test_the_command_can_be_ended_before_the_package_is_there(name: str, ignored: bool):
+    """Also where a shell started it in the background, so that it ignores Ctrl-C."""
+    script = f"""
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.{"SIG_IGN" if ignored else "default_int_handler"})
+class Interrupter:
+    def find_spec(self, name, *_):
+        if name == "fbse_drake":
+            os.kill(os.getpid(), signal.{name})
+sys.meta_path.insert(0, Interrupter())
+from fbse_command import entry
+assert "fbse_drake" not in sys.modules
+sys.argv = ["fbse", "reveal", "nowhere"]
+entry()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    if ignored and name == "SIGINT":
+        assert done.returncode == BAD_INPUT
+        return
+    assert done.returncode == FAILED
+    assert done.stderr == "fbse: interrupted; no file was left half-written\n"
+
+
 def test_ctrl_c_while_drake_is_imported_shows_no_traceback():
     """Drake's extension modules make an ImportError of an exception in what they import."""
     script = """

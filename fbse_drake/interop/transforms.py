@@ -123,8 +123,8 @@ def _shapes(description: str) -> list[Element]:
         files = [path.parent / names.urdf]
     else:
         packages = Parser(MultibodyPlant(0.0)).package_map()
-        packages.AddPackageXml(str(path.parent / "package.xml"))
-        directives = LoadModelDirectives(str(path.parent / names.directives)).directives
+        packages.AddPackageXml(path.parent / "package.xml")
+        directives = LoadModelDirectives(path.parent / names.directives).directives
         models = [directive.add_model for directive in directives if directive.add_model]
         files = [Path(packages.ResolveUrl(model.file)) for model in models]
     roots = [ElementTree.parse(file).getroot() for file in files if file.suffix == ".urdf"]
