@@ -416,6 +416,61 @@ def test_nothing_tells_yaw_and_place():
         np.testing.assert_allclose(unsure[name], sure[name], atol=1e-7, err_msg=name)
 
 
+RESTING = BASE.measurements()
+
+
+def settled(seconds: float = 2.0) -> tuple[Filter, np.ndarray]:
+    """A robot that has rested on both feet for some time."""
+    rig = Filter()
+    for _ in range(round(seconds / TICK)):
+        x = rig.tick(measurements=RESTING)
+    return rig, x.copy()
+
+
+def tilt_of(x: np.ndarray) -> float:
+    """Between the vertical and where it is taken to be [rad]."""
+    return float(np.arccos(min(1.0, x["rotation"][2, 2])))
+
+
+def test_a_tilt_that_all_feet_contradict_is_given_up():
+    """It is as sure of a wrong attitude as it was of the right one."""
+    rig, x = settled()
+    wrong = x.copy()
+    turn = Rotation.from_rotvec([0.03, -0.04, 0.0])
+    wrong["orientation"] = turn.as_quat(scalar_first=True)
+    wrong["rotation"] = turn.as_matrix()
+    wrong["foot_orientation"][:] = wrong["orientation"]
+    for _ in range(450):
+        wrong = rig.step(wrong, measurements=RESTING)
+    assert tilt_of(wrong) < 2e-3
+    np.testing.assert_allclose(wrong["base_velocity"], 0, atol=2e-3)
+    for name in ("gyro_bias_B", "accelerometer_bias_B"):
+        np.testing.assert_allclose(wrong[name], x[name], atol=1e-3)
+
+
+def test_a_foot_that_slips_for_a_moment_does_not_upset_the_attitude():
+    rig, x = settled()
+    slipping = LEVEL.copy()
+    slipping["foot_jacobian"][:, 3, 6] = 1.0
+    slipping["velocity"][6] = 0.2
+    before = x["attitude_std"].copy()
+    for k in range(400):
+        x = rig.step(x, measurements=RESTING, model=slipping if k < 100 else LEVEL)
+        assert tilt_of(x) < 2e-3
+    np.testing.assert_allclose(x["attitude_std"][:2], before[:2], rtol=0.1)
+
+
+def test_an_accelerometer_that_forces_contradict_teaches_no_bias():
+    """Neither half a second of a wrong reading, nor what comes after it; little by little it may."""
+    rig, x = settled()
+    known, push = x["accelerometer_bias_B"].copy(), np.array([0.4, 0.0, 0.0])
+    off = BASE.measurements(specific_force=push - GRAVITY)
+    for k in range(700):
+        x = rig.step(x, measurements=off if k < 500 else RESTING)
+        assert np.abs(x["accelerometer_bias_B"] - known).max() < 0.01
+    assert tilt_of(x) < 2e-3
+
+
 def test_without_feet_it_is_strapdown_integration():
     """Smooth synthetic motion; feet and forces are there, and not believed."""
     unbiased = dataclasses.replace(USUAL_SENSORS, acceleration_bias=0.0, angular_velocity_bias=0.0)

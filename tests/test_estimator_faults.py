@@ -167,6 +167,7 @@ WRONG = {
         lambda x: np.full_like(x, 20.0),
     ),
     "velocity off": ("measured_joint_state", slice(12 + KNEE, 13 + KNEE), 0, lambda x: x + 0.1),
+    "knee dead": ("measured_joint_state", slice(KNEE, 13 + KNEE, 12), 0, lambda x: 0 * x),
     "joints flipped": ("measured_joint_state", slice(0, 24), 0, lambda x: -x),
     "accelerometer off": ("measured_imu", slice(0, 1), 1, lambda x: x + 1.5),
     "gyro off": ("measured_imu", slice(3, 6), 1, lambda x: x + 0.1),

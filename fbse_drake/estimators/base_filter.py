@@ -20,7 +20,12 @@ from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.attitude import AttitudeConfig
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
-from fbse_drake.estimators.cross_check import cross_check, cross_check_type, firm_foot_rate
+from fbse_drake.estimators.cross_check import (
+    cross_check,
+    cross_check_type,
+    firm_foot_rate,
+    force_contradiction,
+)
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import (
     force_delay_type,
@@ -70,8 +75,9 @@ _FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _OPPOSITE = (-1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
 _NONE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-# While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2].
-_UNKNOWN_RATE, _UNKNOWN_ACCELERATION = 0.3, 3.0
+# While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2], and how
+# long that lasts [s].
+_UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
 # An innovation is taken for a fault, and counts as little as makes it just likely, above this
 # quantile of chi^2 with three degrees of freedom (one in 3000).
 _GATE = 18.5
@@ -80,7 +86,11 @@ _MEMORY = 0.1
 # They stay within so many standard deviations of what was known of them so long ago [s]: they hardly
 # walk, and a sensor that drifts faster is at fault. What a filter finds out moves its estimate by a
 # variance as large as what it takes from its own; and at least by so many random walks.
-_LEASH, _LEASH_TIME, _LEAST_WALKS = 4.0, 1.0, 20.0
+_LEASH, _LEASH_TIME, _LEAST_WALKS = 2.0, 1.0, 20.0
+# Beyond so many standard deviations of what forces are wrong by, they contradict the accelerometer.
+_CONTRADICTION = 3.0
+# When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
+_LOST_AFTER = 0.25
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
 # A foot does little in spite of all while the robot rests: this share of what it does from this
@@ -419,8 +429,21 @@ def _correct(x: np.ndarray, error: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def _land(P: np.ndarray, correction: np.ndarray, foot: int) -> None:
+def _land(
+    x: np.ndarray,
+    P: np.ndarray,
+    correction: np.ndarray,
+    foot: int,
+    model: np.ndarray,
+    known: np.ndarray,
+) -> None:
     """The errors of a foot that lands are those of the base, as is what is known of them."""
+    p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
+    moved = rotate(rotation(x.rotation), p_IF)
+    put(x.foot_position[foot], add(vector(x.imu_position), moved))
+    q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
+    put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
+    x.foot_agreement[foot] = 0.0
     for part, source in ((0, _POSITION), (3, _ATTITUDE)):
         start = _FEET + 6 * foot + part
         P[start : start + 3] = P[source : source + 3]
@@ -456,13 +479,16 @@ def _listen_to_foot(
     model: np.ndarray,
     elapsed: float,
     known: np.ndarray,
-) -> None:
+) -> bool:
     """What a foot that stands tells: where it is, how it is turned, and that it rests. (A point
     foot may turn, and tells nothing of that.)
 
     Args:
         share: of the weight, that it carries.
         w_raw: the gyro's reading in base axes.
+
+    Returns:
+        Has it moved of late by the robot's velocity, more than a foot does in spite of all?
     """
     config, sensors, J = known.config, known.sensors, model.foot_jacobian[foot]
     R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
@@ -519,6 +545,11 @@ def _listen_to_foot(
         keep, agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY],
         restless[_FOOT_VELOCITY] * own + sensed,
     )  # fmt: skip
+    possible = max(1.0, restless[_FOOT_VELOCITY]) * own
+    for i in range(3):
+        possible += P[_VELOCITY + i, _VELOCITY + i] / 3.0
+    mean = vector(agreement[_FOOT_VELOCITY])
+    moves = dot(mean, mean) > _GATE * possible
 
     if is_flat:
         own, sensed = light * config.foot_rate**2, turning * rate + gyro
@@ -547,6 +578,7 @@ def _listen_to_foot(
             P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare,
             spare.copy(), 0.0,
         )  # fmt: skip
+    return moves
 
 
 @njit(cache=True)
@@ -565,6 +597,17 @@ def _learned_restlessness(
     share = min(LARGEST_SHARE, dot(innovation, innovation) / (3.0 * variance))
     learned = restless * (1.0 + (1.0 - math.exp(-elapsed / _RESTLESSNESS_TIME)) * (share - 1.0))
     return max(_LEAST_RESTLESSNESS, learned)
+
+
+@njit(cache=True)
+def _force_errors(f_raw: Vector, config: np.ndarray) -> Vector:
+    """What the mean acceleration by the foot forces is hardly ever wrong by [m/s^2]."""
+    any_way, gain = config.force_error**2, config.force_gain_error**2
+    return (
+        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[0] ** 2),
+        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[1] ** 2),
+        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[2] ** 2),
+    )
 
 
 @njit(cache=True)
@@ -680,6 +723,7 @@ def _estimate_base(
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
     firm = x.foot_standing * known.is_flat
     rests, rolling = firm_foot_rate(firm, wrench, weight, w_now, model)
+    contradiction = force_contradiction(x.check, _force_errors(f_mean, known.config))
     if first:
         _start(x, measured, model, known)
     else:
@@ -694,26 +738,27 @@ def _estimate_base(
                 w, rate_noise = subtract(w_now, rolling), _FOOT_RATE_ERROR
             else:
                 w = (0.0, 0.0, 0.0)
+            lasting = math.sqrt(max(1.0, 2.0 * _UNKNOWN_TIME / elapsed))
+            rate_noise, force_noise = lasting * rate_noise, lasting * force_noise
+        elif contradiction > 0.0:
+            # Or velocities that it makes would be put down to a tilt.
+            force_noise += contradiction * math.sqrt(max(1.0, 2.0 * _UNKNOWN_TIME / elapsed))
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
         _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
-    R = rotation(x.rotation)
     force, carried = (0.0, 0.0, 0.0), 0.0
     load_by_mass = np.empty((feet, 3))
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
+    all_move, resting = True, False
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
-            _land(P, correction, foot)
-            p_IF = subtract(vector(model.foot_position[foot]), p_BI)
-            put(x.foot_position[foot], add(vector(x.imu_position), rotate(R, p_IF)))
-            q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
-            put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
-            x.foot_agreement[foot] = 0.0
+            _land(x, P, correction, foot, model, known)
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
-            _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
+            moves = _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
+            all_move, resting = all_move and moves, True
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
         in_foot = (mean_wrench[foot, 3], mean_wrench[foot, 4], mean_wrench[foot, 5])
@@ -750,9 +795,31 @@ def _estimate_base(
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
+    if resting:
+        x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
+    if x.lost_for > _LOST_AFTER:
+        _start_over(x, model, known)
     _leash_biases(x, first, elapsed, known.config)
-    _remember_biases(x, trust, first, elapsed)
+    is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
+    is_doubtful = is_doubtful or contradiction > 0.0 or x.lost_for > 0.0
+    _remember_biases(x, is_doubtful, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
+
+
+@njit(cache=True)
+def _start_over(x: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
+    """Attitude, velocity and place are no better known than at the start; biases are.
+
+    All feet that stand are put down anew.
+    """
+    P, spare = x.error_covariance, np.zeros(len(x.error_covariance))
+    _add_noise(P, _ATTITUDE, known.start.tilt**2)
+    _add_noise(P, _VELOCITY, known.start.velocity**2)
+    _add_noise(P, _POSITION, (known.start.velocity * _LOST_AFTER) ** 2)
+    for foot in range(len(x.foot_standing)):
+        if x.foot_standing[foot] > 0:
+            _land(x, P, spare, foot, model, known)
+    x.lost_for = 0.0
 
 
 @njit(cache=True)
@@ -778,20 +845,35 @@ def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray
             at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
             middle, learned = leash[0, sensor, i], max(0.0, leash[0, 2 + sensor, i] - P[at, at])
             reach = _LEASH * math.sqrt(learned)
-            bias[i] = min(max(bias[i], middle - reach), middle + reach)
+            _set_bias(x, sensor, i, min(max(bias[i], middle - reach), middle + reach))
 
 
 @njit(cache=True)
-def _remember_biases(x: np.ndarray, trust: np.ndarray, first: bool, elapsed: float) -> None:
-    """While a sensor is not trusted the IMU's biases are those from before it began to fail."""
+def _set_bias(x: np.ndarray, sensor: int, axis: int, value: float) -> None:
+    """Sets a bias of the gyro (0) or the accelerometer (1), and moves with it what is known by it.
+
+    What the filter took for a bias it also took for a tilt.
+    """
+    at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + axis
+    bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
+    P, change = x.error_covariance, value - bias[axis]
+    if change != 0.0 and P[at, at] > 0.0:
+        _correct(x, P[at] * (change / P[at, at]))
+
+
+@njit(cache=True)
+def _remember_biases(x: np.ndarray, is_doubtful: bool, first: bool, elapsed: float) -> None:
+    """While sensors are doubtful the IMU's biases are those from before they began to fail."""
     kept = x.kept_biases
     if first:
         for age in range(2):
             kept[age, 0], kept[age, 1] = x.gyro_bias_B, x.accelerometer_bias_B
         x.kept_for = 0.0
-    elif trust.max() > 0 or x.check.doubt.max() > 0:
+    elif is_doubtful:
         kept[1] = kept[0]
-        x.gyro_bias_B[:], x.accelerometer_bias_B[:] = kept[0, 0], kept[0, 1]
+        for sensor in range(2):
+            for axis in range(3):
+                _set_bias(x, sensor, axis, kept[0, sensor, axis])
         x.kept_for = 0.0
     else:
         x.kept_for += elapsed
@@ -911,6 +993,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                [s], and more, see `force_delay_type`
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
+        lost_for               ()      for how long all feet that stand have contradicted the
+                                       velocity [s]
         leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
                                and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
@@ -1023,6 +1107,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         kept_for=(),
         leash=(2, 4, 3),
         leashed_for=(),
+        lost_for=(),
         check=cross_check_type(feet),
         force_delay=force_delay_type(clock),
     )

@@ -154,6 +154,26 @@ def cross_check(
 
 
 @njit(cache=True)
+def force_contradiction(x: np.ndarray, largest: Vector) -> float:
+    """By how much foot forces and joints have contradicted the accelerometer of late [m/s^2].
+
+    What they always do does not count, and less than what the forces may be wrong by is none.
+
+    Args:
+        x: record of `cross_check_type`.
+        largest: what they may be wrong by, along each axis of the base [m/s^2].
+    """
+    if x.age < _LONG:
+        return 0.0
+    z = subtract(add(vector(x.mean[1, 0]), vector(x.mean[1, 1])), vector(x.mean[1, 2]))
+    z = subtract(z, vector(x.habit))
+    for i in range(3):
+        if abs(z[i]) > largest[i]:
+            return _norm(z)
+    return 0.0
+
+
+@njit(cache=True)
 def _blame(x: np.ndarray, turns: bool) -> None:
     """Sets who is doubted: the IMU, or the feet whose forces changed most."""
     change = np.zeros(4)

@@ -497,10 +497,12 @@ def _estimate_friction(
         shared = through_model * through_link * velocity_variance
         column[0] += shared
         S = column[0] + shared + noise * link.impulse_variance[joint]
-        impulse, velocity_error = innovation, 0.0
+        impulse, velocity_error, unlikely = innovation, 0.0, 0.0
         if valid:
             likely = min(1.0, _GATE * math.sqrt(S) / max(abs(innovation), 1e-300))
             S_gate = S / likely**2
+            # Nobody knows which is wrong, estimate or measurement.
+            unlikely = abs(innovation) / T if likely < 1.0 else 0.0
             # From what it cannot explain the model learns nothing, the disturbance all.
             learns = count * last.agreement[joint] ** 2 <= _GATE**2 * S
             for i in range(size):
@@ -554,7 +556,7 @@ def _estimate_friction(
             posterior.parameter_variance[joint, k] = P[1 + k, 1 + k]
         posterior.friction[joint], posterior.noise[joint] = total, noise
         # What the model learned just now is not confirmed yet.
-        doubt = max(abs(x[m]) + abs(unsettled), keep_doubt * last.doubt[joint])
+        doubt = max(abs(x[m]) + abs(unsettled), unlikely, keep_doubt * last.doubt[joint])
         posterior.doubt[joint] = doubt
         posterior.friction_std[joint] = math.sqrt(max(0.0, variance) + doubt**2)
         posterior.disturbance[joint], posterior.impulse[joint] = x[m], impulse

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.force_delay import delays_of, room_for_delays, tick_of
-from fbse_drake.estimators.innovations import LARGEST_SHARE, NOISE_TIME
+from fbse_drake.estimators.innovations import LOG_OF_SIX, LOG_OF_THREE, learned_noise
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
@@ -59,7 +59,6 @@ def _watch_forces(
     It shows in second differences, to which forces that change smoothly add little; one tick does
     not tell much, for a foot may just have landed.
     """
-    learning = 1.0 - math.exp(-elapsed / NOISE_TIME)
     posterior.wrench[:] = wrench
     posterior.wrench_change[:] = wrench - last.wrench
     for foot in range(len(wrench)):
@@ -69,13 +68,13 @@ def _watch_forces(
             continue
         share, variance = 0.0, known.wrench_variance[foot]
         # A point foot has no moment.
-        size = 6.0 * (variance > 0.0).sum()
+        measured = (variance > 0.0).sum()
         for i in range(6):
             if variance[i] > 0.0:
                 bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
-                share += bend * bend / (size * excess * variance[i])
-        learnt = excess * (1.0 + learning * (min(LARGEST_SHARE, share) - 1.0))
-        posterior.force_noise[foot] = max(1.0, learnt)
+                share += bend * bend / (6.0 * measured * excess * variance[i])
+        mean_log = LOG_OF_SIX if measured == 6 else LOG_OF_THREE
+        posterior.force_noise[foot] = learned_noise(excess, share, mean_log, elapsed)
 
 
 @njit(cache=True)

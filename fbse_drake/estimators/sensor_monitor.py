@@ -228,7 +228,9 @@ def _watch_joints(
         x.other[i] = was.other[i] + way
         late = known.limits.velocity_delay * abs(v - was.velocity[i])
         x.allowance[i] = was.allowance[i] + _GAIN_ERROR * abs(way) + late
-        x.agreed[i] = was.agreed[i] + T if agrees else 0.0
+        # What repeats itself agrees with anything that does.
+        moves = q != was.angle[i] or v != was.velocity[i]
+        x.agreed[i] = was.agreed[i] + (T if moves else 0.0) if agrees else 0.0
         x.returned[i], x.is_mixed[i] = 0.0, was.is_mixed[i]
         if doubt == 0 and (jumps or not agrees):
             if jumps and abs(q - x.other[i]) < x.allowance[i]:
