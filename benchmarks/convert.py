@@ -42,7 +42,10 @@ def main() -> None:
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
     with TemporaryDirectory() as folder:
         bag, log = Path(folder) / "bag.mcap", Path(folder) / "log.npz"
-        write = f"from pathlib import Path; from benchmarks.convert import write_bag; write_bag(Path({str(bag)!r}), {minutes})"
+        write = (
+            "from pathlib import Path; from benchmarks.convert import write_bag; "
+            f"write_bag(Path({str(bag)!r}), {minutes})"
+        )
         start = time.perf_counter()
         subprocess.run([sys.executable, "-c", write], check=True)
         written = time.perf_counter() - start

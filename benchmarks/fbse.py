@@ -197,7 +197,10 @@ def cases(fixed: Mapping[str, str]) -> list[Case]:
         "Table I, torque sensors": "!TorqueSensor {}",
         "Table I, fixed model": fixed["paper_walk_fbse"],
     }
-    paper = "estimator=!Fbse {attitude: {level_feet: 0}, base_state: !AdaptiveLipm {}, support: !PlannedSupport {}, "
+    paper = (
+        "estimator=!Fbse {attitude: {level_feet: 0}, base_state: !AdaptiveLipm {}, "
+        "support: !PlannedSupport {}, "
+    )
     paper += "joint_acceleration: {method: minimum_norm}, friction: !RecursiveLeastSquares {}}"
     hrp2 = {
         "no compensation": ("compensation=!NoCompensation {}", _TORQUE_SENSOR),

@@ -1,5 +1,5 @@
-"""How well missing physics is found: `python -m
-benchmarks.hidden [--quick] [--sample N] [--only NAME] [--seeds N] [--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
+"""How well missing physics is found: `python -m benchmarks.hidden [--quick] [--sample N]
+[--only NAME] [--seeds N] [--sizes SIZE ...] [--jobs N] [--keep] [--out DIR]`.
 
 Hides every effect of the library in the paper's walk, in three sizes and for several seeds; also
 nothing, two effects at once, effects that the library does not have, and effects in robots that
@@ -436,7 +436,8 @@ class Figures:
                 continue
             seen = [r for r in mine if r in self.visible]
             counts = [
-                f"{sum(r.score['first'] for r in mine if r.size == size)}/{sum(r.size == size for r in mine)}"
+                f"{sum(r.score['first'] for r in mine if r.size == size)}/"
+                f"{sum(r.size == size for r in mine)}"
                 for size in SIZES
             ]
             others = Counter(r.label for r in seen if not r.score["first"])
@@ -577,7 +578,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Section("Cases that went wrong", details=(Details("One line each", failures or "none"),)),
     )
     versions = len({result.tree["sources"] for result in everything})
-    outcome = f"{len(everything)} cases, made by {versions} version{'s' if versions != 1 else ''} of the sources."
+    outcome = (
+        f"{len(everything)} cases, made by {versions} "
+        f"version{'s' if versions != 1 else ''} of the sources."
+    )
     console.print(outcome, highlight=False)
     write_report(
         options.out / "report.html",

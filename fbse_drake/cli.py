@@ -1,4 +1,7 @@
-"""The `fbse` command line. Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input."""
+"""The `fbse` command line.
+
+Exit status: 0 done, 1 the run failed or was interrupted (what is known is written), 2 bad input.
+"""
 
 import argparse
 import errno
@@ -34,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "_ARGCOMPLETE" in os.environ:
             _complete(parser)
         options = parser.parse_args(arguments)
-        # Matrices are small here: more threads of the linear algebra wait for each other, at three times the cost.
+        # Matrices are small here: more threads of the linear algebra wait for each other, at three
+        # times the cost.
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(name, "1")
         if "workers" in options and not getattr(options, "scheduler", None):
@@ -150,7 +154,10 @@ def _parser() -> argparse.ArgumentParser:
         description="Simulates a scenario; writes log, metrics and report.",
         examples=(
             "fbse simulate squat",
-            "fbse simulate paper_walk --set reference.step_length=0.05 --set seed=3 --out out/short",
+            (
+                "fbse simulate paper_walk --set reference.step_length=0.05 --set seed=3 --out "
+                "out/short"
+            ),
             "fbse simulate my_scenario.yaml --meshcat",
         ),
     )
@@ -164,7 +171,10 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "estimate",
         help="run a scenario's estimator over a recorded log",
-        description="Runs a scenario's estimator over a recorded log; writes the log with the estimates, metrics and report.",
+        description=(
+            "Runs a scenario's estimator over a recorded log; writes the log with the "
+            "estimates, metrics and report."
+        ),
         examples=(
             "fbse estimate paper_walk_fbse out/paper_walk/log.npz",
             "fbse estimate paper_walk_fbse --name paper_method out/paper_walk/log.npz",
@@ -200,7 +210,10 @@ def _parser() -> argparse.ArgumentParser:
             "identify",
             "identify",
             "inertial parameters and plain friction",
-            "Identifies the inertial parameters that a scenario does not trust (identify.inertia), with plain friction.",
+            (
+                "Identifies the inertial parameters that a scenario does not trust "
+                "(identify.inertia), with plain friction."
+            ),
             ("fbse identify real/ur10 ur10_exciting_trajectory.db3",),
         ),
         (
@@ -263,7 +276,10 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "convert",
         help="make a log of a recording, or a bag of a log",
-        description="Makes a log of recordings (ROS bags, CSV, JSON, MATLAB, npz), or of a log a file for other programs (mcap, csv).",
+        description=(
+            "Makes a log of recordings (ROS bags, CSV, JSON, MATLAB, npz), or of a log a "
+            "file for other programs (mcap, csv)."
+        ),
         examples=(
             "fbse convert recording.mcap recording.npz",
             "fbse convert run1.csv run2.csv recording.npz --map my_map.yaml",
@@ -296,7 +312,10 @@ def _parser() -> argparse.ArgumentParser:
         description="Writes a scenario whose model has what a diagnosis found.",
         examples=(
             "fbse add paper_walk out/paper_walk_diagnose --out completed.yaml",
-            "fbse add paper_walk out/paper_walk_diagnose --effect StribeckFriction --out completed.yaml",
+            (
+                "fbse add paper_walk out/paper_walk_diagnose --effect StribeckFriction --out "
+                "completed.yaml"
+            ),
         ),
     )
     _add_scenario(run)
@@ -323,7 +342,10 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "hide",
         help="make an exercise: a log with a hidden effect",
-        description="Hides an effect in a scenario's robot and writes the log without it in the model, and the answer sealed (see reveal).",
+        description=(
+            "Hides an effect in a scenario's robot and writes the log without it in the "
+            "model, and the answer sealed (see reveal)."
+        ),
         examples=(
             "fbse hide paper_walk --seed 7 --out out/mystery",
             "fbse hide paper_walk --seed 7 --what decoy --out out/decoy",
@@ -339,7 +361,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--what",
         default="any",
-        help="any, library, decoy (nothing), stranger (none of the library) or the name of an effect",
+        help=(
+            "any, library, decoy (nothing), stranger (none of the library) or the name of an effect"
+        ),
     )
     run.add_argument(
         "--size",
@@ -365,8 +389,10 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "rivals",
         help="every method of estimating the friction against each other",
-        description="Tunes every estimator that fits a scenario on another walk, each in as many trials, and compares them on the "
-        "same walks and sensors; writes rivals.json and a report. The same command goes on where it was stopped.",
+        description="Tunes every estimator that fits a scenario on another walk, each in as many "
+        "trials, and compares them on the "
+        "same walks and sensors; writes rivals.json and a report. The same command "
+        "goes on where it was stopped.",
         examples=(
             "fbse rivals paper_walk --seeds 1 --set duration=4",
             "fbse rivals hrp2_walk_fbse --case 'a push' --case 'biased IMU' --out out/rivals",
@@ -391,7 +417,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--case",
         action="append",
-        help="only this case beside the walk as believed, as in 'a push'; repeatable (default: all)",
+        help=(
+            "only this case beside the walk as believed, as in 'a push'; repeatable (default: all)"
+        ),
     )
     run.add_argument(
         "--workers",
@@ -432,7 +460,10 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "campaign",
         help="many runs at once, on this machine or a Dask cluster",
-        description="Does the runs of a campaign that are not done, each of which becomes a row of a table; the same command goes on.",
+        description=(
+            "Does the runs of a campaign that are not done, each of which becomes a row of "
+            "a table; the same command goes on."
+        ),
         examples=(
             "fbse campaign friction.yaml --out out/friction",
             "fbse campaign friction.yaml --out s3://lab/friction --scheduler tcp://host:8786",
@@ -443,7 +474,10 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--out",
         metavar="DIR",
-        help="where the rows go: a folder, or an address as s3://... (default: out/ and the file's name)",
+        help=(
+            "where the rows go: a folder, or an address as s3://... (default: out/ and the "
+            "file's name)"
+        ),
     )
     place = run.add_mutually_exclusive_group()
     place.add_argument(
@@ -463,10 +497,16 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "table",
         help="what the rows of a campaign say",
-        description="Prints medians (of truth values: shares) with 95 %% intervals, by group; writes table.csv (all rows) and groups.csv.",
+        description=(
+            "Prints medians (of truth values: shares) with 95 %% intervals, by group; "
+            "writes table.csv (all rows) and groups.csv."
+        ),
         examples=(
             "fbse table out/friction --value walk.com_rse_mean",
-            "fbse table out/friction --by reference.step_length --plot walk.com_rse_mean.x reference.step_length",
+            (
+                "fbse table out/friction --by reference.step_length --plot walk.com_rse_mean.x "
+                "reference.step_length"
+            ),
         ),
     )
     run.add_argument("folder", metavar="DIR", help="what campaign wrote")
@@ -474,7 +514,10 @@ def _parser() -> argparse.ArgumentParser:
         "--by",
         metavar="COLUMN",
         action="append",
-        help="a column that makes groups; repeatable (default: the design's, if they have few values)",
+        help=(
+            "a column that makes groups; repeatable (default: the design's, if they have "
+            "few values)"
+        ),
     )
     run.add_argument(
         "--value",

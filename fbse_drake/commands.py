@@ -190,9 +190,8 @@ def _convert(options: argparse.Namespace) -> bool:
         )
         findings = log.meta.get("findings", [])
         if findings and options.strict:
-            raise InputError(
-                f"{findings[0]}{f' (and {len(findings) - 1} more findings)' if findings[1:] else ''}"
-            )
+            further = f" (and {len(findings) - 1} more findings)" if findings[1:] else ""
+            raise InputError(f"{findings[0]}{further}")
         status.update(f"writing {escape(out.name)}")
         out.parent.mkdir(parents=True, exist_ok=True)
         write(log, out)
@@ -200,7 +199,8 @@ def _convert(options: argparse.Namespace) -> bool:
     table.add_row(
         "rows",
         (
-            f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally {log.meta['period']:g} "
+            f"{len(log.time)} in {log.time[-1] - log.time[0]:.6g} s, nominally "
+            f"{log.meta['period']:g} "
             "s apart"
         ),
     )
@@ -350,7 +350,10 @@ def _add(options: argparse.Namespace) -> bool:
 def _value_lines(finding: Finding) -> list[str]:
     """Values with their 95 % intervals, and what they bring; for the comments of a scenario."""
     where = f"{finding.effect} in {targets_text(finding.targets)}"
-    errors = f"{where}: held-out error {finding.held_out_before:.3g} times the noise before, {finding.held_out_after:.3g} after"
+    errors = (
+        f"{where}: held-out error {finding.held_out_before:.3g} times the noise before, "
+        f"{finding.held_out_after:.3g} after"
+    )
     values = [
         f"{where}: {parameter_text(name, estimate)}, with its 95 % interval"
         for name, estimate in finding.parameters.items()

@@ -67,8 +67,8 @@ def init_robot(
         recording: a bag, for whose topics the map is made; by default it is one of a table.
 
     Raises:
-        InputError: no URDF, a foot that cannot be found, a description that exists already, or a bag
-            that cannot be read or names no joint of the robot.
+        InputError: no URDF, a foot that cannot be found, a description that exists already, or a
+            bag that cannot be read or names no joint of the robot.
     """
     name = name or urdf.stem
     if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name):

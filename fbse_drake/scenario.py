@@ -446,9 +446,9 @@ def load_scenario(
         InputError: file not found, unknown key, wrong type, impossible value, unknown joint.
 
     >>> from fbse_drake import load_scenario
-    >>> scenario = load_scenario("paper_walk", overrides=["duration=5", "reference.step_length=0.05"])
-    >>> scenario.duration, scenario.reference.step_length
-    (5.0, 0.05)
+    >>> scenario = load_scenario("paper_walk", overrides=["duration=5", "seed=3"])
+    >>> scenario.duration, scenario.seed
+    (5.0, 3)
     >>> load_scenario("paper_walk", overrides=["duration=long"])
     Traceback (most recent call last):
     fbse_drake.errors.InputError: ...: duration: expected a number, found 'long'

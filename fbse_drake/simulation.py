@@ -176,10 +176,16 @@ def fall_reason(
     X_WB = _base_pose(robot, context)
     height = X_WB.translation()[2]
     if height < criterion.height_ratio * initial_height:
-        return f"fell: the base is {height:.2f} m high, less than {criterion.height_ratio:g} of {initial_height:.2f} m"
+        return (
+            f"fell: the base is {height:.2f} m high, less than {criterion.height_ratio:g} "
+            f"of {initial_height:.2f} m"
+        )
     tilt = math.acos(min(1.0, X_WB.rotation().matrix()[2, 2]))
     if tilt > criterion.tilt:
-        return f"fell: the base is tilted by {np.rad2deg(tilt):.0f} deg, more than {np.rad2deg(criterion.tilt):.0f} deg"
+        return (
+            f"fell: the base is tilted by {np.rad2deg(tilt):.0f} deg, more than "
+            f"{np.rad2deg(criterion.tilt):.0f} deg"
+        )
     return None
 
 

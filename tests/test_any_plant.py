@@ -33,24 +33,29 @@ CRANE = f"""
 <robot name="crane">
   <link name="rail"/>
   <link name="trolley">
-    <inertial><mass value="{TROLLEY}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <inertial><mass value="{TROLLEY}"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
     <visual><geometry><mesh filename="package://nowhere/trolley.dae"/></geometry></visual>
   </link>
   <link name="rod">
-    <inertial><origin xyz="0 0 {-LENGTH}"/><mass value="{LOAD}"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
+    <inertial><origin xyz="0 0 {-LENGTH}"/><mass value="{LOAD}"/>
+    <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
   </link>
   <link name="spoon">
-    <inertial><origin xyz="0.1 0 0"/><mass value="1.0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
+    <inertial><origin xyz="0.1 0 0"/><mass value="1.0"/>
+    <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
   </link>
   <joint name="slide" type="prismatic">
     <parent link="rail"/><child link="trolley"/><axis xyz="1 0 0"/>
     <limit lower="-9" upper="9" effort="3" velocity="9"/><dynamics damping="50"/>
   </joint>
   <joint name="swing" type="revolute">
-    <parent link="trolley"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="3" velocity="9"/>
+    <parent link="trolley"/><child link="rod"/><axis xyz="0 1 0"/>
+    <limit lower="-9" upper="9" effort="3" velocity="9"/>
   </joint>
   <joint name="spoon_hinge" type="revolute">
-    <parent link="rod"/><child link="spoon"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="3" velocity="9"/>
+    <parent link="rod"/><child link="spoon"/><axis xyz="0 1 0"/>
+    <limit lower="-9" upper="9" effort="3" velocity="9"/>
   </joint>
   <transmission name="slide_drive">
     <joint name="slide"/><actuator name="slide_motor"/>
@@ -377,7 +382,10 @@ def test_a_position_servo_tells_its_torque_by_its_gains(rubbing: tuple[Scenario,
         ({"joints": []}, "expected legs, joints or both, found neither"),
         (
             {"held": {"slide": 0.1}},
-            r"held.slide: expected a joint of the model that is not named elsewhere \(there are: spoon_hinge\)",
+            (
+                r"held.slide: expected a joint of the model that is not named elsewhere \(there "
+                r"are: spoon_hinge\)"
+            ),
         ),
         ({"urdf": "other.urdf"}, "other.urdf: no such file"),
         ({"urdf": "${NOT_SET_ANYWHERE}/crane.urdf"}, "this environment variable is not set"),

@@ -51,7 +51,8 @@ def area(material, file, pause=0.0):
     time.sleep(pause)
     if material.seed == 7:
         raise RuntimeError("out of luck")
-    return {"area": material.values["side"] ** 2, "corners": 4, "large": material.values["side"] > 1}
+    side = material.values["side"]
+    return {"area": side**2, "corners": 4, "large": side > 1}
 """
 
 
@@ -214,7 +215,8 @@ set: [duration=3]
 steps: {walk: !Simulate {}, estimate: !Estimate {set: ["estimator=!Fbse {}"]}}
 design: !Random
   runs: 3
-  values: {reference.step_length: !Uniform {low: 0.05, high: 0.1}, ground: !Choice {of: [{slope: [0.0, 0.0]}]}}
+  values: {reference.step_length: !Uniform {low: 0.05, high: 0.1},
+    ground: !Choice {of: [{slope: [0.0, 0.0]}]}}
 """
     (tmp_path / "a.yaml").write_text(text)
     campaign = load_campaign(tmp_path / "a.yaml")

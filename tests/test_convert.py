@@ -553,7 +553,8 @@ def test_maps_are_checked(tmp_path: Path, text: str, message: str):
         (
             with_position(columns=["q1"]),
             (
-                "channels.joint/position: columns: expected 2 in all, one for each of 2 joints, found "
+                "channels.joint/position: columns: expected 2 in all, one for each of 2 "
+                "joints, found "
                 "1"
             ),
         ),
@@ -844,7 +845,10 @@ def test_a_type_of_somebody_elses(tmp_path: Path):
     channels["joint/position"] = ChannelMap(topic="/state", columns=["motors.speed"])
     with pytest.raises(
         InputError,
-        match=r"topic /state: its messages have no numbers motors.speed \(there are: header.stamp.sec",
+        match=(
+            r"topic /state: its messages have no numbers motors.speed \(there are: "
+            r"header.stamp.sec"
+        ),
     ):
         convert([path], LogMap(joints=JOINTS, channels=channels))
 

@@ -362,7 +362,10 @@ def test_what_a_large_effect_leaves_over_is_noise(hidden: str) -> None:
 def test_a_ripple_is_not_seen_in_a_joint_that_stands_still() -> None:
     """Within a milliradian a ripple of any period is a bias and a spring."""
     candidates = [library()[name] for name in ("TorqueRipple", "JointSpring", "TorqueBias")]
-    values = "sine: {left_hip_yaw: 2.0, left_knee_pitch: 1.0}, cosine: {left_hip_yaw: 0.5, left_knee_pitch: 0.5}, cycles: {all: 100}"
+    values = (
+        "sine: {left_hip_yaw: 2.0, left_knee_pitch: 1.0}, cosine: {left_hip_yaw: 0.5, "
+        "left_knee_pitch: 0.5}, cycles: {all: 100}"
+    )
     hidden = f"!TorqueRipple {{{values}}}"
     diagnosis = diagnose(Predictor(scenario(), log_with(hidden)), candidates)
     named = {target: finding.effect for finding in diagnosis.chosen for target in finding.targets}

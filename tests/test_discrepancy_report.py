@@ -163,15 +163,18 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             True,
             [
                 (
-                    "The model lacks Coulomb friction in left and right knee pitch; this log cannot "
+                    "The model lacks Coulomb friction in left and right knee "
+                    "pitch; this log cannot "
                     "tell that from presliding hysteresis."
                 ),
                 (
-                    "the error of all channels falls from 4.20 to 1.01 times the sensors&#39; noise "
+                    "the error of all channels falls from 4.20 to 1.01 times the "
+                    "sensors&#39; noise "
                     "(1.00 on the data that it was fitted to)"
                 ),
                 (
-                    "Presliding hysteresis explains this log as well as Coulomb friction in left and "
+                    "Presliding hysteresis explains this log as well as Coulomb "
+                    "friction in left and "
                     "right knee pitch."
                 ),
                 (
@@ -198,7 +201,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             False,
             [
                 (
-                    "Something is missing that no effect of the library explains, in left knee pitch "
+                    "Something is missing that no effect of the library explains, "
+                    "in left knee pitch "
                     "(follows position)."
                 ),
                 "register an effect",
@@ -209,7 +213,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             False,
             [
                 (
-                    "This log cannot tell whether something is missing: 1 of 4 effects would not show "
+                    "This log cannot tell whether something is missing: 1 of 4 "
+                    "effects would not show "
                     "in it."
                 ),
                 "Record a motion that shows more: Repeat one motion. It shows thermal drift.",

@@ -470,7 +470,9 @@ class GravityOfACable(JointTorqueEffect):
     description: ClassVar[str] = "A cable hangs on the joint."
     signature: ClassVar[str] = "Torque like the cosine of the angle."
     experiment: ClassVar[str] = "Hold the joint at several angles."
-    parameters: ClassVar[dict[str, Parameter]] = {"weight": Parameter("Nm", linear=True, plausible=(0.0, 10.0))}
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "weight": Parameter("Nm", linear=True, plausible=(0.0, 10.0))
+    }
 
     weight: dict[str, float] = field(default_factory=dict)
 

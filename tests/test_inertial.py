@@ -56,7 +56,8 @@ def urdf(links: dict[str, tuple[float, float, float, float]]) -> str:
         for name, (m, x, z, i) in links.items()
     )
     joints = "".join(
-        f'<joint name="{joint}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/>'
+        f'<joint name="{joint}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x} 0 0"/>'
         '<axis xyz="0 -1 0"/><limit lower="-9" upper="9" effort="99" velocity="99"/></joint>'
         for joint, parent, child, x in (
             ("shoulder", "stand", "upper", 0.0),

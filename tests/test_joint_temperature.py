@@ -184,7 +184,9 @@ from fbse_drake.signals import Signal
 @in_library
 @dataclass(frozen=True)
 class StrainGauge(Sensor):
-    signals: ClassVar[tuple[Signal, ...]] = (Signal("joint/strain", "1", ("n",), "measured_strain"),)
+    signals: ClassVar[tuple[Signal, ...]] = (
+        Signal("joint/strain", "1", ("n",), "measured_strain"),
+    )
 
     gain: float = 1.0e-6
 

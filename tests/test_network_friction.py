@@ -1,4 +1,5 @@
-"""Friction by networks that are trained offline: what they learn, and that they say what they do not know."""
+"""Friction by networks that are trained offline: what they learn, and that they say what they do
+not know."""
 
 from dataclasses import replace
 

@@ -73,8 +73,9 @@ class Load:
         x, y, z = self.place
         return (
             f'<link name="load"><inertial><mass value="{self.mass}"/>'
-            f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-            f'<joint name="holds" type="fixed"><parent link="{self.body}"/><child link="load"/>'
+            f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/>'
+            '</inertial></link><joint name="holds" type="fixed">'
+            f'<parent link="{self.body}"/><child link="load"/>'
             f'<origin xyz="{x} {y} {z}"/></joint>'
         )
 

@@ -235,7 +235,8 @@ def test_the_equation_of_motion_of_the_base_closes_on_point_feet(log: Log):
 
 
 def test_between_two_point_feet_all_but_a_turn_about_their_line_shows(robot: Robot):
-    """Relative velocities are w x (p - q) and what the legs' joints do, by Drake's places of the feet."""
+    """Relative velocities are w x (p - q) and what the legs' joints do, by Drake's places of the
+    feet."""
     random = np.random.default_rng(3)
     q = np.tile([0.05, 0.7, -1.3], 4) + random.uniform(-0.2, 0.2, 12)
     rate, w, lean = random.normal(size=(3, 12)), random.normal(size=(3, 3)), 1e-6
@@ -292,7 +293,8 @@ def test_pairs_of_feet_say_a_motion_once(log: Log):
 
 @pytest.mark.parametrize("compliance", [0.0, 2e-6])
 def test_soft_ground_shows_between_point_feet(run, compliance: float):
-    """Least squares over the rows finds what is simulated, and on firm ground nothing; noise is white."""
+    """Least squares over the rows finds what is simulated, and on firm ground nothing; noise is
+    white."""
     soft = f"robot.effects.soft=!GroundCompliance {{compliance: {compliance}}}"
     log = run(
         "quadruped_trot", *SHORT, "estimator=!NoEstimator {}", *([soft] if compliance else [])

@@ -187,7 +187,10 @@ def test_point_masses_are_no_bodies_of_their_own(plain: Robot):
     [
         (
             BodyMass({"torso": 1.0}),
-            r"effects\.added_0: torso: the model has no body of this name with a mass \(there are: trunk, left_hip",
+            (
+                r"effects\.added_0: torso: the model has no body of this name with a mass "
+                r"\(there are: trunk, left_hip"
+            ),
         ),
         (BodyMass({"trunk": -50.0}), r"trunk: expected a mass > 0, found 0 kg"),
         (ReflectedInertia({"elbow": 1.0}), r"effects\.added_0\.inertia\.elbow: unknown joint"),
@@ -589,7 +592,10 @@ def test_a_foot_in_the_air_does_not_creep_out_of_all_numbers(plain: Robot):
 def test_creep_needs_a_solver_that_creeps():
     with pytest.raises(
         InputError,
-        match=r"robot: plant\.discrete_contact_approximation: FootCreep needs lagged or similar, found sap",
+        match=(
+            r"robot: plant\.discrete_contact_approximation: FootCreep needs lagged or "
+            r"similar, found sap"
+        ),
     ):
         build_station(
             with_effects(

@@ -176,9 +176,11 @@ def test_a_dc_motor_spins_up_to_its_no_load_speed(tmp_path: Path):
     (tmp_path / "wheel.urdf").write_text(f"""
 <robot name="wheel">
   <link name="stand"/>
-  <link name="disc"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="disc"><inertial><mass value="1"/>
+    <inertia ixx="1" iyy="1" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="servo" type="revolute">
-    <parent link="stand"/><child link="disc"/><axis xyz="0 0 1"/><limit lower="-1e6" upper="1e6" effort="1" velocity="1e3"/>
+    <parent link="stand"/><child link="disc"/><axis xyz="0 0 1"/>
+    <limit lower="-1e6" upper="1e6" effort="1" velocity="1e3"/>
   </joint>
 </robot>
 """)

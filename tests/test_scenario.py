@@ -92,7 +92,10 @@ def bomb(begin: str, end: str) -> str:
         ),
         (
             "mine: {reference: !Hop {}}",
-            r"reference: expected one of !Walk, !Trot, !Squat, !Sway, !JointSines, !Recorded, found the tag !Hop",
+            (
+                r"reference: expected one of !Walk, !Trot, !Squat, !Sway, !JointSines, "
+                r"!Recorded, found the tag !Hop"
+            ),
         ),
         ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
         ("mine: {duration: .nan}", r"duration: expected a finite number, found nan"),
@@ -111,7 +114,10 @@ def bomb(begin: str, end: str) -> str:
         ),
         (
             "mine: {plant: {time_step: 0.002}, control: {period: 0.001}}",
-            r"control\.period: expected a whole multiple of plant\.time_step = 0\.002 s, found 0\.001",
+            (
+                r"control\.period: expected a whole multiple of plant\.time_step = 0\.002 s, "
+                r"found 0\.001"
+            ),
         ),
         (
             "mine: {plant: {time_step: 0.002}, sensors: {encoders: {period: 0.003}}}",

@@ -245,7 +245,10 @@ def believed(robot_with: Scenario) -> Scenario:
 
 
 def test_a_hidden_effect_is_found():
-    hidden = "robot.effects.hidden=!LoadDependentFriction {coefficient: {r_knee: 0.08}, transition: {all: 0.02}}"
+    hidden = (
+        "robot.effects.hidden=!LoadDependentFriction {coefficient: {r_knee: 0.08}, "
+        "transition: {all: 0.02}}"
+    )
     case = believed(scenario("strider_walk", "duration=3", hidden))
     diagnosis = diagnose(Predictor(case, simulate(case).log))
     assert diagnosis.verdict == "effect_found"
@@ -381,7 +384,8 @@ def test_legs_that_cannot_walk_are_refused(tmp_path: Path):
         tmp_path / "waisted", "strider", lambda d: d | {"joints": ["waist"], "imu": "torso"}
     )
     urdf = tmp_path / "waisted" / "strider.urdf"
-    waist = """<link name="pelvis"/><joint name="waist" type="revolute"><parent link="torso"/><child link="pelvis"/><axis xyz="0 0 1"/>
+    waist = """<link name="pelvis"/><joint name="waist" type="revolute">
+    <parent link="torso"/><child link="pelvis"/><axis xyz="0 0 1"/>
     <limit lower="-1" upper="1" effort="100" velocity="10"/></joint></robot>"""
     text = urdf.read_text().replace("</robot>", waist)
     for side in "lr":

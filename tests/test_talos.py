@@ -22,12 +22,14 @@ ELBOWS = ["arm_left_4_joint", "arm_right_4_joint"]
 WALK = """
 talos_walk:
   duration: 2
-  reference: !Walk {{com_height: 0.86, foot_spacing: 0.17, zmp_forward: 0.0, double_support: 0.6, single_supports: 3, posture: {posture}}}
+  reference: !Walk {{com_height: 0.86, foot_spacing: 0.17, zmp_forward: 0.0, double_support: 0.6,
+    single_supports: 3, posture: {posture}}}
   robot:
     description: {path}
     rotor_inertia: {{all: 0.2}}
     effects:
-      friction: !CoulombViscousFriction {{coulomb: {{all: 3.0, ankle_roll: 1.5}}, viscous: {{all: 2.0}}, transition: {{all: 0.02}}}}
+      friction: !CoulombViscousFriction {{coulomb: {{all: 3.0, ankle_roll: 1.5}},
+        viscous: {{all: 2.0}}, transition: {{all: 0.02}}}}
   sensors:
     encoders: {{resolution: 4.8e-5, velocity_noise: 5.0e-4}}
     imu: {{acceleration_noise: 0.02, angular_velocity_noise: 1.0e-3}}

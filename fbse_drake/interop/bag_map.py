@@ -35,7 +35,8 @@ _PAIRS = {
 
 
 def propose_map(bag: Path, robot: RobotDescription) -> tuple[LogMap, list[str]]:
-    """What the topics of a bag mean, as far as their messages and names tell; what they do not, in words.
+    """What the topics of a bag mean, as far as their messages and names tell; what they do not, in
+    words.
 
     Args:
         bag: that `open_bag` reads.

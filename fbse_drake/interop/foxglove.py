@@ -1,4 +1,5 @@
-"""A layout for Foxglove, which shows an exported log: the robot in 3D, joints, forces of the feet."""
+"""A layout for Foxglove, which shows an exported log: the robot in 3D, joints, forces of the
+feet."""
 
 from typing import Any
 

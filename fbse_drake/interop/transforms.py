@@ -41,14 +41,16 @@ class Transform:
 
 @dataclass(frozen=True)
 class RobotFrames:
-    """The frames of a log's robot, parents first, and its URDF with shapes as far as its model has them."""
+    """The frames of a log's robot, parents first, and its URDF with shapes as far as its model has
+    them."""
 
     transforms: list[Transform]
     urdf: str
 
 
 def robot_frames(log: Log) -> RobotFrames | None:
-    """The frames of the robot of a log's scenario: of all links, soles (`<side>_sole`) and IMU (`imu`).
+    """The frames of the robot of a log's scenario: of all links, soles (`<side>_sole`) and IMU
+    (`imu`).
 
     The base is where `truth/base/...` says, or else `estimate/base/...`. None for a log of which
     nobody knows the robot, as a recording, or where its base was.
