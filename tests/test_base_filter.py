@@ -461,7 +461,8 @@ def test_a_foot_that_slips_for_a_moment_does_not_upset_the_attitude():
 
 
 def test_an_accelerometer_that_forces_contradict_teaches_no_bias():
-    """Neither half a second of a wrong reading, nor what comes after it; little by little it may."""
+    """Neither half a second of a wrong reading, nor what comes after it; little by little it
+    may."""
     rig, x = settled()
     known, push = x["accelerometer_bias_B"].copy(), np.array([0.4, 0.0, 0.0])
     off = BASE.measurements(specific_force=push - GRAVITY)

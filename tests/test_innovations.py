@@ -28,7 +28,8 @@ def test_noise_is_found_when_it_begins_and_when_it_ends(count: int):
     assert np.median(found[1500:2000]) == pytest.approx(100.0, rel=0.3)
     # As believed it is at least, so it is somewhat above it.
     assert 1.0 <= np.median(found[500:1000]) < 1.3
-    # As long after the end as after the beginning, as much of it is left as is missing, in decibels.
+    # As long after the end as after the beginning, as much of it is left as is missing, in
+    # decibels.
     half = 1000 + int(np.argmax(found[1000:] > 10.0)), 2000 + int(np.argmax(found[2000:] < 10.0))
     assert abs((half[1] - 2000) - (half[0] - 1000)) < 40
     assert found[2500:].max() < 2.0
