@@ -10,6 +10,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from recorded_arm import ARM, Course
 from scipy.spatial.transform import Rotation
 
+from fbse_drake.discrepancy.diagnosis.detectability import separation
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
@@ -163,6 +164,17 @@ def test_a_rival_is_compared_where_it_fits(crooked: Predictor) -> None:
     assert there.deviance < at_zero.deviance - 3 * MARGIN
     errors = np.abs(there.fit.parameters - [0.02, -0.028, 0.0])
     assert np.all(errors < 3 * there.fit.deviation + 1e-4)
+
+
+def test_a_load_could_be_mistaken_for_a_mass(arm: Course) -> None:
+    """A load is linear about values of its own: its columns have an offset."""
+    predictor, mass = ARM.predictor(ARM.log(arm)), library()["BodyMass"]
+    payload, other = (library()[name] for name in ("Payload", "GyroscopeBias"))
+    by_load, by_nothing = (
+        separation(Fits(Dictionary(predictor, [rival])), mass, ["link_5"], {"mass": 1.0}, rival)
+        for rival in (payload, other)
+    )
+    assert abs(by_load) < 1e-3 * by_nothing
 
 
 def test_experiments_of_an_arm_are_planned() -> None:

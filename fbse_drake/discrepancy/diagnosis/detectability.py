@@ -117,9 +117,12 @@ def separation(
         return total
     gains = []
     for s in (c.signature for c in fits.fixed_candidates if c.effect is rival):
-        right = np.einsum("brp,br->p", s.values, signal[:, s.rows])
-        gram = fits.regression.products(s, s)[2].sum(axis=0)
-        gains.append(float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0]))
+        # What it adds whatever its parameters are has none to be fitted.
+        size, apart = s.values.shape[2], signal[:, s.rows] - s.offset
+        right = np.einsum("brp,br->p", s.values, apart)
+        gram = fits.regression.products(s, s)[2].sum(axis=0)[:size, :size]
+        fitted = float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+        gains.append(fitted + float((signal[:, s.rows] ** 2).sum() - (apart**2).sum()))
     return total - max(gains, default=0.0)
 
 
