@@ -10,9 +10,14 @@ imported when it is asked for (Drake takes seconds, and `fbse --help` does witho
 this one may change between versions.
 """
 
-from importlib.metadata import version
-
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__version__ = version(__name__)
+_imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name != "__version__":
+        return _imported(name)
+    from importlib.metadata import version
+
+    return version(__name__)

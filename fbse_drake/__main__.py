@@ -1,5 +1,5 @@
 """`python -m fbse_drake` is the `fbse` command."""
 
-from fbse_drake.cli import entry
+from fbse_drake.entry import entry
 
 entry()

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from fbse_command import FAILED, INTERRUPTED, end_as_at_ctrl_c, keep_what_is_known
+from fbse_drake.entry import FAILED, INTERRUPTED, end_as_at_ctrl_c, keep_what_is_known
 from fbse_drake.errors import InputError, on_one_line
 
 DONE, BAD_INPUT = 0, 2

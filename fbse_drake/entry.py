@@ -1,8 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""Where the `fbse` command begins: who ends it early is answered in one line.
-
-It stands beside the package, for to import anything of that takes a tenth of a second already.
-"""
+"""Where the `fbse` command begins: who ends it early is answered in one line."""
 
 import os
 import signal
