@@ -292,3 +292,14 @@ def test_a_robot_in_a_gantry_is_compared_by_its_joints(run):
     assert comparison.failures
     # Its feet never stand: nothing is said of phases.
     assert all("swing" not in failure.text for failure in comparison.failures)
+
+
+def test_a_log_of_one_stretch_says_no_interval_of_its_error():
+    whole, count = with_error(made_residual(), "left_knee_pitch", 2.0), 10
+    parts = ("time", "value", "known", "variance", "covariance", "standing")
+    signals = {name: values[:count] for name, values in vars(whole.signals).items()}
+    short = {name: getattr(whole, name)[:count] for name in parts}
+    comparison = compared(dataclasses.replace(whole, **short, signals=Instants(**signals)))
+    (failure,) = (f for f in comparison.failures if f.row.name == "left_knee_pitch")
+    assert failure.where.interval == (0.0, np.inf)
+    assert failure.where.error == pytest.approx(2.0, rel=0.1)

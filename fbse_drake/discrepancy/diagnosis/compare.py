@@ -362,9 +362,12 @@ class _RowErrors:
         )
 
     def _mean(self, values: np.ndarray, places: np.ndarray) -> tuple[float, float]:
-        """Mean of values at some blocks, (m,) each, and half of its 95 % interval by the scatter between stretches."""
+        """Mean of values at some blocks, (m,) each, and half of its 95 % interval by the scatter
+        between stretches; infinite where there is one stretch only, whose scatter nobody knows."""
         mean, count = float(values.mean()), len(places)
         stretches, stretch = np.unique(self.stretch[places], return_inverse=True)
+        if len(stretches) < 2:
+            return mean, np.inf
         sums, sizes = np.bincount(stretch, values - mean), np.bincount(stretch)
         scatter = np.sqrt((sums**2).sum() * len(stretches) / (len(stretches) - 1)) / count
         freedom = max(1.0, count**2 / (sizes**2).sum() - 1)
