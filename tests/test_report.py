@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
 from fbse_drake.report import figures
-from fbse_drake.report.figures import base, consistency, friction, joints, panels, walk
+from fbse_drake.report.figures import base, consistency, joint_friction, joints, panels, walk
 from fbse_drake.report.figures.kind import FigureKind
 from fbse_drake.report.html import (
     Details,
@@ -246,7 +246,7 @@ def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_re
 
 def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
     log = log_with_law(0.0, 0.25, 0.5, 0.02)
-    figure = friction.friction(log)
+    figure = joint_friction.friction(log)
     drawn = {
         axes.get_title(loc="left"): line.get_xydata()[:, 1]
         for axes in figure.axes
@@ -255,7 +255,7 @@ def test_the_law_is_drawn_for_the_joint_that_is_farthest_from_it():
     }
     assert list(drawn) == ["right hip"]
     np.testing.assert_array_equal(drawn["right hip"], log["truth/joint/friction_law_torque"][:, 2])
-    followed = friction.friction(log_with_law(0.0, 0.0, 0.005, 0.0))
+    followed = joint_friction.friction(log_with_law(0.0, 0.0, 0.005, 0.0))
     assert all(len(axes.get_lines()) == 1 for axes in followed.axes)
 
 
@@ -388,7 +388,12 @@ def difference(first: str, second: str, sight: str) -> float:
 def test_nobody_takes_the_truth_for_an_estimate(sight: str):
     log = estimated_log()
     compared = 0
-    for kind in (friction.estimated_friction, base.base_attitude, base.base_velocity, walk.com):
+    for kind in (
+        joint_friction.estimated_friction,
+        base.base_attitude,
+        base.base_velocity,
+        walk.com,
+    ):
         for axes in kind(log).axes:
             lines = {line.get_label().split(",")[0]: line for line in axes.get_lines()}
             if true := lines.get("true friction", lines.get("true")):
@@ -554,22 +559,22 @@ def test_figures_of_estimates_follow_the_channels():
 
 def test_estimate_and_truth_are_drawn_at_the_end_of_the_same_step():
     log = estimated_log()
-    figure = friction.estimated_friction(log)
+    figure = joint_friction.estimated_friction(log)
     estimate, truth = line(figure, 0, "estimated, left"), line(figure, 0, "true friction")
     np.testing.assert_allclose(estimate[1:], truth[1:] * [1.0, 1.1])
-    error = friction.friction_errors(log)
+    error = joint_friction.friction_errors(log)
     assert error.axes[0].get_title(loc="right") == "RMS 0.10 Nm"
     known = without(log, "truth/")
     assert [
         label
-        for label in friction.estimated_friction(known).axes[0].get_legend_handles_labels()[1]
+        for label in joint_friction.estimated_friction(known).axes[0].get_legend_handles_labels()[1]
         if "true" in label
     ] == []
 
 
 def test_swings_of_the_joints_own_leg_are_shaded():
     for log in (estimated_log(), without(estimated_log(), "reference/")):
-        panels = friction.estimated_friction(log).axes
+        panels = joint_friction.estimated_friction(log).axes
         spans = {
             axes.get_title(loc="left"): [patch.get_extents() for patch in axes.patches]
             for axes in panels
@@ -587,7 +592,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     log = estimated_log()
     spiky = log["estimate/joint/friction_torque"].copy()
     spiky[200, 0] = 500.0
-    axes = friction.estimated_friction(
+    axes = joint_friction.estimated_friction(
         Log(log.channels | {"estimate/joint/friction_torque": spiky}, log.meta)
     ).axes[0]
     low, high = axes.get_ylim()
@@ -597,7 +602,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     true_spike = log["truth/joint/friction_torque"].copy()
     true_spike[200, 0] = 50.0
     assert (
-        friction.estimated_friction(
+        joint_friction.estimated_friction(
             Log(log.channels | {"truth/joint/friction_torque": true_spike}, log.meta)
         )
         .axes[0]
@@ -620,7 +625,7 @@ def test_a_spike_of_an_estimate_does_not_flatten_its_panel():
     ],
 )
 def test_parameters_are_named_by_the_scenarios_friction_model(scenario, titles, bands):
-    figure = friction.friction_parameters(estimated_log(scenario))
+    figure = joint_friction.friction_parameters(estimated_log(scenario))
     assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == titles
     found = [
         collection.get_paths()[0].vertices[:, 1]

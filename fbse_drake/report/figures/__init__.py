@@ -1,20 +1,68 @@
 """Pictures of a log, by topic: a module for each, which holds its kinds of figures.
 
+    show(figures.footprints(log))
+
 To add a figure, write the function that draws it behind `@figure_kind(...)`, which says its title,
-its caption and the channels it needs, and name it in its module's `KINDS`.
+its caption and the channels it needs, and name it in its module's `KINDS` and here.
 """
 
 from fbse_drake.log import Log
-from fbse_drake.report.figures import base, consistency, forces, friction, joints, sensors, walk
+from fbse_drake.report.figures import (
+    base,
+    consistency,
+    forces,
+    joint_friction,
+    joints,
+    sensors,
+    walk,
+)
+from fbse_drake.report.figures.base import base_attitude, base_velocity, support
+from fbse_drake.report.figures.consistency import filter_consistency, friction_consistency, statuses
+from fbse_drake.report.figures.forces import foot_forces
+from fbse_drake.report.figures.joint_friction import (
+    estimated_friction,
+    friction,
+    friction_errors,
+    friction_over_velocity,
+    friction_parameters,
+)
+from fbse_drake.report.figures.joints import joint_angles, joint_errors, torques
 from fbse_drake.report.figures.kind import FigureKind
+from fbse_drake.report.figures.sensors import imu
+from fbse_drake.report.figures.walk import com, feet, footprints
 from fbse_drake.report.html import FigureBlock
+
+__all__ = [
+    "TOPICS",
+    "FigureKind",
+    "base_attitude",
+    "base_velocity",
+    "com",
+    "estimated_friction",
+    "feet",
+    "filter_consistency",
+    "foot_forces",
+    "footprints",
+    "friction",
+    "friction_consistency",
+    "friction_errors",
+    "friction_over_velocity",
+    "friction_parameters",
+    "imu",
+    "joint_angles",
+    "joint_errors",
+    "run_figures",
+    "statuses",
+    "support",
+    "torques",
+]
 
 # In the order of a report.
 TOPICS: dict[str, tuple[FigureKind, ...]] = {
     "walk": walk.KINDS,
     "joints": joints.KINDS,
     "forces": forces.KINDS,
-    "friction": friction.KINDS,
+    "friction": joint_friction.KINDS,
     "base": base.KINDS,
     "consistency": consistency.KINDS,
     "sensors": sensors.KINDS,
