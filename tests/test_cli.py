@@ -182,11 +182,19 @@ def test_an_interrupted_run_keeps_what_was_recorded(
     assert log.meta["outcome"]["reason"].endswith("interrupted")
 
 
+# Where the tests run in the background, these may be ignored, and so by all that they start.
+HEEDED = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)
+"""
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_whatever_ends_a_command_ends_it_as_ctrl_c_does(name: str):
     """As soon as it has begun, and so also while it imports what it needs."""
-    script = f"""
-import os, signal, sys
+    script = f"""{HEEDED}
 from fbse_drake import cli
 parse = cli._parser
 def interrupted():
@@ -205,9 +213,9 @@ cli.entry()
 @pytest.mark.parametrize("ignored", [False, True])
 def test_the_command_can_be_ended_before_anything_is_imported(name: str, ignored: bool):
     """Also where a shell started it in the background, so that it ignores Ctrl-C."""
-    script = f"""
-import os, signal, sys
-signal.signal(signal.SIGINT, signal.{"SIG_IGN" if ignored else "default_int_handler"})
+    script = f"""{HEEDED}
+if {ignored}:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 class Interrupter:
     def find_spec(self, name, *_):
         if name == "fbse_drake.cli":
@@ -228,16 +236,13 @@ entry()
 
 def test_ctrl_c_while_drake_is_imported_shows_no_traceback():
     """Drake's extension modules make an ImportError of an exception in what they import."""
-    script = """
-import os, signal, sys
+    script = f"""{HEEDED}
 class Interrupter:
     def find_spec(self, name, *_):
         if name == "pydrake.common.cpp_param":
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Interrupter())
 sys.argv = ["fbse", "reveal", "nowhere"]
-# Where the tests run in the background, it would be ignored.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 from fbse_drake import cli
 cli.entry()
 """
