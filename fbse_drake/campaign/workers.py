@@ -18,16 +18,14 @@ if TYPE_CHECKING:
 
 _METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 _PRELOAD = ["distributed.nanny", "fbse_drake.campaign.work"]
-# Memory that was freed goes back to the system from so many bytes on, as Dask advises.
-_TRIM = {"MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
 def begin_to_import() -> None:
     """Begins to import what workers need, in a process of its own; returns at once."""
     if _METHOD == "forkserver":
         get_context(_METHOD).set_forkserver_preload(_PRELOAD)
-        for name, value in _TRIM.items():
-            os.environ.setdefault(name, value)
+        # Memory that was freed goes back to the system from so many bytes on, as Dask advises.
+        os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", "65536")
         forkserver.ensure_running()
 
 

@@ -3,19 +3,10 @@
     show(figures.footprints(log))
 
 To add a figure, write the function that draws it behind `@figure_kind(...)`, which says its title,
-its caption and the channels it needs, and name it in its module's `KINDS` and here.
+its caption and the channels it needs, and name it here.
 """
 
 from fbse_drake.log import Log
-from fbse_drake.report.figures import (
-    base,
-    consistency,
-    forces,
-    joint_friction,
-    joints,
-    sensors,
-    walk,
-)
 from fbse_drake.report.figures.base import base_attitude, base_velocity, support
 from fbse_drake.report.figures.consistency import filter_consistency, friction_consistency, statuses
 from fbse_drake.report.figures.forces import foot_forces
@@ -59,13 +50,19 @@ __all__ = [
 
 # In the order of a report.
 TOPICS: dict[str, tuple[FigureKind, ...]] = {
-    "walk": walk.KINDS,
-    "joints": joints.KINDS,
-    "forces": forces.KINDS,
-    "friction": joint_friction.KINDS,
-    "base": base.KINDS,
-    "consistency": consistency.KINDS,
-    "sensors": sensors.KINDS,
+    "walk": (footprints, com, feet),
+    "joints": (joint_angles, joint_errors, torques),
+    "forces": (foot_forces,),
+    "friction": (
+        friction,
+        estimated_friction,
+        friction_errors,
+        friction_over_velocity,
+        friction_parameters,
+    ),
+    "base": (base_attitude, base_velocity, support),
+    "consistency": (filter_consistency, friction_consistency, statuses),
+    "sensors": (imu,),
 }
 
 

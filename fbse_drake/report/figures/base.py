@@ -159,6 +159,3 @@ def _estimate_and_error(
             row[1].set_ylim(readable(log, error[:, column], span=spans[1]))
     add_legend(figure)
     return figure
-
-
-KINDS = (base_attitude, base_velocity, support)

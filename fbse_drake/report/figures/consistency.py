@@ -196,6 +196,3 @@ def _plot_nis(
     axes.yaxis.set_minor_formatter(NullFormatter())
     if len(log.time) > 1:
         axes.set_xlim(log.time[0], log.time[-1])
-
-
-KINDS = (filter_consistency, friction_consistency, statuses)

@@ -112,6 +112,3 @@ def centre_of_pressure(log: Log, side: str) -> np.ndarray:
     origin where there is hardly any."""
     m_x, m_y, _, _, _, f_z = log[f"foot/{side}/wrench"].T
     return np.stack([-m_y, m_x], axis=1) / np.where(f_z > 1.0, f_z, np.inf)[:, None]
-
-
-KINDS = (foot_forces,)

@@ -339,12 +339,3 @@ def _dots(
     axes: Axes, x: np.ndarray, y: np.ndarray, color: str, size: float, label: str | None
 ) -> None:
     axes.plot(x, y, ".", color=color, markersize=size, markeredgewidth=0, label=label)
-
-
-KINDS = (
-    friction,
-    estimated_friction,
-    friction_errors,
-    friction_over_velocity,
-    friction_parameters,
-)

@@ -78,6 +78,3 @@ def torques(log: Log) -> Figure:
             plot(axes, log, values, color=INK, linewidth=0.9, linestyle="--", label="feed-forward")
     add_legend(figure)
     return figure
-
-
-KINDS = (joint_angles, joint_errors, torques)

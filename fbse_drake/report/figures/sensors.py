@@ -28,6 +28,3 @@ def imu(log: Log) -> Figure:
             axes.set_ylabel(f"{name} [{unit}]")
     add_legend(figure)
     return figure
-
-
-KINDS = (imu,)

@@ -235,6 +235,3 @@ def _measured_zmp(log: Log, pads: Mapping[str, np.ndarray]) -> np.ndarray:
             centre = np.pad(centre_of_pressure(log, side), ((0, 0), (0, 1)))
             places.append(sole + np.einsum("nij,nj->ni", R, centre)[:, None])
     return zero_moment_point(np.concatenate(forces, axis=1), np.concatenate(places, axis=1))
-
-
-KINDS = (footprints, com, feet)
