@@ -5,10 +5,7 @@ The bare plant goes through the same motion, with contact and with the recorded 
 minus friction) from a C++ source, in windows that each start from the recorded state; nothing is
 measured, controlled or recorded. The closed loop is run in two ways: by itself (robot, friction,
 encoders, controller, reference; Drake evaluates only what is read, so the IMU and the foot sensors
-rest), and as `fbse simulate` does it, with every sensor read and recorded at every tick. All take
-turns over short windows of the motion, so that whatever else the computer does slows down all
-alike, and the medians over the windows are printed: of times, and of ratios within a window.
-"""
+rest), XX"""
 
 import dataclasses
 import sys
@@ -115,21 +112,23 @@ def main() -> None:
     """Prints real time factors and ratios of costs."""
     name = sys.argv[1] if len(sys.argv) > 1 else "paper_walk"
     base = at_step(name, _BASE)
-    timers = {"bare plant": bare_plant(base, simulate(base, name=name).log)}
-    timers["closed loop"] = closed_loop(base, recorded=False)
-    steps = {step: f"closed loop, recorded, at {step:g} ms" for step in _STEPS}
-    for step, what in steps.items():
-        timers[what] = closed_loop(at_step(name, step), recorded=True)
-    times = in_turn(timers, base.duration)
-    windows = len(times["bare plant"])
-    print(f"{name}, plant step {_BASE:g} ms unless said, medians of {windows} windows in turn")
-    for what, values in times.items():
-        ratio = np.median(values / times["bare plant"])
-        speed = np.median(times[steps[_BASE]] / values)
+    bare = bare_plant(base, simulate(base, name=name).log)
+    print(f"{name}, plant step {_BASE:g} ms unless said, medians of windows in turn")
+    loops = {"closed loop": (base, False)}
+    loops |= {f"closed loop, recorded, at {h:g} ms": (at_step(name, h), True) for h in _STEPS}
+    ratios: dict[str, float] = {}
+    for what, (scenario, recorded) in loops.items():
+        timers = {"bare plant": bare, what: closed_loop(scenario, recorded=recorded)}
+        times = in_turn(timers, base.duration)
+        ratios[what] = float(np.median(times[what] / times["bare plant"]))
         print(
-            f"{what:34} {1 / np.median(values):5.2f} x real time   {ratio:5.2f} x bare plant's cost"
-            f"   {speed:5.2f} x speed of recorded at {_BASE:g} ms"
+            f"{what:34} {1 / np.median(times[what]):5.2f} x real time, the bare plant "
+            f"{1 / np.median(times['bare plant']):5.2f} x   {ratios[what]:5.2f} x its cost"
         )
+    of_recorded = [ratios[what] for what, (_, recorded) in loops.items() if recorded]
+    for step, ratio in zip(_STEPS, of_recorded, strict=True):
+        speed = of_recorded[_STEPS.index(_BASE)] / ratio
+        print(f"recorded at {step:g} ms: {speed:.2f} x the speed of {_BASE:g} ms")
 
 
 if __name__ == "__main__":

@@ -143,12 +143,26 @@ def _calc_steady(
     last: np.ndarray,
     joint_state: np.ndarray,
     offset: np.ndarray,
-    table: LawTable,
-    solver: _Solver,
     velocities: int,
     is_solved: bool,
+    unit: np.ndarray,
+    rate: np.ndarray,
+    velocity: np.ndarray,
+    torque: np.ndarray,
+    slope: np.ndarray,
+    damping: np.ndarray,
+    clamp_slope: np.ndarray,
+    clamp_limit: np.ndarray,
+    clamp: np.ndarray,
+    velocity_index: np.ndarray,
 ) -> None:
-    """A tick of effects that depend on the velocity alone, which the solver may take as a whole."""
+    """A tick of effects that depend on the velocity alone, which the solver may take as a whole.
+
+    Takes the parts of `LawTable` and `_Solver` one by one: from Python a tuple of arrays takes
+    longer to hand over than the tick takes.
+    """
+    table = LawTable(unit, rate, velocity, torque, slope)
+    solver = _Solver(damping, clamp_slope, clamp_limit, clamp, velocity_index)
     n = len(joint_state) // 2
     parts = _parts(tick, n, velocities)
     parts.memory[_ROWS : _ROWS + len(offset)] = offset
@@ -233,8 +247,8 @@ class ExplicitTorque(LeafSystem):
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
         joint_state = self._joint_state.Eval(context)
         if not self._others:
-            laws = (self._law.torque.offset, self._table, self._solver)
-            _calc_steady(*vectors, joint_state, *laws, self._velocities, self._is_solved)
+            fixed = (self._law.torque.offset, self._velocities, self._is_solved)
+            _calc_steady(*vectors, joint_state, *fixed, *self._table, *self._solver)
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
         expected = _begin(tick, last, joint_state)
