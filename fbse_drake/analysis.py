@@ -62,6 +62,7 @@ from fbse_drake.report.identification import (
     identification_outcome,
     write_identification_report,
 )
+from fbse_drake.report.replay import study_motions, write_replay
 from fbse_drake.report.sentences import Inputs, compare_outcome, diagnosis_outcome, study_outcome
 from fbse_drake.results import Result, made_folder
 from fbse_drake.robot.plant import Robot
@@ -299,6 +300,13 @@ class StudyResult(Study, AnalysisResult):
     @property
     def _completed(self) -> Scenario | None:
         return self.scenario if self.found else None
+
+    def save(self, folder: str | Path, inputs: Inputs | None = None) -> None:
+        """Also writes replay.html where something was found and models were simulated: the log,
+        the model as given and the completed one in motion."""
+        super().save(folder, inputs)
+        if self.found and (motions := study_motions(self, self.case.train)):
+            write_replay(Path(folder) / "replay.html", self.case.scenario, motions)
 
     def _report(self, path: Path, inputs: Inputs) -> None:
         given, completed = (

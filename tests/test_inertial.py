@@ -34,6 +34,7 @@ from fbse_drake.effects.inertia import (
     inertial_parameters,
     pseudo_inertia,
 )
+from fbse_drake.report.identification_figures import combinations, errors_by_joint
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, build_robot
 
@@ -218,6 +219,28 @@ def test_identified_bodies_are_physical_and_the_scenario_holds_them(
     content = identification_json(identified)
     assert content["identifiability"]["combinations"] == 6
     assert content["bodies"]["lower"]["mass"]["model"] == BELIEVED["lower"][0]
+
+
+def test_pictures_show_what_the_tables_say(identified: Identification) -> None:
+    """Where an interval drawn does not reach the model's mark, the log contradicts the model."""
+    found = identified.inertia.base_parameters
+    shown: dict[str, object] = {}
+    for axes in combinations(identified).axes:
+        names = [label.get_text() for label in axes.get_yticklabels()]
+        marks = {line.get_label(): line.get_xdata() for line in axes.lines}
+        shown |= dict(zip(names, marks["model"], strict=True))
+        for name, line in zip(names, axes.collections, strict=True):
+            shown[name] = (shown[name], tuple(line.get_segments()[0][:, 0]))
+    assert shown == {base.short: (base.model, base.interval) for base in found}
+    panels = errors_by_joint(identified).axes
+    assert [axes.get_title("left") for axes in panels] == ["train", "rest"]
+    for axes, (name, after) in zip(panels, identified.after.items(), strict=True):
+        before, last = axes.lines[0].get_xdata(), axes.lines[1].get_xdata()
+        assert last == pytest.approx(
+            [100 * after.relative, *(100 * s for s in after.relative_by_joint.values())]
+        )
+        assert before[0] == pytest.approx(100 * identified.before[name].relative)
+        assert axes.lines[1].get_label() == "identified"
 
 
 def test_bodies_at_the_edge_of_what_is_physical(folder: Path) -> None:

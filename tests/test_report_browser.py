@@ -27,6 +27,7 @@ from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report.html import Report, Section, Table, write_report
 from fbse_drake.report.metrics import run_metrics
+from fbse_drake.report.replay import Motion, write_replay
 from fbse_drake.report.run import write_run_report
 from fbse_drake.report.runs import read_runs, write_runs_report
 
@@ -254,6 +255,25 @@ def test_recording_of_a_run_shows_the_robot(visit: Visitor, folder: Path):
     assert (red - blue > 0.3).sum() > 1000
     assert (blue - red > 0.3).sum() > 1000
     assert ((np.abs(red - blue) < 0.1) & (np.abs(red - green) < 0.1)).mean() > 0.5
+
+
+def test_replay_of_a_study_shows_each_robot_in_its_colour(visit: Visitor, folder: Path):
+    """Of an arm whose model has no shapes: its limbs are drawn."""
+    q = np.tile([0.0, 0.6, 0.9, 0.0, 0.8, 0.0], (2, 1))
+    turned = {"log": 0.0, "model as given": 0.9, "completed model": -0.9}
+    motions = {
+        name: Motion(np.array([0.0, 0.1]), q + np.eye(6)[0] * angle)
+        for name, angle in turned.items()
+    }
+    write_replay(folder / "replay.html", load_scenario("bsc_arm"), motions)
+    (seen,) = visit(folder / "replay.html", (1280, "light"))
+    assert seen.requests == []
+    assert seen.errors == []
+    # Below the bar of the controls: orange, teal and a grey that is darker than the stage.
+    scene = seen.screenshot[60:]
+    red, green, blue = np.moveaxis(scene, 2, 0)
+    found = (red - blue > 0.2, blue - red > 0.2, (np.ptp(scene, axis=2) < 0.1) & (green < 0.3))
+    assert [(color.sum() > 300) for color in found] == [True] * 3
 
 
 def test_what_is_wrong_with_a_page_is_seen(visit: Visitor, tmp_path: Path):

@@ -418,7 +418,11 @@ def _fall(
         blocks.append(FigureBlock("Every channel, before and after", _RATIOS, drawn))
     blocks += _measured_torque(study.scenario, before[0], tests)
     if rolled and len(first.sample_time) and len(last.sample_time):
-        caption = "Simulated less recorded position of the joints that the model as given misses most, over the whole log."
+        caption = (
+            "Simulated less recorded position of the joints that the model as given misses most, over "
+            "the whole log. replay.html, which is saved beside this report, shows the log (grey), the "
+            "model as given (orange) and the completed one (teal) in motion."
+        )
         blocks.append(
             FigureBlock(
                 "The simulated model, before and after",

@@ -7,7 +7,17 @@ from fbse_drake.discrepancy.identification.inertial import PARAMETERS, BaseParam
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.report.discrepancy_figures import spaced, targets_text
 from fbse_drake.report.discrepancy_tables import spread_tables
-from fbse_drake.report.html import Details, Report, Section, Step, Table, number, write_report
+from fbse_drake.report.html import (
+    Details,
+    FigureBlock,
+    Report,
+    Section,
+    Step,
+    Table,
+    number,
+    write_report,
+)
+from fbse_drake.report.identification_figures import combinations, errors_by_joint
 from fbse_drake.report.sentences import Inputs, parameters_text
 from fbse_drake.scenario import dump_scenario
 
@@ -22,6 +32,12 @@ _BODIES_TEXT = (
     "First moments and rotational inertia are about the origin of the body's frame. Where `known to` is near 100 % the value is that of "
     "the model."
 )
+
+_COMBINATIONS_CAPTION = (
+    "As the model has them, and as identified with 95 % intervals. Where an interval does not reach "
+    "the model's mark, the log contradicts the model."
+)
+_ERRORS_CAPTION = "What is left of the torque, by log; `train` is the one that was fitted."
 
 
 def base_row(base: BaseParameter) -> tuple[str, ...]:
@@ -40,13 +56,7 @@ def base_row(base: BaseParameter) -> tuple[str, ...]:
 
 def base_table(result: Identification) -> Table:
     """Combinations of inertial parameters that a log tells apart, with the first of each alone."""
-    rows = (
-        (
-            f"{base.body} {base.parameter}{', with others' if base.others else ''}",
-            *base_row(base)[1:],
-        )
-        for base in result.inertia.base_parameters
-    )
+    rows = ((base.short, *base_row(base)[1:]) for base in result.inertia.base_parameters)
     return Table(BASE_HEADER, tuple(rows))
 
 
@@ -108,12 +118,16 @@ def write_identification_report(path: str | Path, result: Identification, inputs
             "Combinations",
             _BASE_TEXT,
             (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),),
+            (FigureBlock("Combinations", _COMBINATIONS_CAPTION, combinations(result)),)
+            if inertia.base_parameters
+            else (),
         ),
         Section("Friction", tables=(friction, *spread_tables(plain))),
         Section(
             "Errors",
             "|residual| / |torque|, 2-norms.",
             (errors_table(result),),
+            (FigureBlock("Errors by joint", _ERRORS_CAPTION, errors_by_joint(result)),),
         ),
         Section("Bodies", _BODIES_TEXT, (Table(("parameter", *BASE_HEADER[1:]), tuple(bodies)),)),
         Section(

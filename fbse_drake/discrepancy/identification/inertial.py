@@ -280,6 +280,11 @@ class BaseParameter:
         return self.uncertainty < IDENTIFIED
 
     @property
+    def short(self) -> str:
+        """As `upper_arm izz, with others`."""
+        return f"{self.body} {self.parameter}{', with others' if self.others else ''}"
+
+    @property
     def text(self) -> str:
         """As `upper_arm izz + 0.612 forearm mz`."""
         terms = [f"{self.body} {self.parameter}"]

@@ -53,6 +53,10 @@ class RolloutError:
     # Error over time: N sample times [s], and simulated less recorded position (N, n) [rad].
     sample_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
     position_error: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    # Of the simulated base at these times, where it floats: quaternions [w, x, y, z] to the world
+    # (N, 4), and its place (N, 3) [m].
+    base_orientation: np.ndarray | None = None
+    base_position: np.ndarray | None = None
 
     @property
     def mean_position(self) -> float:
@@ -183,7 +187,11 @@ def _simulated_error(scenario: Scenario, log: Log, progress: Progress) -> Rollou
     if not shared.any():
         raise InputError("the log and the simulated model have no sample time in common")
     there = {name: simulated[name][rows[shared]] for name in _COMPARED if name in log}
-    return _rollout_error(log, shared, there, float(simulated.time[-1]), result.failure)
+    error = _rollout_error(log, shared, there, float(simulated.time[-1]), result.failure)
+    if "truth/base/orientation" not in simulated:
+        return error
+    base = (simulated[f"truth/base/{name}"][rows[shared]] for name in ("orientation", "position"))
+    return replace(error, **dict(zip(("base_orientation", "base_position"), base, strict=True)))
 
 
 _COMPARED = ("joint/position", "joint/velocity", "joint/torque_command")
