@@ -9,6 +9,7 @@ from fbse_drake import InputError, Scenario, build_station, load_scenario, resou
 from fbse_drake.effects.friction import StribeckFriction
 from fbse_drake.scenario import RobotConfig, dump_scenario
 from fbse_drake.walking.stand import Squat
+from fbse_drake.wiring import release
 
 SHIPPED = sorted(path.stem for path in resources.folder("scenarios").glob("*.yaml"))
 
@@ -21,7 +22,7 @@ def written(tmp_path: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_scenario_loads_and_builds(name: str):
-    build_station(scenario(name))
+    release(build_station(scenario(name)))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
