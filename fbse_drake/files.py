@@ -26,7 +26,7 @@ _PARTIAL = ".fbse-part"
 _LARGEST_JSON = 2**28
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Lets `write` fill a temporary file beside `path`, then renames it.
 
     Several programs may write the same file at once: the last one's stays. What killed ones left

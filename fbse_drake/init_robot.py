@@ -82,7 +82,8 @@ def init_robot(
     write_text(description, _description_text(proposal.description, name, proposal.remarks))
     try:
         robot, _ = make_robot(description)
-        map_text, about_map = _map_text(robot), []
+        map_text = _map_text(robot)
+        about_map: list[str] = []
         if recording is not None:
             log_map, about_map = propose_map(recording, robot.description)
             map_text = _bag_map_text(log_map, recording)

@@ -149,12 +149,14 @@ def merge(tree: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
             merged.pop(key, None)
             continue
         old = merged.get(key)
-        same_kind = (
+        if (
             isinstance(old, dict)
             and isinstance(value, dict)
             and value.get("_tag", old.get("_tag")) == old.get("_tag")
-        )
-        merged[key] = merge(old, value) if same_kind else value
+        ):
+            merged[key] = merge(old, value)
+        else:
+            merged[key] = value
     return merged
 
 
@@ -280,7 +282,7 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
             raise InputError(f"{file}{key}: expected a list, found {describe(value)}")
         return [_build(args[0], item, None, file, f"{key}[{i}]") for i, item in enumerate(value)]
     if origin is tuple:
-        return tuple(_build(list[args[0]], value, None, file, key))
+        return tuple(_build(types.GenericAlias(list, args[:1]), value, None, file, key))
     if origin is dict:
         if not isinstance(value, dict):
             raise InputError(f"{file}{key}: expected a mapping, found {describe(value)}")

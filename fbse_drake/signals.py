@@ -3,6 +3,7 @@
 Sensors and estimators of a user's own add their rows with `register`.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -47,7 +48,7 @@ class Signal:
     def sample_shape(self, joints: int, size: int) -> tuple[int, ...]:
         """Shape of a sample that has `size` numbers in all."""
         shape = tuple(joints if axis == "n" else axis for axis in self.shape)
-        known = int(np.prod([axis for axis in shape if axis != "m"]))
+        known = math.prod(int(axis) for axis in shape if axis != "m")
         return tuple(size // known if axis == "m" else int(axis) for axis in shape)
 
 

@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def _postponed_interruption() -> Iterator[threading.Event]:
     one, which get none, nothing changes."""
     interrupted = threading.Event()
 
-    def interrupt(number: int, frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         if interrupted.is_set():
             signal.default_int_handler(number, frame)
         interrupted.set()
@@ -315,7 +316,8 @@ def _port_channels(
     recorded: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     """Channels that recorded ports, (N, size) each, become: those of a sensor as it says itself."""
-    channels, of_sensors = {}, set()
+    channels: dict[str, np.ndarray] = {}
+    of_sensors: set[str] = set()
     for sensor in sensors.by_name.values():
         channels |= sensor.channels(robot, recorded)
         of_sensors.update(sensor.ports())

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -97,7 +98,8 @@ class Campaign:
         steps = [[name, settings(step)] for name, step in self.steps.items()]
         runs: dict[str, Run] = {}
         for point in self.design.points():
-            for scenario, tree in (self.trees or {"": None}).items():
+            trees: Mapping[str, ScenarioTree | None] = self.trees or {"": None}
+            for scenario, tree in trees.items():
                 decides = [steps, tree and tree.tree, point.seed, point.values]
                 text = json.dumps(decides, sort_keys=True, default=str)
                 key = hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -114,14 +114,14 @@ def _work_off(
             while waiting and len(running) < max(_LEAST, _AHEAD * threads):
                 job = waiting.popleft()
                 future = client.submit(work, job, key=job.run.key, pure=False)
-                running[future.key] = job, future
+                running[job.run.key] = job, future
                 future.add_done_callback(finished.put)
             progress(text if threads else "waiting for a worker", outcome.done / todo)
             try:
                 future = finished.get(timeout=_PERIOD)
             except queue.Empty:
                 continue
-            job, future = running.pop(future.key)
+            job, future = running.pop(str(future.key))
             failure = _failure_of(future, job)
             outcome.done += 1
             if failure is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -51,7 +52,7 @@ class Group:
     """Runs that have the same values in some columns."""
 
     # By column.
-    same: dict[str, object]
+    same: dict[str, Any]
     rows: pa.Table
 
     @property
@@ -153,7 +154,8 @@ def picture(rows: pa.Table, y: str, x: str, by: Sequence[str]) -> Figure:
             if a is not None and b is not None
         ]
         if known:
-            axes.scatter(*zip(*known, strict=True), s=14, alpha=0.5, color=colour, label=group.name)
+            across, up = zip(*known, strict=True)
+            axes.scatter(across, up, s=14, alpha=0.5, color=colour, label=group.name)
         shared = [of for of in groups(group.rows, [x]) if of.same[x] is not None]
         middles = [Summary.of(of.rows[y].combine_chunks()) for of in shared]
         if 1 < len(shared) <= _MOST_GROUPS and any(s.count > 1 for s in middles):

@@ -204,7 +204,7 @@ class FrictionCompensation(RecursiveEstimator):
 
     def _lost(self, context: Context) -> np.ndarray:
         """What is to be compensated, (n,) [Nm]."""
-        return self._estimate.Eval(context)
+        return np.asarray(self._estimate.Eval(context))
 
 
 class FaultCompensation(FrictionCompensation):
@@ -230,4 +230,4 @@ class FaultCompensation(FrictionCompensation):
         self._fault = self.DeclareVectorInputPort("estimate/joint/fault", size)
 
     def _lost(self, context: Context) -> np.ndarray:
-        return self._estimate.Eval(context) * self._fault.Eval(context)
+        return super()._lost(context) * self._fault.Eval(context)

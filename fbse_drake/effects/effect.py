@@ -179,7 +179,7 @@ class Effect(ABC):
                 value.
         """
         targets = self._targets(names)
-        linear, nonlinear = [], []
+        given: dict[bool, list[np.ndarray]] = {True: [], False: []}
         for name, parameter in self.parameters.items():
             where = f"{key}.{name}".lstrip(".")
             values = self._values(
@@ -191,11 +191,11 @@ class Effect(ABC):
                     f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found "
                     f"{values.tolist()}"
                 )
-            (linear if parameter.linear else nonlinear).append(values)
+            given[parameter.linear].append(values)
         columns = len(targets)
         linear, nonlinear = (
             np.array(values, dtype=float).reshape(len(values), columns)
-            for values in (linear, nonlinear)
+            for values in (given[True], given[False])
         )
         return ResolvedEffect(type(self), targets, linear, nonlinear)
 

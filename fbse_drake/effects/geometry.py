@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydrake.multibody.tree import Joint
+from pydrake.multibody.tree import Frame, Joint
 
 from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.errors import InputError, located
@@ -117,5 +117,5 @@ def _next_joint(robot: Robot, body: str) -> tuple[Joint, np.ndarray] | None:
     return (carried[0], along) if np.linalg.norm(along) > _SHORTEST_LINK else None
 
 
-def _place(frame: object) -> np.ndarray:
+def _place(frame: Frame) -> np.ndarray:
     return frame.GetFixedPoseInBodyFrame().translation()

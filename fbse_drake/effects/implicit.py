@@ -239,8 +239,8 @@ def _joint_clamps(
     for sign, side in ((1.0, forwards - shared), (-1.0, backwards - shared)):
         if np.max(side, initial=0.0) > least:
             # From zero to twice the limit, in one direction.
-            pieces = _pieces(corner, side)
-            clamps += [(slope, limit / 2, -sign * limit / 2) for slope, limit in pieces]
+            further = _pieces(corner, side)
+            clamps += [(slope, limit / 2, -sign * limit / 2) for slope, limit in further]
     return clamps
 
 

@@ -371,7 +371,7 @@ def equal_point_masses(J: np.ndarray, name: str) -> list[tuple[float, np.ndarray
     spread, axes = (
         np.linalg.eigh(J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / mass)
         if mass > 0
-        else (np.array([-1.0]), None)
+        else (np.array([-1.0]), np.eye(3))
     )
     if spread.min() < -_ROUNDING * np.trace(J):
         raise InputError(

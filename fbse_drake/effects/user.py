@@ -75,6 +75,8 @@ def _import_file(path: str) -> None:
     if path in sys.modules:
         return
     spec = importlib.util.spec_from_file_location(path, path)
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look their module up while it is still being made.
     sys.modules[path] = module

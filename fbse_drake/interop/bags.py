@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -202,23 +203,23 @@ class Bag:
         Raises:
             InputError: a topic has no such joints or fields.
         """
-        topics = {}
-        for topic, paths in wanted.items():
-            first, names = self.first(topic), self.joints(topic)
+        topics: dict[str, _Collected] = {}
+        for name, paths in wanted.items():
+            first, names = self.first(name), self.joints(name)
             for path in paths:
                 if not first.width(path):
                     raise InputError(
-                        f"topic {topic}: its messages have no numbers {path} (there are: "
+                        f"topic {name}: its messages have no numbers {path} (there are: "
                         f"{listed(list(first.numbers))})"
                     )
             for joint in joints:
                 if names and joint not in names:
                     raise InputError(
-                        f"joints: {joint} is not in the messages of {topic} (there are: "
+                        f"joints: {joint} is not in the messages of {name} (there are: "
                         f"{listed(names)})"
                     )
             widths = {path: len(joints) if names else first.width(path) for path in paths}
-            topics[topic] = _Collected(widths, joints if names else [])
+            topics[name] = _Collected(widths, joints if names else [])
         connections = [
             c
             for c in self._reader.connections
@@ -230,10 +231,10 @@ class Bag:
             topic.received.append(received)
             topic.pending.append(raw)
             if len(topic.pending) == _BLOCK:
-                topic.decode(lambda raw, name=connection.topic: self._layout(name, raw))
+                topic.decode(partial(self._layout, connection.topic))
                 progress(f"reading messages: {min(1.0, count / total):.0%}")
         for name, topic in topics.items():
-            topic.decode(lambda raw, name=name: self._layout(name, raw))
+            topic.decode(partial(self._layout, name))
         left_out = [
             f"{topic.foreign} messages of {name} are left out: they have not all of the joints "
             f"{listed(joints)}"

@@ -184,7 +184,7 @@ def _moving_frames(
 
 def write_csv(log: Log, path: Path) -> None:
     """Writes all channels as columns: `joint/position/<joint>`, `imu/angular_velocity[0]`, ..."""
-    names = []
+    names: list[str] = []
     for name, values in log.items():
         width = values[0].size
         parts = (

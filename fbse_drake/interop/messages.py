@@ -8,7 +8,7 @@ is some twenty times faster than one message object after another.
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -121,7 +121,7 @@ class _Walk:
         # CDR has four bytes in front that say how it is encoded; numbers stand at multiples of
         # their size after these.
         self.position = 4 if cdr else 0
-        self.order = ">" if cdr and raw[1] == 0 else "<"
+        self.order: Literal["<", ">"] = ">" if cdr and raw[1] == 0 else "<"
         self.numbers: dict[str, tuple[np.dtype, list[np.ndarray]]] = {}
         self.texts: dict[str, list[str]] = {}
         self.fixed: list[int] = list(range(self.position))

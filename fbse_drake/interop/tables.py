@@ -46,7 +46,8 @@ class Growing:
     """An array to which rows are added; it grows in place, so that it is not in memory twice."""
 
     def __init__(self, shape: tuple[int, ...], dtype: type):
-        self._values, self._count = np.empty((0, *shape), dtype), 0
+        self._values: np.ndarray = np.empty((0, *shape), dtype)
+        self._count = 0
 
     def extend(self, rows: np.ndarray) -> None:
         """Adds rows, (k, ...)."""

@@ -79,7 +79,7 @@ def add_implicit_torque(
     """
     for j, name in enumerate(joint_names):
         motor = motors[name]
-        motor.joint().set_default_damping(torque.damping[j])
+        motor.joint().set_default_damping_vector(torque.damping[j : j + 1])
         for row in np.flatnonzero(torque.has_clamp[:, j]).tolist():
             limit, gains = torque.limit[row, j], PdControllerGains(p=0.0, d=torque.slope[row, j])
             clamp = plant.AddJointActuator(clamp_name(name, row), motor.joint(), limit)

@@ -153,7 +153,8 @@ class WindingThermometers(LeafSystem):
     def _warm_up(self, context: Context, state: State) -> None:
         ports = (self._torque_command, self._torque_loss)
         velocity = np.split(self._joint_state.Eval(context), 2)[1]
-        power = self._heat.power(*(port.Eval(context) for port in ports), velocity)
+        command, loss = (port.Eval(context) for port in ports)
+        power = self._heat.power(command, loss, velocity)
         temperature = context.get_discrete_state(self._temperature).value()
         later = self._heat.after(temperature, power, self._period)
         state.get_mutable_discrete_state(self._temperature).set_value(later)

@@ -85,13 +85,13 @@ class LegKinematics:
         context = plant.CreateDefaultContext()
         robot.set_joint_positions(context, np.zeros(len(robot.joint_names)))
         base = robot.base.body_frame()
-        joints = [plant.GetJointByName(name) for name in leg.joints]
+        named = [plant.GetJointByName(name) for name in leg.joints]
+        joints = [joint for joint in named if isinstance(joint, RevoluteJoint)]
         ruled, needed = (slice(3, 6), "three") if leg.is_point else (slice(0, 6), "six")
-        is_right = len(joints) == ruled.stop - ruled.start
-        if not is_right or not all(isinstance(joint, RevoluteJoint) for joint in joints):
+        if not len(joints) == len(named) == ruled.stop - ruled.start:
             raise InputError(
                 f"legs.{side}.joints: a walking robot's leg needs {needed} revolute joints, found "
-                f"{len(joints)} joints"
+                f"{len(named)} joints"
             )
         if leg.is_point and np.linalg.norm(robot.pad_positions(side)) > _AXIS_TOLERANCE:
             raise InputError(f"legs.{side}.sole: expected the origin of a point foot in its pad")
@@ -308,7 +308,10 @@ def _stance(robot: Robot, leg: Leg) -> np.ndarray:
     known = names.per_joint(names.stance, key="stance", default=np.nan)
     given = dict(zip(names.joint_names, known, strict=True))
     joints = [robot.plant.GetJointByName(name) for name in leg.joints]
-    middle = [0.5 * (j.position_lower_limit() + j.position_upper_limit()) for j in joints]
+    middle = [
+        0.5 * (joint.position_lower_limits().item() + joint.position_upper_limits().item())
+        for joint in joints
+    ]
     stance = [given[name] for name in leg.joints]
     chosen = np.where(np.isnan(stance), middle, stance)
     return np.nan_to_num(chosen, nan=0.0, posinf=0.0, neginf=0.0)

@@ -331,13 +331,13 @@ class Walk:
         if phases[-1].end > breaks[-1]:
             breaks.append(phases[-1].end)
             moves.append((targets[-1], np.zeros(2)))
-        breaks = np.array(breaks)
+        ends = np.array([breaks[0], breaks[-1]])
 
         def polynomial(step: np.ndarray, offset: np.ndarray, bumps: np.ndarray) -> PPoly:
             c = _STEP[:, None, None] * step + _BUMP[:, None, None] * bumps[:, None]
             c[-1] += offset
             return PPoly(
-                c / np.diff(breaks)[None, :, None] ** np.arange(6, -1, -1)[:, None, None], breaks
+                c / np.diff(breaks)[:, None] ** np.arange(6, -1, -1)[:, None, None], breaks
             )
 
         step, offset = np.array([m[1] for m in moves]), np.array([m[0] for m in moves])
@@ -346,7 +346,6 @@ class Walk:
         first, last = (
             polynomial(0 * step, 0 * offset, pieces == bumped) for bumped in (0, len(phases) - 1)
         )
-        ends = breaks[[0, -1]]
         # The CoM depends linearly on the ZMP: two bumps make its velocity vanish at both ends.
         speed = [solve_lipm(zmp, self.com_height, gravity)(ends, 1) for zmp in (plain, first, last)]
         amplitude = np.linalg.solve(np.stack([speed[1][:, 0], speed[2][:, 0]], axis=1), -speed[0])
