@@ -247,8 +247,15 @@ class ExplicitTorque(LeafSystem):
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
         joint_state = self._joint_state.Eval(context)
         if not self._others:
-            fixed = (self._law.torque.offset, self._velocities, self._is_solved)
-            _calc_steady(*vectors, joint_state, *fixed, *self._table, *self._solver)
+            _calc_steady(
+                *vectors,
+                joint_state,
+                self._law.torque.offset,
+                self._velocities,
+                self._is_solved,
+                *self._table,
+                *self._solver,
+            )
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
         expected = _begin(tick, last, joint_state)
