@@ -40,6 +40,7 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
         proposals = Proposals(fits)
         path.append(explanation)
         yield [*path], proposals
+    revised: Sequence[Candidate] = ()
     while len(path[-1].candidates) < _MOST_EFFECTS:
         base = path[-1]
         additions = best_additions(proposals, base)
@@ -47,7 +48,7 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
             break
         chosen = _spread(fits, additions)
         yield [*path, chosen], proposals
-        chosen = _revise(proposals, chosen)
+        chosen = _revise(proposals, chosen, revised)
         if chosen.deviance > base.deviance - MARGIN:
             yield [*path], proposals
             break
@@ -55,11 +56,15 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
         if weighed is not fits:
             fits, proposals = weighed, Proposals(weighed)
         path.append(polished(fits, explanation))
+        revised = path[-1].candidates
         yield [*path], proposals
 
 
 def best_additions(
-    proposals: Proposals, base: Explanation, rows: np.ndarray | None = None
+    proposals: Proposals,
+    base: Explanation,
+    rows: np.ndarray | None = None,
+    most: float = np.inf,
 ) -> list[Explanation]:
     """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
 
@@ -67,6 +72,7 @@ def best_additions(
 
     Args:
         rows: only candidates that change one of these; by default all.
+        most: only explanations with a smaller deviance.
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows), []
@@ -77,6 +83,8 @@ def best_additions(
         if _loses_scale(fits, everything):
             continue
         wider = fits.explain(everything)
+        if wider.deviance >= most:
+            continue
         without = (
             base if len(added) == 1 else fits.explain([c for c in everything if c is not member])
             for member in added
@@ -222,23 +230,43 @@ def _simplest(additions: list[Explanation]) -> Explanation:
     return min(equal, key=lambda e: len(e.fit.parameters))
 
 
-def _revise(proposals: Proposals, explanation: Explanation) -> Explanation:
-    """Tries every member that shares a row with another one against all others in its place, until nothing improves."""
-    improved = True
-    while improved:
-        improved = False
-        for k, member in enumerate(explanation.candidates):
-            proposals.fits.dictionary.progress(
-                "checking what was found", k / len(explanation.candidates)
-            )
-            others = [c for c in explanation.candidates if c is not member]
-            rows = member.signature.rows
-            if not any(np.intersect1d(rows, c.signature.rows).size for c in others):
-                continue
-            rest = proposals.fits.explain(others)
-            additions = best_additions(proposals, rest, rows)
-            best = _simplest(additions) if additions else rest
-            if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
-                explanation, improved = best, True
-                break
-    return explanation
+def _revise(
+    proposals: Proposals, explanation: Explanation, revised: Sequence[Candidate]
+) -> Explanation:
+    """Tries members against all others in their place, until nothing improves.
+
+    A member is tried if it shares a row with another one, and anew when something changes in its
+    rows.
+
+    Args:
+        revised: members that were tried before the others came.
+    """
+    fits = proposals.fits
+    added = [c for c in explanation.candidates if c not in revised]
+    settled = _untouched(revised, added)
+    while True:
+        waiting = [c for c in explanation.candidates if c not in settled]
+        if not waiting:
+            return explanation
+        fits.dictionary.progress(
+            "checking what was found", 1.0 - len(waiting) / len(explanation.candidates)
+        )
+        member = waiting[0]
+        settled.append(member)
+        others = [c for c in explanation.candidates if c is not member]
+        if len(_untouched(others, [member])) == len(others):
+            continue
+        rest = fits.explain(others)
+        # What is no better than the member need not be looked at, unless nothing at all may be.
+        most = explanation.deviance if rest.deviance >= explanation.deviance else np.inf
+        additions = best_additions(proposals, rest, member.signature.rows, most)
+        best = _simplest(additions) if additions else rest
+        if best.deviance < explanation.deviance - (MARGIN if additions else 0.0):
+            changed = [member, *(c for c in best.candidates if c not in others)]
+            explanation, settled = best, _untouched(settled, changed)
+
+
+def _untouched(candidates: Sequence[Candidate], changed: Sequence[Candidate]) -> list[Candidate]:
+    """Those that share no row with any that changed."""
+    rows = np.concatenate([np.zeros(0, dtype=int), *(c.signature.rows for c in changed)])
+    return [c for c in candidates if not np.isin(c.signature.rows, rows).any()]
