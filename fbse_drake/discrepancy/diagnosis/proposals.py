@@ -18,6 +18,9 @@ _NARROWINGS = 2
 _POINTS = 9
 # How often a candidate that is linear only nearby is made linear about the values that fit best.
 _EXPANSIONS = 3
+# What takes off less than this share of a deviance does not reach it at other values of its
+# nonlinear parameters either.
+_CATCHES_UP = 0.4
 # So many numbers are kept in columns of candidates.
 _MOST_NUMBERS = 15_000_000
 # How often friction of all joints is fitted in turn.
@@ -36,11 +39,15 @@ class Proposals:
         self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
         self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
-    def promising(self, base: Explanation, rows: np.ndarray | None) -> list[Candidate]:
+    def promising(
+        self, base: Explanation, rows: np.ndarray | None, wanted: float = 0.0
+    ) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over.
 
         Args:
             rows: only those that change one of these; None for all.
+            wanted: drop of the deviance; what is far from it, with values of its grid or linear
+                about no effect at all, is left out.
         """
         fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
         if rows is None:
@@ -52,7 +59,8 @@ class Proposals:
             for candidate in fits.fixed_candidates
             if (candidate.effect, candidate.targets) not in known
             and np.intersect1d(candidate.signature.rows, rows).size
-            and fixed_gain(beside, candidate) > 0.5 * fits.required(candidate)
+            and (gain := fixed_gain(beside, candidate)) > 0.5 * fits.required(candidate)
+            and self._may_reach(wanted, base, candidate.signature.rows, gain)
         ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
             group: [] for group in dictionary.groups
@@ -65,7 +73,9 @@ class Proposals:
                 if taken & set(group) or not np.intersect1d(places, rows).size:
                     continue
                 gain = self._gain(effect, places, beside)
-                coarse[group].append((float(gain.max()), effect, int(gain.argmax())))
+                best = int(gain.argmax())
+                if self._may_reach(wanted, base, places, float(gain[best])):
+                    coarse[group].append((float(gain[best]), effect, best))
         for group, found in coarse.items():
             # What the grid shows far behind the best does not catch up between its points.
             # (A share of measured torque seems to explain more than it does.)
@@ -135,6 +145,25 @@ class Proposals:
                 self._moments[key] = beside.moments_of_sets(sets.signature, 0, sets.gram)
             moments.append(self._moments[key])
         return grid_gain(effect, *_weighted(moments, beside.scale[places]))
+
+    def _may_reach(
+        self, wanted: float, base: Explanation, rows: Sequence[int], gain: float
+    ) -> bool:
+        """May a candidate that takes this off the weighted sum of squares of some rows lower the
+        deviance as much as is wanted?
+
+        The deviance of a row falls the faster the less is left in it. So it falls most if all that
+        is there is taken from one row, then from the next.
+        """
+        if wanted <= 0:
+            return True
+        white, scale = self.fits.white, self.fits.remainder(base).scale
+        left = base.sse.copy()
+        for row in sorted(rows, key=lambda row: -scale[row]):
+            taken = min(gain, white.count[row] * (1.0 - 1.0 / scale[row]))
+            left[row] -= scale[row] * taken
+            gain -= taken
+        return white.deviance(base.sse) - white.deviance(left) > _CATCHES_UP * wanted
 
     def _best_on(
         self,

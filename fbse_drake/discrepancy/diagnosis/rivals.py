@@ -19,6 +19,8 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
 
+# A rival takes off the deviance at least this share of what the member takes.
+_NEAR = 0.25
 # So many rivals of each member are fitted by themselves, and so often at most.
 _FITTED, _ROUNDS = 4, 3
 # Values of a nonlinear parameter that are tried over its plausible range, and how often the best is sought between its neighbours.
@@ -27,14 +29,18 @@ _POINTS, _NARROWINGS = 5, 2
 
 def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
     """For each member: explanations with another effect in its place, or the same on another body, which comes last; best first. One
-    for each effect and targets; the best of them fitted by themselves."""
+    for each effect and targets that comes near the member; the best of them fitted by themselves."""
     fits, result = proposals.fits, {}
+    judge = Judge(fits, final)
     for k, member in enumerate(final.candidates):
         fits.dictionary.progress("fitting what looks alike", k / len(final.candidates))
         rest = fits.explain([c for c in final.candidates if c is not member])
+        # What chance may tell apart, and what explains much of what the member does.
+        alike = fits.threshold[-1] / judge.independent_share(rest, final)
+        near = max(alike, (1.0 - _NEAR) * (rest.deviance - final.deviance))
         additions = [
             e
-            for e in best_additions(proposals, rest, member.signature.rows)
+            for e in best_additions(proposals, rest, member.signature.rows, final.deviance + near)
             if len(e.candidates) == len(final.candidates) and rival_name(e.candidates[-1], member)
         ]
         found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]

@@ -75,7 +75,7 @@ def best_additions(
         most: only explanations with a smaller deviance.
     """
     fits = proposals.fits
-    promising, found = proposals.promising(base, rows), []
+    promising, found = proposals.promising(base, rows, base.deviance - most), []
     tried = [*([candidate] for candidate in promising), *_pairs(fits, promising)]
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))

@@ -114,8 +114,14 @@ def inertia_addition(
     rotor_inertia, point_masses = inertia_changes({"effect": effect}, equation.robot)
     result = np.zeros((len(at.joint_acceleration), len(equation.row_velocities)))
     result[:, : len(rotor_inertia)] = rotor_inertia * at.joint_acceleration
+    by_body: dict[str, np.ndarray] = {}
     for point in point_masses:
-        result += regressor(point.body) @ inertial_parameters(point.inertia)
+        so_far = by_body.get(point.body, 0.0)
+        by_body[point.body] = so_far + inertial_parameters(point.inertia)
+    for body, parameters in by_body.items():
+        # As one matrix: a product of many small ones is slow.
+        columns = regressor(body).reshape(-1, len(parameters))
+        result += (columns @ parameters).reshape(result.shape)
     return result
 
 
