@@ -23,6 +23,9 @@ from fbse_drake.walking.reference import make_reference
 
 # A planned motion is evaluated at this period and interpolated [s].
 _PERIOD = 0.010
+# Samples in a block of a motion that is only compared with others: motions differ in what they show
+# by more than the white noise that further samples would average out.
+_SAMPLES = 2
 
 
 def planned_log(scenario: Scenario) -> Log:
@@ -128,11 +131,13 @@ class Experiments:
         found = {}
         for name, other in _motions(self._scenario).items():
             model = replace(self._scenario.believed, gantry_height=other.robot.gantry_height)
+            period = max(other.log.period, other.recording.block / _SAMPLES)
             try:
                 # With our sensors, to which the other's estimator need not fit.
                 wanted = replace(
                     other,
                     model=model,
+                    log=replace(other.log, period=period),
                     sensors=self._scenario.sensors,
                     estimator=self._scenario.estimator,
                     compensation=self._scenario.compensation,
