@@ -227,7 +227,6 @@ def _inverse_kinematics(
     R_BF = {side: R_BW @ plan.yaw[side].rotation for side in legs}
     p_WB = plan.com.position.copy()
     q: dict[str, np.ndarray] = {}
-    share, before = 1.0, None
     for _ in range(_MAX_ITERATIONS):
         for side, leg in legs.items():
             try:
@@ -237,18 +236,13 @@ def _inverse_kinematics(
                 raise InputError(_unreachable(plan, side, error)) from None
         moment = base_moment + sum(leg.first_moment(q[side]) for side, leg in legs.items())
         com = p_WB + _turned(trunk.rotation, moment / total_mass)
-        error = plan.com.position - com
-        # The legs do not go all the way with the base, which shows in what the last shift has left.
-        if before is not None:
-            share = np.clip(
-                share * (1.0 - np.vdot(error, before) / np.vdot(before, before)), 0.5, 1.0
-            )
-        p_WB, before = p_WB + error / share, error
-        if np.abs(error).max() < _COM_TOLERANCE:
+        correction = plan.com.position - com
+        p_WB = p_WB + correction
+        if np.abs(correction).max() < _COM_TOLERANCE:
             break
     else:
         raise InputError(
-            f"no posture found for the planned CoM, {np.abs(error).max():.1e} m off; change "
+            f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change "
             "com_height"
         )
 
@@ -355,8 +349,7 @@ def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan 
     excess = np.maximum(lower - q, q - upper)
     if excess.max() > 0:
         sample, joint = np.unravel_index(excess.argmax(), excess.shape)
-        at = float(time[sample])
-        step = f"step {(plan.phase_at(at)[0] + 1) // 2}, " if plan is not None else ""
+        step = f"step {(plan.phase_at(time[sample])[0] + 1) // 2}, " if plan is not None else ""
         raise InputError(
             f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at "
             f"{q[sample, joint]:.3f} rad, "
