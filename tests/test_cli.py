@@ -692,7 +692,8 @@ def test_study_writes_the_completed_scenario(
     monkeypatch.setattr("fbse_drake.commands.study", functools.partial(study, effects=few))
     assert main(["study", *BIASED, str(biased), "--out", str(tmp_path)]) == DONE
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        [*FOUND, "study.json", "completed.yaml", "completed.urdf", "completed.xml"]
+        [*FOUND, "study.json", "replay.html"]
+        + ["completed.yaml", "completed.urdf", "completed.xml"]
     )
     content = json.loads((tmp_path / "study.json").read_text())
     first, *_, last = content["steps"]

@@ -157,13 +157,13 @@ class Proposals:
         """
         if wanted <= 0:
             return True
-        white, scale = self.fits.white, self.fits.remainder(base).scale
+        deviance, scale = self.fits.white.deviance, self.fits.remainder(base).scale
         left = base.sse.copy()
         for row in sorted(rows, key=lambda row: -scale[row]):
-            taken = min(gain, white.count[row] * (1.0 - 1.0 / scale[row]))
+            taken = min(gain, left[row] / scale[row])
             left[row] -= scale[row] * taken
             gain -= taken
-        return white.deviance(base.sse) - white.deviance(left) > _CATCHES_UP * wanted
+        return deviance(base.sse) - deviance(left) > _CATCHES_UP * wanted
 
     def _best_on(
         self,
