@@ -108,3 +108,24 @@ def test_a_longer_shank_is_found_in_a_walk(tmp_path: Path) -> None:
     found = diagnose(Predictor(scenario, log), rivals).chosen
     assert [(f.effect, f.targets) for f in found] == [("LinkLength", ("left_shank",))]
     assert found[0].parameters["length"].value == pytest.approx(0.005, abs=3e-4)
+
+
+@pytest.mark.parametrize("length", [-0.006, 0.006])
+def test_a_robot_with_unequal_legs_starts_on_the_ground(length: float) -> None:
+    """No sole begins inside the ground, which would push it out for half a second, nor hangs above
+    it: what the feet feel from the first millisecond on is about the weight."""
+    log = simulate(
+        load_scenario(
+            "squat",
+            overrides=[f"robot.effects.long=!LinkLength {{length: {{right_thigh: {length}}}}}"]
+            + ["duration=0.1"],
+        )
+    ).log
+    robot = build_robot(RobotConfig())
+    weight = 9.81 * robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+    height = {side: log[f"truth/foot/{side}/position"][0, 2] for side in log.sides}
+    # The sole's centre of a foot 0.1 m wide that stands on its edge.
+    assert all(-1e-4 < z < 2e-3 for z in height.values())
+    force = sum(log[f"foot/{side}/pad_force"][5:, :, 2].sum(axis=1) for side in log.sides)
+    assert 0.5 * weight < force.mean() < 1.5 * weight
+    assert force.max() < 3 * weight

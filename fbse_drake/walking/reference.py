@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import MultibodyForces
-from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -28,6 +28,8 @@ _SAME_PLACE = 1e-3
 # The base position is found to this [m].
 _COM_TOLERANCE = 1e-12
 _MAX_ITERATIONS = 100
+# Soles nearer to the ground than this are on it [m].
+_STANDS = 1e-5
 
 
 @dataclass(frozen=True)
@@ -84,17 +86,44 @@ class Reference:
         return ReferenceSource(self)
 
     def set_start(self, robot: Robot, ground: Ground) -> None:
-        """Makes its start a robot's default positions, as deep as the ground carries the weight."""
+        """Makes its start a robot's default positions: standing on the ground, also where its legs
+        are not as long as those of the model it was planned with, and as deep as the ground carries
+        the weight."""
         plant = robot.plant
         context = plant.CreateDefaultContext()
         if robot.has_floating_base:
             pads = sum(leg.points for leg in robot.description.legs.values())
             weight = -plant.CalcTotalMass(context) * plant.gravity_field().gravity_vector()[2]
             penetration = weight / (pads * ground.stiffness)
-            p_WB = self.base.position[0] - [0.0, 0.0, penetration]
-            plant.SetPositions(context, robot.base_pose_positions(RigidTransform(p_WB)))
+            X_WB = RigidTransform(self.base.position[0])
+            plant.SetPositions(context, robot.base_pose_positions(X_WB))
+            robot.set_joint_positions(context, self.joint_position[0])
+            X_WB = self._stood(robot, context) @ X_WB
+            sunk = RigidTransform(X_WB.rotation(), X_WB.translation() - [0.0, 0.0, penetration])
+            plant.SetPositions(context, robot.base_pose_positions(sunk))
         robot.set_joint_positions(context, self.joint_position[0])
         plant.SetDefaultPositions(plant.GetPositions(context))
+
+    def _stood(self, robot: Robot, context: Context) -> RigidTransform:
+        """How a robot is to be moved for the soles that stand at the start to rest on the ground:
+        raised and tilted as fits their pads best, with none of them under it."""
+        stand = [
+            side
+            for side in robot.description.sides
+            if self.plan is not None and self.plan.support(side)[0]
+        ]
+        soles = [robot.sole(side).CalcPoseInWorld(context) for side in stand]
+        pads = [X_WF @ robot.pad_positions(side).T for side, X_WF in zip(stand, soles, strict=True)]
+        p = np.hstack(pads) if pads else np.zeros((3, 1))
+        if np.abs(p[2]).max() < _STANDS:
+            return RigidTransform()
+        centre = np.array([*p[:2].mean(axis=1), 0.0])
+        x, y, z = p - centre[:, None]
+        raised, roll, pitch = np.linalg.pinv(np.stack([np.ones_like(x), y, -x], axis=1)) @ -z
+        tilt = RotationMatrix(RollPitchYaw(roll, pitch, 0.0))
+        X = RigidTransform(tilt, centre - tilt @ centre + [0.0, 0.0, raised])
+        lowest = (X @ p)[2].min()
+        return RigidTransform(tilt, X.translation() - [0.0, 0.0, min(lowest, 0.0)])
 
 
 @dataclass(frozen=True)
