@@ -81,6 +81,28 @@ def test_a_delay_is_found_and_forgotten(late: int):
     assert np.all(ticks[3050:] == 0)
 
 
+def test_a_delay_that_begins_is_no_shorter_one_first():
+    """What was in time before it began is no evidence against it."""
+    time, late = TICK * np.arange(3000), 6
+    truth = np.stack([np.sin(2 * np.pi * f * time) for f in (2.0, 3.1, 4.3)], axis=1)
+    forces = truth.copy()
+    forces[1500:] = truth[1500 - late : -late]
+    ticks = found(truth, forces)
+    assert not ticks[:1500].any()
+    assert np.all((ticks[1500:] == 0) | (np.abs(ticks[1500:] - late) <= 1))
+    assert np.all(np.abs(ticks[1700:] - late) <= 1)
+
+
+def test_a_delay_longer_than_any_looked_for_is_not_allowed_for():
+    """The longest that is looked for is the best of them, and wrong; nor is it there afterwards."""
+    truth = specific_force(TICK * np.arange(4000))
+    forces = truth.copy()
+    forces[1020:2000] = truth[1000:1980]
+    ticks = found(truth, forces)
+    assert np.all(ticks[1500:2000] == 0)
+    assert np.all(ticks[2600:] == 0)
+
+
 @pytest.mark.parametrize("gain", [0.9, 1.1])
 def test_a_wrong_gain_or_bias_is_no_delay(gain: float):
     truth = specific_force(TICK * np.arange(2000))

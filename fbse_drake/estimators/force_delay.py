@@ -1,4 +1,8 @@
-"""How late foot forces come: the acceleration that they make shows in the other sensors as well."""
+"""How late foot forces come: the acceleration that they make shows in the other sensors as well.
+
+Delays are compared by cumulative sums of their log likelihoods after E. S. Page, "Continuous
+inspection schemes", Biometrika 41, 1954.
+"""
 
 import math
 
@@ -7,10 +11,10 @@ from numba import njit
 
 from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock
-from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, vector
+from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract, vector
 
-# The longest delay that is looked for, and for how long what it was found by counts [s]: no longer
-# than a step, so that sensors which are in time again are soon seen to be.
+# The longest delay that is looked for, and for how long it counts what gain and bias the forces had,
+# and how noisy they were [s].
 _LONGEST, _MEMORY = 0.01, 0.3
 # Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
 # the size of what they remember, and one for every rate would take half a minute each to compile.
@@ -24,26 +28,25 @@ _UNEVEN = 0.01
 _SMOOTHING = 0.005
 # How much of the way in which forces change the other sensors must explain to tell their delay.
 _EXPLAINED = 0.9
-# By how much more likely another delay must be, as the logarithm of the ratio, before it counts,
-# and for how long [s]: noise that begins reaches the sensors of some ticks ago last, which looks
-# better until it does.
-_EVIDENCE, _LASTING = 5.0, 2.0 * _LONGEST
+# The logarithm of how likely a delay is at least (one in a thousand), for it may begin at any time.
+_LEAST_LIKELY = -math.log(1000.0)
 
 
 def force_delay_type(clock: Clock) -> np.dtype:
     """What `watch_force_delay` remembers, of delays of 0, 1, ... ticks.
 
     `smooth` (2, 3), smoothed readings of how the centre of mass accelerates, by the other sensors
-    and by the forces; `shown` (room, 3), the former so many ticks ago [m/s^2]; `filled`, how many
-    of these are known; sums over the last time, of these, `total` (room, 3), of their
-    `square` and of their product `cross` with the forces, (room,), and of the forces,
-    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `contradicted`, for
-    how long another delay has been better [s]; and the `delay` [s]. Of `room_for_delays` the first
-    `delays_of` the clock are used.
+    and by the forces; `shown` and `read` (room, 3), the same so many ticks ago [m/s^2]; `filled`,
+    how many of these are known; sums over the last time, of `shown`, `total` (room, 3), of its
+    `square` and of its product `cross` with the forces, (room,), and of the forces,
+    `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `likelihood`
+    (2, room) of each delay, as the logarithm of its ratio to the largest, by the latest forces and
+    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of` the clock are used.
     """
     room = room_for_delays(clock)
-    shapes = {"shown": (room, 3), "total": (room, 3), "square": (room,), "cross": (room,)}
-    numbers = ("push_square", "filled", "count", "contradicted", "delay")
+    shapes = {"shown": (room, 3), "read": (room, 3), "total": (room, 3)}
+    shapes |= {"square": (room,), "cross": (room,), "likelihood": (2, room)}
+    numbers = ("push_square", "filled", "count", "delay")
     return record_type(**shapes, smooth=(2, 3), push_total=(3,), **dict.fromkeys(numbers, ()))
 
 
@@ -83,7 +86,7 @@ def forget_force_delay(x: np.ndarray) -> None:
     The delay that has been found stays.
     """
     x.total[:], x.square[:], x.cross[:], x.push_total[:] = 0.0, 0.0, 0.0, 0.0
-    x.push_square = x.filled = x.count = x.contradicted = 0.0
+    x.push_square = x.filled = x.count = 0.0
 
 
 @njit(cache=True)
@@ -111,6 +114,9 @@ def watch_force_delay(
     if abs(elapsed - period) > _UNEVEN * period:
         forget_force_delay(x)
         return
+    if x.filled == 0:
+        x.likelihood[:] = _LEAST_LIKELY
+        x.likelihood[:, round(x.delay / period)] = 0.0
     # Accelerations are differences of velocities, whose noise averages out fast.
     blend = 1.0 - math.exp(-elapsed / _SMOOTHING) if x.filled > 0 else 1.0
     for i in range(3):
@@ -119,8 +125,9 @@ def watch_force_delay(
     acceleration, push = vector(x.smooth[0]), vector(x.smooth[1])
     delays = _delays(period)
     for age in range(delays - 1, 0, -1):
-        x.shown[age] = x.shown[age - 1]
+        x.shown[age], x.read[age] = x.shown[age - 1], x.read[age - 1]
     put(x.shown[0], acceleration)
+    put(x.read[0], push)
     x.filled = min(x.filled + 1.0, float(delays))
     if x.filled < delays:
         return
@@ -130,7 +137,10 @@ def watch_force_delay(
     put(x.push_total, add(scale(keep, vector(x.push_total)), push))
     middle = scale(1.0 / x.count, vector(x.push_total))
     push_square = x.push_square - dot(vector(x.push_total), middle)
-    best, mismatch = 0, np.empty(delays)
+    gain, mismatch = np.empty(delays), np.empty(delays)
+    # Squares of what the latest forces that are read are off by, and of what those are that answer
+    # to the earliest acceleration.
+    off, last = np.empty((2, delays)), delays - 1
     for late in range(delays):
         shown = vector(x.shown[late])
         x.square[late] = keep * x.square[late] + dot(shown, shown)
@@ -138,18 +148,34 @@ def watch_force_delay(
         put(x.total[late], add(scale(keep, vector(x.total[late])), shown))
         total = vector(x.total[late])
         square = x.square[late] - dot(total, total) / x.count
-        cross = x.cross[late] - dot(total, middle)
-        mismatch[late] = push_square - max(0.0, cross) ** 2 / max(square, 1e-9)
-        if mismatch[late] < mismatch[best]:
-            best = late
-    variance = max(noise**2, mismatch[best] / (3.0 * x.count))
-    # At the longest delay the true one may be longer.
-    is_known = x.count * elapsed > _LEAST * _MEMORY and best < delays - 1
-    is_explained = mismatch[best] < (1.0 - _EXPLAINED) * push_square
-    gained = mismatch[round(x.delay / period)] - mismatch[best]
+        cross = max(0.0, x.cross[late] - dot(total, middle))
+        gain[late] = cross / max(square, 1e-9)
+        mismatch[late] = push_square - gain[late] * cross
+        offset = subtract(middle, scale(gain[late] / x.count, total))
+        off[0, late] = _square_off(push, gain[late], shown, offset)
+        answer = vector(x.read[last - late])
+        off[1, late] = _square_off(answer, gain[late], vector(x.shown[last]), offset)
+    if x.count * elapsed < _LEAST * _MEMORY:
+        return
+    # What no delay explains is noise.
+    variance = max(noise**2, mismatch.min() / (3.0 * x.count), off[0].min() / 3.0)
     # Of the smoothed readings so many are as good as one.
     alike = 1.0 + 2.0 * _SMOOTHING / period
-    is_better = is_known and is_explained and gained > 2.0 * _EVIDENCE * variance * alike
-    x.contradicted = x.contradicted + elapsed if is_better else 0.0
-    if x.contradicted > _LASTING:
-        x.delay, x.contradicted = best * period, 0.0
+    likelihood, now = x.likelihood, round(x.delay / period)
+    for way in range(2):
+        likelihood[way] -= off[way] / (2.0 * variance * alike)
+        likelihood[way] = np.maximum(_LEAST_LIKELY, likelihood[way] - likelihood[way].max())
+    best = np.argmax(likelihood[0] + likelihood[1])
+    # Noise that begins reaches the delays one after the other, in the one way in the opposite order
+    # as in the other.
+    is_likelier = (likelihood[:, best] > likelihood[:, now]).all()
+    if is_likelier and mismatch[best] < (1.0 - _EXPLAINED) * push_square:
+        # At the longest delay the true one may be longer, and nobody knows it.
+        x.delay = best * period if best < last else 0.0
+
+
+@njit(cache=True)
+def _square_off(push: Vector, gain: float, shown: Vector, offset: Vector) -> float:
+    """Square of how far forces are off a gain times an acceleration and an offset [m^2/s^4]."""
+    off = subtract(push, add(scale(gain, shown), offset))
+    return dot(off, off)
