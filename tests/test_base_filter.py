@@ -23,6 +23,7 @@ from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.records import as_record
+from fbse_drake.estimators.recursive import Status
 from fbse_drake.robot.plant import grasp_map
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -432,20 +433,38 @@ def tilt_of(x: np.ndarray) -> float:
     return float(np.arccos(min(1.0, x["rotation"][2, 2])))
 
 
-def test_a_tilt_that_all_feet_contradict_is_given_up():
-    """It is as sure of a wrong attitude as it was of the right one."""
-    rig, x = settled()
-    wrong = x.copy()
-    turn = Rotation.from_rotvec([0.03, -0.04, 0.0])
+def leaning(x: np.ndarray) -> np.ndarray:
+    """As sure of a wrong attitude as it was of the right one."""
+    wrong, turn = x.copy(), Rotation.from_rotvec([0.03, -0.04, 0.0])
     wrong["orientation"] = turn.as_quat(scalar_first=True)
     wrong["rotation"] = turn.as_matrix()
     wrong["foot_orientation"][:] = wrong["orientation"]
+    return wrong
+
+
+def test_a_tilt_that_all_feet_contradict_is_given_up():
+    rig, x = settled()
+    wrong = leaning(x)
     for _ in range(450):
         wrong = rig.step(wrong, measurements=RESTING)
     assert tilt_of(wrong) < 2e-3
     np.testing.assert_allclose(wrong["base_velocity"], 0, atol=2e-3)
     for name in ("gyro_bias_B", "accelerometer_bias_B"):
         np.testing.assert_allclose(wrong[name], x[name], atol=1e-3)
+
+
+def test_a_tilt_from_before_the_imu_was_doubted_is_given_up():
+    """Feet contradicted it already; an IMU that is doubted while nothing else is changes little."""
+    rig, x = settled()
+    doubted = BASE.measurements(trust=[0, Status.IMPLAUSIBLE, 0, 0])
+    right, wrong = x.copy(), leaning(x)
+    for k in range(300):
+        readings = doubted if 100 <= k < 120 else RESTING
+        wrong = rig.step(wrong, measurements=readings)
+        right = rig.step(right, measurements=readings)
+    assert tilt_of(wrong) < 2e-3
+    assert tilt_of(right) < 1e-3
+    assert np.all(right["attitude_std"] < 3 * x["attitude_std"])
 
 
 def test_a_foot_that_slips_for_a_moment_does_not_upset_the_attitude():

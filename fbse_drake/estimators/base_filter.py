@@ -797,7 +797,8 @@ def _estimate_base(
     _correct(x, correction)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
-    if x.lost_for > _LOST_AFTER:
+    # Nor is it they if the IMU is found to be wrong meanwhile: it was so before.
+    if x.lost_for > _LOST_AFTER or (x.lost_for > 0.0 and trust[1] == _IMPLAUSIBLE):
         _start_over(x, model, known)
     _leash_biases(x, first, elapsed, known.config)
     is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
