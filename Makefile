@@ -6,13 +6,15 @@
 # make hidden hides physics in the robot and prints how well it is found, and writes out/hidden/report.html
 # make bench  prints speeds, as ratios measured in one run
 # make fuzz   gives the commands 20,000 wrong files
+# make minimum  tries the oldest versions of all dependencies
 PYTHON ?= python3
+OLDEST_PYTHON ?= python3.10
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test docs lint kernels format bench fuzz fbse rivals hidden clean
+.PHONY: walk test minimum docs lint kernels format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -21,6 +23,14 @@ walk: $(INSTALLED)
 test: $(INSTALLED)
 	$(MAKE) --jobs 2 lint kernels
 	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# Files that call every dependency, in some minutes; most of it is compiled.
+minimum:
+	$(OLDEST_PYTHON) -m venv out/minimum
+	out/minimum/bin/pip install --quiet --editable ".[dev]" --constraint constraints-minimum.txt
+	NUMBA_CACHE_DIR=$(CURDIR)/out/minimum/numba MPLBACKEND=Agg out/minimum/bin/python -m pytest \
+		$(addprefix tests/test_,log.py effects.py regression.py export.py lipm.py learned_friction.py \
+		bag_map.py convert.py campaign.py report.py cli.py api.py)
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .

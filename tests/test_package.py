@@ -1,9 +1,13 @@
 import subprocess
 import sys
 import zipfile
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -61,3 +65,21 @@ def test_the_wheel_holds_every_model_scenario_and_template(installed: Path):
         shipped = {path.name for path in (installed / "fbse_drake" / name).iterdir()}
         assert shipped == {path.name for path in (ROOT / name).iterdir()}
     assert (installed / "fbse_drake/report/templates/report.html.j2").is_file()
+
+
+def test_the_oldest_versions_that_are_tried_are_the_lower_bounds():
+    tomllib = pytest.importorskip("tomllib")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = map(
+        Requirement,
+        [*project["dependencies"], *chain(*project["optional-dependencies"].values())],
+    )
+    bounds = {
+        canonicalize_name(needed.name): Version(bound.version)
+        for needed in asked
+        for bound in needed.specifier
+        if bound.operator == ">="
+    }
+    lines = (ROOT / "constraints-minimum.txt").read_text().splitlines()
+    tried = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert {canonicalize_name(name): Version(text) for name, text in tried.items()} == bounds
