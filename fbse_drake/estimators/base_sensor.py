@@ -188,8 +188,8 @@ class BaseSensorTorque(RecursiveEstimator):
 
     with its axis s_i and wrenches about the world's origin, where the tick began. No acceleration
     is needed. Fields are those of `LinkTorqueEstimator` that a friction filter takes, of the tick
-    that ends now (`late` is 0), with `link_torque` (n,) [Nm]; and `momentum` (b, 6), `weight` (b, 6) and `axes` (n, 6) of the
-    links now, `velocity` (n,).
+    that ends now (`late` is 0), with `link_torque` (n,) [Nm]; and `momentum` (b, 6), `weight` (b,
+    6) and `axes` (n, 6) of the links now, `velocity` (n,).
     """
 
     def __init__(

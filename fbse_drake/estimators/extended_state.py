@@ -67,7 +67,8 @@ class ExtendedStateObserver(MomentumBalance):
 
 
 def extended_state_gains(pole: float, elapsed: float) -> np.ndarray:
-    """Gains (3,) [1, 1/s, 1/s^2] that put all poles at exp(-pole elapsed) (Miklosovic et al. 2006)."""
+    """Gains (3,) [1, 1/s, 1/s^2] that put all poles at exp(-pole elapsed) (Miklosovic et al.
+    2006)."""
     z = math.exp(-pole * elapsed)
     gains = (1 - z**3, 1.5 * (1 - z) ** 2 * (1 + z) / elapsed, (1 - z) ** 3 / elapsed**2)
     return np.array(gains)

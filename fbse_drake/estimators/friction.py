@@ -581,11 +581,11 @@ class ModelAidedEstimator(FrictionEstimator):
     Further fields, each (n,): `disturbance` d [Nm]; `impulse`, measured minus estimated impulse
     [Nm s], after the update; `velocity` that the model sees, `past_velocity` (room, n), that
     one now and in the ticks before, and `joint_velocity`, that measured less what is known of its
-    noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is that of
-    [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of other
-    shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how much
-    the variance of the measurement's noise is larger than believed, at least 1; `agreement` (n,)
-    the running mean of the innovation [Nm s]; `settled` (n, ...) the weights of some time ago;
+    noise [rad/s]. `innovation` is that of the impulse [Nm s]; `covariance` (n, m + 2, m + 2) is
+    that of [impulse, weights, disturbance]; `weights` (n, ...) are the parameters and those of
+    other shapes; `friction_std` (n,) [Nm] is the estimate's standard deviation; `noise` (n,) by how
+    much the variance of the measurement's noise is larger than believed, at least 1; `agreement`
+    (n,) the running mean of the innovation [Nm s]; `settled` (n, ...) the weights of some time ago;
     `doubt` (n,) the largest disturbance of late, with what has been learned since then [Nm].
     """
 

@@ -17,7 +17,8 @@ class IdentifiedEffect:
     effect: type[JointTorqueEffect]
     # Joints, in column order.
     joints: list[str]
-    # Values and standard deviations by parameter name, each (n,) in the parameter's unit. The deviations take the residual as white.
+    # Values and standard deviations by parameter name, each (n,) in the parameter's unit. The
+    # deviations take the residual as white.
     values: dict[str, np.ndarray]
     deviations: dict[str, np.ndarray]
     # What the model leaves unexplained, rms (n,) [Nm].
@@ -35,8 +36,9 @@ def batch_least_squares(phi: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray
         phi: regressors (N, m); torque: (N,) [Nm].
 
     Returns:
-        Parameters (m,) and their standard deviations (m,), for white errors of the size of the residual. A parameter that the samples do
-        not excite gets the smallest value that fits, and a deviation of infinity if no sample moves it.
+        Parameters (m,) and their standard deviations (m,), for white errors of the size of the
+        residual. A parameter that the samples do not excite gets the smallest value that fits, and
+        a deviation of infinity if no sample moves it.
     """
     parameters, *_ = np.linalg.lstsq(phi, torque)
     residual = torque - phi @ parameters
@@ -54,9 +56,10 @@ def identify(
 ) -> IdentifiedEffect:
     """Fits an effect to friction samples of each joint: the nonlinear least squares (51), (55).
 
-    Parameters that enter linearly are solved for at every step of the search over the others (variable projection, Golub and Pereyra 1973),
-    which starts in the middle of their plausible ranges and stays inside them. A linear value stays within the parameter's bounds, so that
-    a joint that hardly moves does not get a negative friction.
+    Parameters that enter linearly are solved for at every step of the search over the others
+    (variable projection, Golub and Pereyra 1973), which starts in the middle of their plausible
+    ranges and stays inside them. A linear value stays within the parameter's bounds, so that a
+    joint that hardly moves does not get a negative friction.
 
     Args:
         joints: names, in column order.
@@ -123,7 +126,8 @@ def identify(
 
 
 def _bounded_least_squares(phi: np.ndarray, torque: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Least squares with parameters in [bounds[0], bounds[1]]; for most samples the plain solution is there already."""
+    """Least squares with parameters in [bounds[0], bounds[1]]; for most samples the plain solution
+    is there already."""
     parameters, *_ = np.linalg.lstsq(phi, torque)
     if np.all((bounds[0] <= parameters) & (parameters <= bounds[1])):
         return parameters

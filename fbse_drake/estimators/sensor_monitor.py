@@ -313,8 +313,9 @@ def _watch_sensors(
         doubt: of IMU and feet, see there, (1 + feet,).
         known: record with the values of `SensorMonitorConfig` as `limits` and of `SensorBeliefs` as
             `beliefs`; the mass that the feet carry [kg], 0 where they need not; which foot each pad
-            belongs to; whether the robot `has_imu`; the thresholds of `detect_support`; whether joint velocities are
-            `counted` or `derived`; and how long a `reading` takes, see `Clock`.
+            belongs to; whether the robot `has_imu`; the thresholds of `detect_support`; whether
+            joint velocities are `counted` or `derived`; and how long a `reading` takes, see
+            `Clock`.
     """
     posterior, last, sensors, known = posterior[()], last[()], sensors[()], known[()]
     trust, idle, was_idle = posterior.trust, posterior.unchanged, last.unchanged

@@ -7,9 +7,11 @@ _SMALLEST_LOAD = 1.0
 
 
 def zero_moment_point(force: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """ZMP of forces on level ground: the mean of the pads' places weighted with their vertical forces.
+    """ZMP of forces on level ground: the mean of the pads' places weighted with their vertical
+    forces.
 
-    That is eq. (8) with the centres of pressure (9) written out. While nothing stands the last ZMP is kept.
+    That is eq. (8) with the centres of pressure (9) written out. While nothing stands the last ZMP
+    is kept.
 
     Args:
         force: of the ground on each pad, world axes, shape (N, pads, 3) [N].

@@ -67,7 +67,8 @@ from fbse_drake.report.sentences import (
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, dump_scenario
 
-# Pictures show this many of the worst channels, of alternatives, and of joints' torques; and of a log this many averages.
+# Pictures show this many of the worst channels, of alternatives, and of joints' torques; and of a
+# log this many averages.
 _CHANNELS = 4
 
 _ALTERNATIVES = 8
@@ -310,7 +311,8 @@ def _why(
     alternatives: Sequence[Finding],
     unexplained: Sequence[Structure],
 ) -> list[Section]:
-    """What was found in each round, with its values and the alternatives, and what is left without an explanation."""
+    """What was found in each round, with its values and the alternatives, and what is left without
+    an explanation."""
     chosen = [finding for found in rounds for finding in found]
     others = [finding for finding in alternatives if not finding.chosen][:_ALTERNATIVES]
     of_round = [f", round {k}" * (k > 1) for k, found in enumerate(rounds, start=1) for _ in found]
@@ -470,7 +472,8 @@ def _relative_fall(study: Study) -> list[tuple[str, str]]:
 def _measured_torque(
     completed: Scenario, given: Predictor, tests: Mapping[str, Log]
 ) -> list[FigureBlock]:
-    """Measured and modelled torque of the worst joints where the model as given errs most, on a log that nothing was fitted to if any."""
+    """Measured and modelled torque of the worst joints where the model as given errs most, on a log
+    that nothing was fitted to if any."""
     name, log = next(iter(tests.items()), ("train", given.motion.log))
     given, after = Predictor(given.scenario, log), Predictor(completed, log)
     residual, n = given.residual, len(given.robot.joint_names)

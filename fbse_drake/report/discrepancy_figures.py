@@ -1,6 +1,7 @@
 """Pictures of where a model fails, what is missing in it, and how the error falls.
 
-Errors are in multiples of the sensors' noise wherever channels of different units stand side by side. Nothing here touches pyplot.
+Errors are in multiples of the sensors' noise wherever channels of different units stand side by
+side. Nothing here touches pyplot.
 """
 
 import textwrap
@@ -47,7 +48,8 @@ _BEFORE = "#d65f1a"
 # Effects that a tick names, panels in a row.
 _MOST_NAMED = 3
 _PANELS = 3
-# Joints whose simulated positions are drawn; samples further apart than this many periods are not joined.
+# Joints whose simulated positions are drawn; samples further apart than this many periods are not
+# joined.
 _MOST_JOINTS = 6
 _GAP = 3.0
 # Intervals are drawn up to this many times the largest value.
@@ -61,7 +63,8 @@ VERDICT_COLORS = {
 
 
 def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> Figure:
-    """The robot from behind with every joint coloured by its error, in multiples of the noise; and the same by phase.
+    """The robot from behind with every joint coloured by its error, in multiples of the noise; and
+    the same by phase.
 
     Args:
         posture: joint angles that it is drawn in, shape (n,) [rad].
@@ -230,7 +233,8 @@ def _draw_phases(axes: Axes, channels: Sequence[Channel]) -> None:
 
 
 def channel_errors(before: Sequence[Channel], after: Sequence[Channel] = ()) -> Figure:
-    """Error over noise of every channel that is known; with `after`, of the same channels, also what is left of it."""
+    """Error over noise of every channel that is known; with `after`, of the same channels, also
+    what is left of it."""
     figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(before)), layout="constrained")
     axes = figure.subplots()
     ratios = [
@@ -324,7 +328,8 @@ def binned_variables(channel: Channel) -> list[str]:
 
 
 def error_bins(channels: Sequence[Channel]) -> Figure:
-    """Mean error of channels against each variable, with its 95 % interval and the noise of the mean; a row for each channel."""
+    """Mean error of channels against each variable, with its 95 % interval and the noise of the
+    mean; a row for each channel."""
     columns = [binned_variables(channel) for channel in channels]
     width = max(map(len, columns))
     figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * len(channels)), layout="constrained")
@@ -402,7 +407,8 @@ def errors_over_time(
 def torques_over_time(
     before: Residual, after: Residual, joints: Sequence[int], stretch: slice
 ) -> Figure:
-    """Torque of joints as measured and by the model before and after something was added to it; below each the two models' errors.
+    """Torque of joints as measured and by the model before and after something was added to it;
+    below each the two models' errors.
 
     Args:
         before, after: what each model leaves of the same log.
@@ -470,7 +476,8 @@ def torques_over_time(
 
 
 def position_errors(before: RolloutError, after: RolloutError, units: Sequence[str]) -> Figure:
-    """Simulated less recorded position over time, before and after something was added to a model, of the worst joints.
+    """Simulated less recorded position over time, before and after something was added to a model,
+    of the worst joints.
 
     Args:
         units: of the joints' torques.
@@ -556,7 +563,8 @@ def finding_name(finding: Finding) -> str:
 
 
 def targets_text(targets: Sequence[str], effect: str = "") -> str:
-    """Names of an effect's targets for reading, as `left and right knee pitch`; of many only how many."""
+    """Names of an effect's targets for reading, as `left and right knee pitch`; of many only how
+    many."""
     things = "bodies" if effect in library() and library()[effect].acts_on == "body" else "joints"
     sides, parts = zip(*(target.partition("_")[::2] for target in targets), strict=True)
     if len(targets) > 1 and len(set(parts)) == 1:
@@ -565,7 +573,8 @@ def targets_text(targets: Sequence[str], effect: str = "") -> str:
 
 
 def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
-    """Smallest size of every effect that the data would have shown, on each target, over the largest plausible size."""
+    """Smallest size of every effect that the data would have shown, on each target, over the
+    largest plausible size."""
     known = library()
     names = [name for name in statuses if name in known]
     figure = Figure(figsize=(WIDTH, 1.1 + 0.27 * len(names)), layout="constrained")
@@ -616,7 +625,8 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
 
 
 def parameters(findings: Sequence[tuple[Finding, str]]) -> Figure:
-    """Fitted values with their 95 % intervals: a panel for each parameter, rows of panels for each effect.
+    """Fitted values with their 95 % intervals: a panel for each parameter, rows of panels for each
+    effect.
 
     Intervals that are many times as wide as the values are large are cut.
 

@@ -77,7 +77,8 @@ def steps_table(study: Study, *, tested: bool) -> Table:
 
 
 def _spread_rows(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
-    """How far recordings that were fitted together agree in what was found; see `_SPREAD_HEADER`."""
+    """How far recordings that were fitted together agree in what was found; see
+    `_SPREAD_HEADER`."""
     rows = []
     for finding in findings:
         for name, spread in finding.spread.items():
@@ -163,7 +164,8 @@ def channel_table(channels: Sequence[Channel]) -> Table:
 
 
 def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
-    """A table for each effect: its values where it was found. What a later round finds in the same place comes on top."""
+    """A table for each effect: its values where it was found. What a later round finds in the same
+    place comes on top."""
     known = library()
     where: dict[str, list[tuple[int, Finding]]] = {}
     for number_of, found in enumerate(rounds, start=1):
@@ -215,13 +217,15 @@ def _value_text(estimate: Estimate) -> str:
 
 
 def _short(value: float) -> str:
-    """A number for a narrow column; very small and very large ones with an exponent. With a minus sign, at which no line breaks."""
+    """A number for a narrow column; very small and very large ones with an exponent. With a minus
+    sign, at which no line breaks."""
     text = number(value) if value == 0 or 1e-4 <= abs(value) < 1e5 else f"{value:.2e}"
     return text.replace("-", "\N{MINUS SIGN}")
 
 
 def reach_text(status: EffectStatus, effect: str) -> str:
-    """Smallest sizes that the data would have shown, and where it would have shown none that is plausible."""
+    """Smallest sizes that the data would have shown, and where it would have shown none that is
+    plausible."""
     known = library().get(effect)
     largest = (
         np.inf
@@ -242,7 +246,8 @@ def log_name(name: str) -> str:
 
 
 def relative_error_tables(study: Study) -> list[Table]:
-    """Relative errors of the model as given and completed, by joint, on the log that was diagnosed and on others."""
+    """Relative errors of the model as given and completed, by joint, on the log that was diagnosed
+    and on others."""
     first, last = study.steps[0].errors, study.steps[-1].errors
     if not any(np.isfinite(error.relative) for error in first.values()):
         return []

@@ -1,6 +1,7 @@
 """Reports: one HTML file that holds everything it shows, to be mailed, archived and printed.
 
-A report is data (`Report`, made of `Section`s); `write_report` puts it into `templates/report.html.j2`.
+A report is data (`Report`, made of `Section`s); `write_report` puts it into
+`templates/report.html.j2`.
 """
 
 import base64
@@ -97,7 +98,8 @@ class Details:
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of a report; shows its text, tables, figures, folded tables and details in this order."""
+    """A titled part of a report; shows its text, tables, figures, folded tables and details in this
+    order."""
 
     title: str
     text: str | Step = ""
@@ -183,7 +185,8 @@ def _png_uri(figure: Figure) -> str:
     # The page shows through, which may be dark.
     for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
         patch.set_alpha(0.0)
-    # Dollars that are there before ticks are labelled stand in names: no figure of ours has formulas.
+    # Dollars that are there before ticks are labelled stand in names: no figure of ours has
+    # formulas.
     for text in figure.findobj(Text):
         if "$" in text.get_text():
             text.set_parse_math(False)

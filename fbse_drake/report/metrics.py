@@ -1,7 +1,8 @@
 """Figures of merit of a run, computed from its log.
 
-Estimates are compared with the truth from `_SETTLING_TIME` on. Friction is that of a step: row k of the estimate belongs to the step that
-ends at `time[k]`, row k of the truth to the step that begins then.
+Estimates are compared with the truth from `_SETTLING_TIME` on. Friction is that of a step: row k of
+the estimate belongs to the step that ends at `time[k]`, row k of the truth to the step that begins
+then.
 """
 
 import math
@@ -16,7 +17,8 @@ from fbse_drake.log import Log
 
 # A foot counts as standing while it carries at least this share of the weight.
 _STANDING_SHARE = 0.05
-# The beginning of a log that no figure of an estimate counts: the filters start from wide priors and settle [s].
+# The beginning of a log that no figure of an estimate counts: the filters start from wide priors
+# and settle [s].
 _SETTLING_TIME = 0.2
 PHASES = ("stance", "swing")
 # A joint's simulated torque follows its law if it differs by at most this share of the law's rms.
@@ -25,7 +27,8 @@ LAW_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Consistency:
-    """A filter's mean normalised innovation squared (NIS), about 1 if its noise is as large as the filter believes."""
+    """A filter's mean normalised innovation squared (NIS), about 1 if its noise is as large as the
+    filter believes."""
 
     nis: float
     # Between these lie 95 % of such means, if the innovations are white.
@@ -68,7 +71,8 @@ def run_metrics(log: Log, wall_time: float, tick_time: np.ndarray | None = None)
 
 
 def joint_tracking_rms(log: Log) -> np.ndarray:
-    """Root mean square of reference minus joint angle (see `joint_position_channel`) over the run, shape (n,) [rad].
+    """Root mean square of reference minus joint angle (see `joint_position_channel`) over the run,
+    shape (n,) [rad].
 
     NaN without a reference.
     """
@@ -88,7 +92,8 @@ def com_rse(log: Log) -> np.ndarray:
 
 
 def com_rse_mean(log: Log) -> dict[str, float]:
-    """Mean of `com_rse` over the run [m]; NaN for a motion without a planned CoM, or without truth."""
+    """Mean of `com_rse` over the run [m]; NaN for a motion without a planned CoM, or without
+    truth."""
     if "reference/com/position" not in log or "truth/com/position" not in log:
         return {"x": math.nan, "y": math.nan}
     return dict(zip("xy", com_rse(log).mean(axis=0).tolist(), strict=True))
@@ -97,9 +102,10 @@ def com_rse_mean(log: Log) -> dict[str, float]:
 def stance_creep(log: Log) -> dict[str, list[float]]:
     """How far each foot's sole moves over the ground in each stance [m], by side.
 
-    A stance is one stretch of time in which the plan has the foot on the ground; it counts from when the foot takes up 5 % of the
-    feet's mean load to when it falls below, around the time of its largest load. (A foot that carries next to nothing may slide.)
-    A log without truth has no creep.
+    A stance is one stretch of time in which the plan has the foot on the ground; it counts from
+    when the foot takes up 5 % of the feet's mean load to when it falls below, around the time of
+    its largest load. (A foot that carries next to nothing may slide.) A log without truth has no
+    creep.
     """
     if not has_feet(log, "truth/foot/{}/pad_force") or not has_feet(log, "truth/foot/{}/position"):
         return {side: [] for side in log.sides}
@@ -126,12 +132,14 @@ def settled(log: Log) -> np.ndarray:
 
 
 def has_feet(log: Log, channel: str) -> bool:
-    """Whether the log has this channel, as in `foot/{}/pad_force`, for every side, and has sides."""
+    """Whether the log has this channel, as in `foot/{}/pad_force`, for every side, and has
+    sides."""
     return bool(log.sides) and all(channel.format(side) in log for side in log.sides)
 
 
 def joint_sides(log: Log) -> list[str | None]:
-    """Whose leg each joint belongs to: as the log says, else by its name (`left_knee_pitch`), or by its place.
+    """Whose leg each joint belongs to: as the log says, else by its name (`left_knee_pitch`), or by
+    its place.
 
     Legs follow one another in the order of the sides, with equally many joints.
     """
@@ -152,7 +160,8 @@ def joint_sides(log: Log) -> list[str | None]:
 
 
 def stance(log: Log) -> dict[str, np.ndarray]:
-    """When each foot stands, (N,) bool by side: by the plan, without one by the estimated support; empty if neither is known."""
+    """When each foot stands, (N,) bool by side: by the plan, without one by the estimated support;
+    empty if neither is known."""
     if has_feet(log, "reference/foot/{}/support"):
         return {side: log[f"reference/foot/{side}/support"] > 0 for side in log.sides}
     if log.sides and "estimate/support" in log:
@@ -161,7 +170,8 @@ def stance(log: Log) -> dict[str, np.ndarray]:
 
 
 def ended_step(values: np.ndarray) -> np.ndarray:
-    """What a channel says of steps that begin at its rows' times, (N, ...), moved to the rows where they end; the first row is NaN."""
+    """What a channel says of steps that begin at its rows' times, (N, ...), moved to the rows where
+    they end; the first row is NaN."""
     return np.concatenate([np.full_like(values[:1], math.nan), values[:-1]])
 
 
@@ -192,12 +202,14 @@ def worst_joint(figures: Mapping[str, float]) -> str:
 
 
 def friction_error(log: Log) -> np.ndarray:
-    """Estimated minus true friction of the step that ends at each row, shape (N, n) [Nm]; NaN in the first row, in which no step ends."""
+    """Estimated minus true friction of the step that ends at each row, shape (N, n) [Nm]; NaN in
+    the first row, in which no step ends."""
     return log["estimate/joint/friction_torque"] - ended_step(log["truth/joint/friction_torque"])
 
 
 def friction_rmse(log: Log) -> dict[str, dict[str, float]]:
-    """Root mean square of `friction_error` by phase of the joint's leg (`stance`, `swing`) and joint [Nm]; NaN where it is not known.
+    """Root mean square of `friction_error` by phase of the joint's leg (`stance`, `swing`) and
+    joint [Nm]; NaN where it is not known.
 
     A joint of no leg, which nothing stands on, swings.
     """
@@ -205,7 +217,8 @@ def friction_rmse(log: Log) -> dict[str, dict[str, float]]:
 
 
 def friction_nrmse(log: Log) -> dict[str, dict[str, float]]:
-    """`friction_rmse` over the root mean square of the true friction in the same rows [1]; NaN for a joint without friction."""
+    """`friction_rmse` over the root mean square of the true friction in the same rows [1]; NaN for
+    a joint without friction."""
     return _friction_figures(log, normalised=True)
 
 
@@ -218,7 +231,8 @@ def attitude_error_deg(log: Log) -> np.ndarray:
 
 
 def roll_and_pitch_deg(orientation: np.ndarray) -> np.ndarray:
-    """x- and y-Euler angles (z-y-x order) of quaternions [w, x, y, z] (N, 4), shape (N, 2) [deg]."""
+    """x- and y-Euler angles (z-y-x order) of quaternions [w, x, y, z] (N, 4), shape (N, 2)
+    [deg]."""
     w, x, y, z = orientation.T
     to_the_left, up = 2 * (w * x + y * z), w * w - x * x - y * y + z * z
     roll, pitch = (
@@ -263,9 +277,11 @@ def tick_us(tick_time: np.ndarray | None) -> dict[str, float]:
 
 
 def normalised_innovations(log: Log) -> dict[str, dict[str, np.ndarray]]:
-    """Innovations squared over their variances, by filter and part of its measurement; each (N, components) [1].
+    """Innovations squared over their variances, by filter and part of its measurement; each (N,
+    components) [1].
 
-    NaN where there was no update: where the variance or the innovation is zero, or both are still those of the row before.
+    NaN where there was no update: where the variance or the innovation is zero, or both are still
+    those of the row before.
     """
     result = {}
     for name in ("attitude", "base_state", "joint_acceleration", "friction"):
@@ -288,11 +304,13 @@ def normalised_innovations(log: Log) -> dict[str, dict[str, np.ndarray]]:
 
 
 def consistency(log: Log) -> dict[str, dict[str, Consistency]]:
-    """Mean normalised innovation squared (NIS) by filter and part of its measurement, as in `normalised_innovations`.
+    """Mean normalised innovation squared (NIS) by filter and part of its measurement, as in
+    `normalised_innovations`.
 
-    The bounds are those of a chi-square variable with as many degrees of freedom as there are innovations, divided by their number. They
-    hold for white innovations; errors that last make a mean scatter more, without being wrong. The NIS of recursive least squares, which
-    has no measurement noise in Nm, is that for a noise of 1 Nm.
+    The bounds are those of a chi-square variable with as many degrees of freedom as there are
+    innovations, divided by their number. They hold for white innovations; errors that last make a
+    mean scatter more, without being wrong. The NIS of recursive least squares, which has no
+    measurement noise in Nm, is that for a noise of 1 Nm.
     """
     result: dict[str, dict[str, Consistency]] = {}
     for name, parts in normalised_innovations(log).items():
@@ -308,7 +326,8 @@ def consistency(log: Log) -> dict[str, dict[str, Consistency]]:
 
 
 def nis_bounds(count: np.ndarray) -> np.ndarray:
-    """Lower and upper 95 % bound of the mean of `count` (...) normalised squares of white innovations, shape (2, ...)."""
+    """Lower and upper 95 % bound of the mean of `count` (...) normalised squares of white
+    innovations, shape (2, ...)."""
     return np.stack([chi2.ppf(probability, count) / count for probability in (0.025, 0.975)])
 
 
@@ -330,7 +349,8 @@ def _measurement_parts(log: Log, name: str, components: int) -> list[str]:
 
 
 def _base_state_parts(log: Log, components: int) -> list[str]:
-    """Of the filter with the feet in its state, of that on legs and IMU, or of that on the LIPM, axis by axis."""
+    """Of the filter with the feet in its state, of that on legs and IMU, or of that on the LIPM,
+    axis by axis."""
     if "estimate/base_state/foot_innovation" in log:
         kinds = ("position", "orientation", "velocity", "angular velocity")
         return [f"{side} foot, {kind}" for side in log.sides for kind in kinds]

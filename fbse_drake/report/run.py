@@ -200,7 +200,8 @@ def _consistency_table(log: Log) -> tuple[Table, ...]:
 
 
 def _scenarios(log: Log) -> tuple[Details, ...]:
-    """Scenarios that the log holds: that of the simulation, and that of the estimator which ran over the log later."""
+    """Scenarios that the log holds: that of the simulation, and that of the estimator which ran
+    over the log later."""
     titles = {
         "scenario": "YAML",
         "estimator_scenario": "YAML of the estimator that ran over the log",

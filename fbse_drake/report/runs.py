@@ -1,4 +1,5 @@
-"""Runs beside each other: their figures of merit in one table, their pictures with the same axes."""
+"""Runs beside each other: their figures of merit in one table, their pictures with the same
+axes."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

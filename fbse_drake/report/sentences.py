@@ -36,7 +36,8 @@ _KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of t
 
 @dataclass(frozen=True)
 class Inputs:
-    """What was compared, in the words of the command line, for the commands that a report proposes."""
+    """What was compared, in the words of the command line, for the commands that a report
+    proposes."""
 
     # Of the scenario.
     name: str
@@ -75,7 +76,8 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
 
 
 def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
-    """A result with what it is worth on data that was set aside; if that is nothing, it comes first."""
+    """A result with what it is worth on data that was set aside; if that is nothing, it comes
+    first."""
     refuted = {name: one for name, one in set_aside.items() if one.course != "falls"}
     confirmed = {name: one for name, one in set_aside.items() if one.course == "falls"}
     before = [f"Not confirmed: {_course(name, one)}." for name, one in refuted.items()]
@@ -84,7 +86,8 @@ def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
 
 
 def _course(log: str, validation: Validation) -> str:
-    """As `on the rest of the log, which was set aside, the error falls from 4.20 to 0.99 (0.95 to 1.03) times the sensors' noise`."""
+    """As `on the rest of the log, which was set aside, the error falls from 4.20 to 0.99 (0.95 to
+    1.03) times the sensors' noise`."""
     before, after = validation.before, validation.after
     text = (
         f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: from {number(before.value)} to "
@@ -319,7 +322,8 @@ def as_sentence(text: str) -> str:
 
 
 def listed_effects(findings: Sequence[Finding]) -> str:
-    """Effects and where, as `Coulomb friction and torque bias in left knee pitch and body mass in trunk`; for the inside of a sentence."""
+    """Effects and where, as `Coulomb friction and torque bias in left knee pitch and body mass in
+    trunk`; for the inside of a sentence."""
     by_place: dict[tuple[str, ...], list[str]] = {}
     for effect, targets in by_effect(findings).items():
         by_place.setdefault(tuple(targets), []).append(effect)
@@ -403,7 +407,8 @@ def applicable(statuses: Mapping[str, EffectStatus]) -> dict[str, EffectStatus]:
 
 
 def statuses_of(study: Study) -> dict[str, EffectStatus]:
-    """What all rounds together say of every effect: the last one, but for what was found before and what stood for it as well."""
+    """What all rounds together say of every effect: the last one, but for what was found before and
+    what stood for it as well."""
     found = {finding.effect for finding in study.found}
     equal = {name for finding in study.found for name in finding.confusable_with}
     return {

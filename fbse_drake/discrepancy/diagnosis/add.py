@@ -20,10 +20,12 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
 
     Args:
         diagnosis: its contents.
-        effect: which effect of the ranking, on the targets where it explains most; by default all that the diagnosis chose.
+        effect: which effect of the ranking, on the targets where it explains most; by default all
+            that the diagnosis chose.
 
     Raises:
-        InputError: these are not such contents, the ranking has no such effect, or there is nothing to add.
+        InputError: these are not such contents, the ranking has no such effect, or there is nothing
+            to add.
     """
     ranking = [
         Finding(
@@ -80,8 +82,9 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
 
 
 def _settled(effect: str, name: str, estimate: Estimate) -> float:
-    """The value that a parameter gets. A velocity of transition of which the data do not say that the default is wrong keeps it: friction
-    must hold a joint at rest also where nobody saw how steep it is.
+    """The value that a parameter gets. A velocity of transition of which the data do not say that
+    the default is wrong keeps it: friction must hold a joint at rest also where nobody saw how
+    steep it is.
     """
     kind = library().get(effect)
     if kind is None or name != "transition":

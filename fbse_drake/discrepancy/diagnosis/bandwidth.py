@@ -40,7 +40,8 @@ class Averaging:
 
 
 def averaged_to_bandwidth(predictor: Predictor) -> tuple[Predictor, Averaging]:
-    """A predictor over longer blocks if the log has many and its motion does not need them; else the same one."""
+    """A predictor over longer blocks if the log has many and its motion does not need them; else
+    the same one."""
     motion, recording = predictor.motion, predictor.scenario.recording
     asked = motion.length * motion.period
     blocks = len(motion.signals.joint_position) // motion.length
@@ -59,7 +60,8 @@ def averaged_to_bandwidth(predictor: Predictor) -> tuple[Predictor, Averaging]:
 
 
 def bandwidth(motion: RecordedMotion) -> float:
-    """Frequency below which the motion in a log lies, by the fastest of its channels [Hz]; 0 if nothing moves."""
+    """Frequency below which the motion in a log lies, by the fastest of its channels [Hz]; 0 if
+    nothing moves."""
     signals, rate = motion.signals, 1.0 / motion.period
     fastest = 0.0
     for name in (

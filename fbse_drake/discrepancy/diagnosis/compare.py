@@ -1,4 +1,5 @@
-"""Where does a model fail? Its residual on a log by joint, phase, velocity, position, load and time, beside the sensors' noise."""
+"""Where does a model fail? Its residual on a log by joint, phase, velocity, position, load and
+time, beside the sensors' noise."""
 
 import itertools
 import math
@@ -17,7 +18,8 @@ from fbse_drake.robot.description import RobotDescription
 
 # Probability that a log of noise alone shows any failure.
 _FALSE_ALARM = 1e-3
-# An error below this share of the noise of one block, or of what the zero predictor leaves, is no failure however sure it is.
+# An error below this share of the noise of one block, or of what the zero predictor leaves, is no
+# failure however sure it is.
 _SMALLEST_NOISE_SHARE = 0.3
 _SMALLEST_SHARE = 1e-3
 # Quantiles that bins lie between: of speeds, and of other variables.
@@ -30,7 +32,8 @@ _MOST_TIME_BINS = 6
 _EXCESS = 1.5
 # A bin is looked at if it has this many blocks, from this many stretches.
 _FEWEST_BLOCKS, _FEWEST_STRETCHES = 10, 3
-# A simpler division of a log is preferred to a finer one if it leaves at most this times as much (sum of squares).
+# A simpler division of a log is preferred to a finer one if it leaves at most this times as much
+# (sum of squares).
 _WORTHWHILE = 1.25
 # Neighbouring bins are one failure if the smaller error is at least this share of the larger one.
 _SIMILAR = 0.5
@@ -38,7 +41,8 @@ _SIMILAR = 0.5
 
 @dataclass(frozen=True)
 class Bin:
-    """Mean error in part of a log: in a phase, and in a range of a variable. Errors in the channel's unit.
+    """Mean error in part of a log: in a phase, and in a range of a variable. Errors in the
+    channel's unit.
 
     Where the variable is `speed`, an error counts positive along the motion.
     """
@@ -77,7 +81,8 @@ class Channel:
     # Root mean square, of the error and of the sensors' noise in it.
     rmse: float
     noise_floor: float
-    # `rmse` over that of the zero predictor: a model without any forces (joint and base rows; NaN for kinematic ones, which are zero).
+    # `rmse` over that of the zero predictor: a model without any forces (joint and base rows; NaN
+    # for kinematic ones, which are zero).
     nrmse: float
     # `rmse` and `noise_floor` by phase; NaN for a phase that never occurs.
     by_phase: dict[str, tuple[float, float]]
@@ -106,11 +111,13 @@ class Failure:
 class Comparison:
     """A model against a log.
 
-    Total errors are root mean squares over all rows in multiples of the sensors' noise (whitened), so that the noise floor is 1.
+    Total errors are root mean squares over all rows in multiples of the sensors' noise (whitened),
+    so that the noise floor is 1.
     """
 
     rmse: float
-    # What is left on held-out data if every row gets a constant, its mean over the other data: how much of the error is a mere offset.
+    # What is left on held-out data if every row gets a constant, its mean over the other data: how
+    # much of the error is a mere offset.
     held_out_rmse: float
     channels: tuple[Channel, ...]
     # Worst first.
@@ -152,7 +159,8 @@ def compare_residual(
 
     Args:
         description: whose joints are the residual's first rows.
-        zero_rmse: root mean square error of the zero predictor in each row, shape (R,); NaN where there is none.
+        zero_rmse: root mean square error of the zero predictor in each row, shape (R,); NaN where
+            there is none.
         foot_load: vertical force on each sole [N], shape (B,), by side.
     """
     white = WhitenedResidual(residual)
@@ -289,7 +297,8 @@ class _RowErrors:
         return {variable.name: variable for variable in found}
 
     def _edges(self, values: np.ndarray, quantiles: Sequence[float]) -> np.ndarray:
-        """Infinite at the ends, and between numbers that are round against their spread, so that texts read well."""
+        """Infinite at the ends, and between numbers that are round against their spread, so that
+        texts read well."""
         if not self.known.any():
             return np.array([-np.inf, np.inf])
         inner = np.quantile(values[self.known], quantiles)
@@ -437,7 +446,8 @@ class _RowErrors:
         )
 
     def _cells(self, division: _Division) -> np.ndarray:
-        """Columns of the parts of a division, (B, cells): the sign of the error's variable inside, 0 outside."""
+        """Columns of the parts of a division, (B, cells): the sign of the error's variable inside,
+        0 outside."""
         place = np.digitize(division.variable.values, division.variable.edges[1:-1])
         inside = np.eye(len(division.variable.edges) - 1)[place] * division.variable.sign[:, None]
         return np.concatenate(
@@ -447,7 +457,8 @@ class _RowErrors:
     def _outstanding(
         self, division: _Division, phase: str, threshold: float, smallest: float
     ) -> list[Bin]:
-        """Runs of bins of one phase whose errors have one sign and stand out from the noise: at most one for each sign."""
+        """Runs of bins of one phase whose errors have one sign and stand out from the noise: at
+        most one for each sign."""
         bins = self.bins(replace(division, phases={phase: division.phases[phase]}))
         found = []
         for sign in (1, -1):
@@ -485,7 +496,8 @@ def _constant(white: WhitenedResidual, row: int) -> tuple[np.ndarray, np.ndarray
 def _held_out_sse(
     error: np.ndarray, columns: np.ndarray, known: np.ndarray, fold: np.ndarray
 ) -> float:
-    """Sum of squares of an error (B,) after orthogonal columns (B, p) that are fitted to the other folds."""
+    """Sum of squares of an error (B,) after orthogonal columns (B, p) that are fitted to the other
+    folds."""
     inside = (fold == np.arange(FOLDS)[:, None]) & known
     power, product = inside @ columns**2, inside @ (columns * error[:, None])
     other_power, other_product = power.sum(axis=0) - power, product.sum(axis=0) - product
@@ -517,7 +529,8 @@ def words(name: str) -> str:
 
 
 def range_text(row: Row, where: Bin) -> str:
-    """The range of a bin's variable, as `|velocity| < 0.1 rad/s`; empty if it is the whole range."""
+    """The range of a bin's variable, as `|velocity| < 0.1 rad/s`; empty if it is the whole
+    range."""
     quantities = _QUANTITY_ALONG if row.kind == "joint" and row.unit == "N" else _QUANTITY
     name, unit = quantities.get(where.variable, (where.variable, "N"))
     low, high = (f"{bound:.4g}" for bound in (where.low, where.high))

@@ -1,4 +1,5 @@
-"""What a log would have shown: the smallest size of an effect that is found, and how well two effects are told apart."""
+"""What a log would have shown: the smallest size of an effect that is found, and how well two
+effects are told apart."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,7 +17,8 @@ _HOPELESS = 1e3
 
 
 def smallest_detectable(fits: Fits, base: Explanation, effect: type[Effect]) -> dict[str, float]:
-    """Size of an effect's first parameter that would have been found beside an explanation, by target; infinite where none would.
+    """Size of an effect's first parameter that would have been found beside an explanation, by
+    target; infinite where none would.
 
     The size at which the effect's sum of squares reaches what its parameters must bring and cost.
     """
@@ -88,7 +90,8 @@ def separation(
     values: Mapping[str, float],
     rival: type[Effect],
 ) -> float:
-    """How much of what an effect would do here a rival could not mimic: a sum of squares in units of noise.
+    """How much of what an effect would do here a rival could not mimic: a sum of squares in units
+    of noise.
 
     Args:
         values: of the effect's parameters.

@@ -1,4 +1,5 @@
-"""Which physical effect does a model lack? Verdicts from what each effect explains of the held-out residual."""
+"""Which physical effect does a model lack? Verdicts from what each effect explains of the held-out
+residual."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,8 +38,8 @@ from fbse_drake.progress import Interrupted, Progress, silent
 
 Verdict = Literal["effect_found", "nothing_missing", "unknown_effect", "not_visible"]
 EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
-# An effect counts as the explanation of a row if it takes away this share of what exceeds the noise there, and leaves no more than this
-# many times the noise.
+# An effect counts as the explanation of a row if it takes away this share of what exceeds the noise
+# there, and leaves no more than this many times the noise.
 _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
 
@@ -59,7 +60,8 @@ class Finding:
     effect: str
     # Joints, bodies, sides or `robot`; they share the values.
     targets: tuple[str, ...]
-    # Root mean square of the held-out residual, in multiples of the sensors' noise, without and with the effect.
+    # Root mean square of the held-out residual, in multiples of the sensors' noise, without and
+    # with the effect.
     held_out_before: float
     held_out_after: float
     parameters: dict[str, Estimate]
@@ -67,10 +69,12 @@ class Finding:
     confusable_with: tuple[str, ...]
     # Is it part of the explanation, or only an alternative, or too small to matter?
     chosen: bool
-    # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is measured, NaN where it is not known.
+    # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is
+    # measured, NaN where it is not known.
     too_small: bool = False
     share: float = np.nan
-    # Of what is chosen, where several recordings were fitted together: how far they agree, by parameter.
+    # Of what is chosen, where several recordings were fitted together: how far they agree, by
+    # parameter.
     spread: Mapping[str, Spread] = field(default_factory=dict)
 
 
@@ -79,7 +83,8 @@ class EffectStatus:
     """What this data says about one effect of the library."""
 
     verdict: EffectVerdict
-    # Parameter that says how large the effect is, its unit, and the smallest value that this data would have shown, by target.
+    # Parameter that says how large the effect is, its unit, and the smallest value that this data
+    # would have shown, by target.
     parameter: str
     unit: str
     smallest_detectable: dict[str, float]
@@ -117,16 +122,18 @@ class Diagnosis:
     unexplained: tuple[Structure, ...]
     # Explanations in the order in which they were found; the first has no effects.
     path: tuple[SelectionStep, ...]
-    # Root mean squares of the whole residual in multiples of the sensors' noise: on held-out data without and with what was chosen, and on
-    # the data that it was fitted to.
+    # Root mean squares of the whole residual in multiples of the sensors' noise: on held-out data
+    # without and with what was chosen, and on the data that it was fitted to.
     held_out_before: float
     held_out_after: float
     train_after: float
-    # Inertial parameters that were identified along, of bodies whose own are not trusted; see `IdentifyConfig`.
+    # Inertial parameters that were identified along, of bodies whose own are not trusted; see
+    # `IdentifyConfig`.
     inertia: IdentifiedInertia | None = None
     # Over what the log was averaged.
     averaging: Averaging | None = None
-    # Why the search ended before it was through; None if it was. What a partial diagnosis does not name was not ruled out.
+    # Why the search ended before it was through; None if it was. What a partial diagnosis does not
+    # name was not ruled out.
     partial: str | None = None
     # By log that was set aside: is the model with what was chosen better there? See `study` for a
     # search that goes on.
@@ -145,7 +152,8 @@ class Diagnosis:
 
 
 def plausible_effects(predictor: Predictor) -> list[type[Effect]]:
-    """The library but for what the scenario rules out, and for what acts in the joints of a log without torques."""
+    """The library but for what the scenario rules out, and for what acts in the joints of a log
+    without torques."""
     torques = "joint/torque_command" in predictor.motion.log
     known = {
         name: effect
@@ -165,8 +173,9 @@ def diagnose(
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
-    Candidates are added one after the other, each the one that leaves the least deviance on held-out data; after every addition each member
-    is tried against all others in its place. An effect counts if it beats what chance would bring once in a thousand logs.
+    Candidates are added one after the other, each the one that leaves the least deviance on
+    held-out data; after every addition each member is tried against all others in its place. An
+    effect counts if it beats what chance would bring once in a thousand logs.
 
     Args:
         effects: what is tried; by default `plausible_effects`.
@@ -238,7 +247,8 @@ class _Search:
     # Sum of squares of each row before anything is explained, (R,).
     before: np.ndarray
     inertia: IdentifiedInertia | None
-    # What is left in rows, as far as it is large enough to matter, and in which stretches it stands out.
+    # What is left in rows, as far as it is large enough to matter, and in which stretches it stands
+    # out.
     unexplained: list[Structure]
     disturbances: tuple[Disturbance, ...]
     partial: str | None

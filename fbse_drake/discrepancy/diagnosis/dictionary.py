@@ -1,4 +1,5 @@
-"""The dictionary of a log: every effect that could explain its residual, as columns that know nothing of noise."""
+"""The dictionary of a log: every effect that could explain its residual, as columns that know
+nothing of noise."""
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
@@ -57,17 +58,20 @@ class Dictionary:
         """
         self.predictor, self.progress = predictor, progress
         self.effects = [effect for effect in effects if not effect.composite]
-        # In a log per step it is not known at which velocity within the step a law holds: what such a law leaves is weak evidence.
+        # In a log per step it is not known at which velocity within the step a law holds: what such
+        # a law leaves is weak evidence.
         self.per_step = predictor.scenario.recording.rows == "per_step"
         self.joints = predictor.robot.joint_names
         self.travel = travel_of(predictor.motion.signals.joint_position)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
         self._untrusted = set(untrusted)
-        # Inertial parameters that are not trusted are fitted in every explanation, in directions that the log shows.
+        # Inertial parameters that are not trusted are fitted in every explanation, in directions
+        # that the log shows.
         self.inertia = untrusted_inertia(predictor.motion, untrusted) if untrusted else None
         if self.inertia is not None:
-            # Friction is tried as a whole: as long as half of it is missing, inertia is fitted to that half.
+            # Friction is tried as a whole: as long as half of it is missing, inertia is fitted to
+            # that half.
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
             self._look_at(self.inertia)
         self._grids: dict[type[JointTorqueEffect], np.ndarray] = {}
@@ -112,7 +116,8 @@ class Dictionary:
 
     @cached_property
     def fixed(self) -> list[FixedColumns]:
-        """All candidates that are no joint torque effects: one for each target that moves the residual."""
+        """All candidates that are no joint torque effects: one for each target that moves the
+        residual."""
         result = []
         for k, effect in enumerate(self.effects):
             self.progress("predicting what each effect would do", k / len(self.effects))
@@ -137,7 +142,8 @@ class Dictionary:
         return result
 
     def _targets(self, effect: type[Effect]) -> Sequence[str]:
-        """What an effect is tried on. Of bodies whose inertia is not trusted all is fitted anyhow."""
+        """What an effect is tried on. Of bodies whose inertia is not trusted all is fitted
+        anyhow."""
         if effect.acts_on == "body":
             suspected = effect.suspected_bodies(self.predictor.robot)
             return [body for body in suspected if body not in self._untrusted]
@@ -180,7 +186,8 @@ class Dictionary:
         return len(self._grids) / max(1, len(self.joint_effects))
 
     def _factors(self, effect: type[Effect], target: str) -> np.ndarray:
-        """What values of the nonlinear parameters at a revolute joint are multiplied with for a target, shape (m,)."""
+        """What values of the nonlinear parameters at a revolute joint are multiplied with for a
+        target, shape (m,)."""
         prismatic = self.unit.get(target) == "N"
         return np.array(
             [
@@ -202,7 +209,8 @@ class Dictionary:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """Columns for G sets of nonlinear values, (m, G) or (m, G, r), shape (B, r, p, G); see `Predictor.joint_columns`.
+        """Columns for G sets of nonlinear values, (m, G) or (m, G, r), shape (B, r, p, G); see
+        `Predictor.joint_columns`.
 
         Searches come back to the same values again and again: columns are kept.
         """

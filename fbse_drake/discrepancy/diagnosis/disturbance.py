@@ -1,7 +1,7 @@
 """Short disturbances: something pushed the robot for a moment, and never again.
 
-No law of the robot explains that, and a fit that tries to is spoilt. So stretches that stand out from
-all the rest of a row that nothing explains are left out, and said.
+No law of the robot explains that, and a fit that tries to is spoilt. So stretches that stand out
+from all the rest of a row that nothing explains are left out, and said.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,8 @@ from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 
 # Probability of any false alarm on a log of noise.
 _FALSE_ALARM = 1e-3
-# What is left in a block stands out if its square is so many times that of this quantile of its row.
+# What is left in a block stands out if its square is so many times that of this quantile of its
+# row.
 _STANDS_OUT, _USUAL = 10.0, 0.9
 # Stretches that are no further apart are one [s]; it has so many blocks that stand out, and is no
 # longer than this [s].

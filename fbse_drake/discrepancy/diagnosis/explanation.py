@@ -27,7 +27,8 @@ class Candidate:
     signature: Signature
     # The same as it is, or what makes it: it is seldom asked for.
     source: Signature | Callable[[], Signature]
-    # Drop of the deviance that it brings because the sensors' noise is in its columns and in the residual alike.
+    # Drop of the deviance that it brings because the sensors' noise is in its columns and in the
+    # residual alike.
     spurious: float = 0.0
 
     @property
@@ -55,7 +56,8 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Effects that are fitted together; their parameters stand one candidate after the other, then those of untrusted inertia."""
+    """Effects that are fitted together; their parameters stand one candidate after the other, then
+    those of untrusted inertia."""
 
     candidates: tuple[Candidate, ...]
     # None for no effects at all.
@@ -73,7 +75,8 @@ class Explanation:
         )
 
     def fitted(self, candidate: Candidate) -> tuple[list[str], np.ndarray, slice]:
-        """Names of a candidate's fitted parameters, their values (m,), and their places in the fit."""
+        """Names of a candidate's fitted parameters, their values (m,), and their places in the
+        fit."""
         names = list(candidate.linear_names)
         if issubclass(candidate.effect, JointTorqueEffect):
             names += candidate.nonlinear_names
@@ -85,7 +88,8 @@ class Explanation:
     def values(
         self, candidate: Candidate
     ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values of a candidate's parameters and their 95 % intervals, by name, within the parameters' bounds.
+        """Values of a candidate's parameters and their 95 % intervals, by name, within the
+        parameters' bounds.
 
         A nonlinear parameter that was not searched for has its plausible range as interval.
         """

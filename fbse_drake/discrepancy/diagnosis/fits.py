@@ -1,4 +1,5 @@
-"""Fits of explanations to one residual: how well effects explain it together, and what they leave."""
+"""Fits of explanations to one residual: how well effects explain it together, and what they
+leave."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -90,7 +91,8 @@ class Fits:
         self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
 
     def doubting(self, explanation: Explanation) -> tuple["Fits", Explanation]:
-        """Fits that weigh the residual anew, and an explanation in them: friction laws that it takes off make the residual noisier."""
+        """Fits that weigh the residual anew, and an explanation in them: friction laws that it
+        takes off make the residual noisier."""
         predictor = self.dictionary.predictor
         resolved = [effect.resolve(predictor.robot.description) for effect in explanation.effects]
         residual = predictor.doubted(predictor.residual, resolved)
@@ -104,7 +106,8 @@ class Fits:
 
     @cached_property
     def fixed_candidates(self) -> list[Candidate]:
-        """All candidates that are no joint torque effects: one for each target that moves the residual."""
+        """All candidates that are no joint torque effects: one for each target that moves the
+        residual."""
         result = []
         for fixed in self.dictionary.fixed:
             signature = self.white.whiten_signature(fixed.signature)
@@ -179,10 +182,12 @@ class Fits:
     def torque_factor(
         self, candidates: Sequence[Candidate], parameters: np.ndarray
     ) -> np.ndarray | float:
-        """What the squares of each row are to be multiplied with where torque is measured and effects take a share of it, (R,).
+        """What the squares of each row are to be multiplied with where torque is measured and
+        effects take a share of it, (R,).
 
-        With u = share * torque, the rest torque - u - ... is the error of the torque times 1 - share: a share near 1 would explain
-        everything. As the error of the torque itself it is the larger the more is taken.
+        With u = share * torque, the rest torque - u - ... is the error of the torque times 1 -
+        share: a share near 1 would explain everything. As the error of the torque itself it is the
+        larger the more is taken.
         """
         taking = [c for c in candidates if self.dictionary.takes_torque(c.effect)]
         if self.dictionary.per_step or not taking:
@@ -213,7 +218,8 @@ class Fits:
         return Explanation((), None, 1.0 * self.white.count, 1.0 * self.white.count, 0.0)
 
     def systematic(self, rows: np.ndarray) -> float:
-        """Drop of the deviance that doubtful laws alone may give to an effect in these rows: what is doubted need not be random."""
+        """Drop of the deviance that doubtful laws alone may give to an effect in these rows: what
+        is doubted need not be random."""
         return (
             _SYSTEMATIC * float(self.white.doubt[rows].sum()) if self.dictionary.per_step else 0.0
         )
@@ -234,7 +240,8 @@ class Fits:
         *,
         noisier: bool = False,
     ) -> ColumnSets:
-        """Sets of an effect's nonlinear values, (m, G), in one joint; if they are to be noisier, with the sensors' noise once more."""
+        """Sets of an effect's nonlinear values, (m, G), in one joint; if they are to be noisier,
+        with the sensors' noise once more."""
 
         def made() -> ColumnSets:
             columns = self.dictionary.columns(effect, np.array([place]), points, noisier=noisier)
@@ -279,7 +286,8 @@ class Fits:
             amounts = bounded_least_squares(gram, right, smallest)
 
         def linearised(columns: np.ndarray) -> np.ndarray:
-            """Columns (r, B, G, p) of the stencil: those of the amounts, then slopes for amounts that fit best; (B, r, P)."""
+            """Columns (r, B, G, p) of the stencil: those of the amounts, then slopes for amounts
+            that fit best; (B, r, P)."""
             slopes = [
                 (columns[:, :, 2 + 2 * k] - columns[:, :, 1 + 2 * k]) @ amounts / (2 * step)
                 for k, step in enumerate(steps)
@@ -287,7 +295,8 @@ class Fits:
             together = [columns[:, :, 0], *(slope[..., None] for slope in slopes)]
             return np.moveaxis(np.concatenate(together, axis=2), 0, 1)
 
-        # A weak belief in the plausible range keeps values that the data say nothing about from running away.
+        # A weak belief in the plausible range keeps values that the data say nothing about from
+        # running away.
         ranges = [np.log(parameters[name].plausible) for name in names]
         belief = [
             1.0 / (0.25 * (high - low) * value) ** 2
@@ -326,7 +335,8 @@ class Fits:
         return Candidate(effect, group, parameters, nonlinear, signature(whitened), raw, spurious)
 
     def about(self, candidate: Candidate, values: np.ndarray) -> Candidate:
-        """A candidate that is no joint torque effect, made linear about values of its linear parameters.
+        """A candidate that is no joint torque effect, made linear about values of its linear
+        parameters.
 
         Raises:
             InputError: no body has these values.

@@ -1,4 +1,5 @@
-"""Identifies inertial parameters together with plain friction: the textbook fit, without a search for what else may be missing."""
+"""Identifies inertial parameters together with plain friction: the textbook fit, without a search
+for what else may be missing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -35,11 +36,12 @@ class Identification:
     inertia: IdentifiedInertia
     # Friction and bias of each joint, then the changes of each body's inertia.
     findings: tuple[Finding, ...]
-    # By log, `train` being the one that was fitted: errors of the model as given, and of the identified one.
+    # By log, `train` being the one that was fitted: errors of the model as given, and of the
+    # identified one.
     before: dict[str, ModelError]
     after: dict[str, ModelError]
-    # Root mean square of the residual in multiples of the sensors' noise: on held-out blocks, and on
-    # those that were fitted.
+    # Root mean square of the residual in multiples of the sensors' noise: on held-out blocks, and
+    # on those that were fitted.
     held_out_rmse: float
     train_rmse: float
     # With all that in its model.
@@ -53,7 +55,8 @@ def identify(
     *,
     progress: Progress = silent,
 ) -> Identification:
-    """Identifies the inertial parameters that a scenario does not trust, with friction and bias of every joint.
+    """Identifies the inertial parameters that a scenario does not trust, with friction and bias of
+    every joint.
 
     Args:
         tests: logs that are not fitted, by name.

@@ -2,8 +2,8 @@
 
 A search adds what improves an explanation; what it added first may have become needless later, and
 chance and errors of the model make some of it look useful. So every member has to pay once more,
-beside all others; laws give way to simpler ones that they contain; and joints that agree share values.
-A law that no joint proves alone may be proven by several together.
+beside all others; laws give way to simpler ones that they contain; and joints that agree share
+values. A law that no joint proves alone may be proven by several together.
 
 Held-out data are no independent samples where what is left is correlated in time: improvements are
 divided by the number of blocks that count as one, see `blocks_per_sample`.
@@ -30,9 +30,9 @@ from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Level of the region of confidence that must not contain "no effect".
 _CONFIDENCE = 0.95
-# Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what is
-# required speaks for itself, unless it leaves more unexplained than it takes: of a row that nobody
-# explains any law takes some.
+# Intervals are wide where few stretches bear on a parameter. A held-out gain of so many times what
+# is required speaks for itself, unless it leaves more unexplained than it takes: of a row that
+# nobody explains any law takes some.
 _PLAIN = 3.0
 # Share of the upper end of a range from which on a value counts as at its end.
 _AT_THE_END = 0.98
@@ -207,9 +207,11 @@ class Judge:
         return bool(np.any((taken > 0) & (taken >= share * left)))
 
     def explained(self, explanation: Explanation) -> np.ndarray:
-        """Of which rows do the members that act on them explain at least half, beyond the noise, (R,)?
+        """Of which rows do the members that act on them explain at least half, beyond the noise,
+        (R,)?
 
-        Of a row that stays a riddle any law takes some: what takes less than it leaves is no name for it.
+        Of a row that stays a riddle any law takes some: what takes less than it leaves is no name
+        for it.
         """
         fits, members = self._fits, explanation.candidates
         result = np.ones(len(fits.white.count), dtype=bool)
@@ -237,7 +239,8 @@ def _size(explanation: Explanation) -> int:
 
 
 def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]) -> bool:
-    """Does the interval of one of the members' amounts not hold zero, or their joint region (Hotelling's T squared)?
+    """Does the interval of one of the members' amounts not hold zero, or their joint region
+    (Hotelling's T squared)?
 
     Intervals are simultaneous: of several members each is wider (Bonferroni). Of an effect that has
     one parameter and no amount, the interval of that, if zero is neutral. (With several, that they
@@ -293,7 +296,8 @@ def _is_repeated(rest: Explanation, member: Candidate) -> bool:
 
 
 def _is_beyond_its_range(member: Candidate) -> bool:
-    """Is a parameter at the upper end of a range that it cannot leave? Then something else is there."""
+    """Is a parameter at the upper end of a range that it cannot leave? Then something else is
+    there."""
     values = dict(zip(member.nonlinear_names, member.nonlinear, strict=True))
     return any(
         parameter.closed and values[name] > _AT_THE_END * parameter.plausible[1]
@@ -349,7 +353,8 @@ def _with_laws(
     member: Candidate,
     laws: Sequence[type[JointTorqueEffect]],
 ) -> Explanation | None:
-    """With laws in the place of a member that are not there yet; None if some are there for some of its targets alone."""
+    """With laws in the place of a member that are not there yet; None if some are there for some of
+    its targets alone."""
     others = [c for c in explanation.candidates if c is not member]
     result = proposals.fits.explain(others)
     for law in laws:

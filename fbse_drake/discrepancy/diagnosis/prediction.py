@@ -1,4 +1,5 @@
-"""What effects add to the residual of a log: signatures for the regression to fit, and predictions of effects whose values are known."""
+"""What effects add to the residual of a log: signatures for the regression to fit, and predictions
+of effects whose values are known."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -49,17 +50,21 @@ from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.sensors.foot_force import force_noise
 
-# Joint velocities are smoothed over this many samples, without delay, where friction laws take them.
+# Joint velocities are smoothed over this many samples, without delay, where friction laws take
+# them.
 _SMOOTHING = 9
-# What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change within the step, squared.
+# What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change
+# within the step, squared.
 _LAW_DOUBT = 8.0
-# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times it.
+# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
+# it.
 _SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
 _EVALUATIONS = 8
-# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of those that we did.
+# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
+# those that we did.
 _EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
@@ -145,7 +150,8 @@ class Predictor:
     def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
         """A residual that is less certain because effects were taken off it.
 
-        Friction laws are doubtful, see `law_variance`, and the sinking of soles is predicted from forces that are measured with noise.
+        Friction laws are doubtful, see `law_variance`, and the sinking of soles is predicted from
+        forces that are measured with noise.
         """
         effects = list(effects)
         doubt = np.zeros_like(residual.variance)
@@ -162,7 +168,8 @@ class Predictor:
 
     @cached_property
     def sinking_variance(self) -> np.ndarray:
-        """What the noise of the force sensors puts into the predicted sinking of the soles, per unit of compliance squared, (R,).
+        """What the noise of the force sensors puts into the predicted sinking of the soles, per
+        unit of compliance squared, (R,).
 
         Of a noise that is added to the measured forces once more.
         """
@@ -186,9 +193,9 @@ class Predictor:
     def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
         """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
 
-        A law of the velocity does not say at which velocity within a step it holds: its torque is uncertain by its slope times what the
-        velocity changes in the step. This counts where a sticking joint trembles. Of rows that are sampled at an instant
-        nothing is doubted.
+        A law of the velocity does not say at which velocity within a step it holds: its torque is
+        uncertain by its slope times what the velocity changes in the step. This counts where a
+        sticking joint trembles. Of rows that are sampled at an instant nothing is doubted.
         """
         motion, joint_motion = self.motion, self.joint_motion
         if motion.recording.rows == "instantaneous":
@@ -203,7 +210,8 @@ class Predictor:
         return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
 
     def predict(self, effect: ResolvedEffect) -> np.ndarray:
-        """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are in the residual already."""
+        """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are
+        in the residual already."""
         result = np.zeros((len(self.motion.time), self.rows))
         if issubclass(effect.effect, JointTorqueEffect):
             columns = self.joint_columns(
@@ -268,7 +276,8 @@ class Predictor:
 
     @cached_property
     def _loss(self) -> np.ndarray:
-        """What the links do not get of the command by the rigid model, smoothed over three blocks, step by step, (N - 1, n)."""
+        """What the links do not get of the command by the rigid model, smoothed over three blocks,
+        step by step, (N - 1, n)."""
         motion, n = self.motion, len(self.robot.joint_names)
         loss = _smooth(motion.residual.value[:, :n])
         time = (
@@ -315,7 +324,8 @@ class Predictor:
         return np.concatenate(parts, axis=1)
 
     def _averages(self, columns: np.ndarray, step: int) -> np.ndarray:
-        """Averages over blocks of columns (..., M, T) that were evaluated once for so many steps, all at once."""
+        """Averages over blocks of columns (..., M, T) that were evaluated once for so many steps,
+        all at once."""
         first = np.moveaxis(columns, -2, 0)
         if step > 1:
             return np.moveaxis(block_means(first, self.motion.length // step), 0, -2)
@@ -323,7 +333,8 @@ class Predictor:
 
     @property
     def _joined_steps(self) -> int:
-        """How many steps may be averaged before a law is evaluated: in long blocks a law is evaluated often enough all the same."""
+        """How many steps may be averaged before a law is evaluated: in long blocks a law is
+        evaluated often enough all the same."""
         motion = self.motion
         if motion.recording.recorded_cutoff > 0:
             return 1
@@ -366,8 +377,9 @@ class Predictor:
         return self._smoothed(self.motion.blocks)
 
     def _smoothed(self, blocks: Instants) -> Instants:
-        """Averages with accelerations that are smoothed further, for their noise is in the residual too. Not those of a recording that is
-        low-passed: little noise is left in them, and smoothing would take motion."""
+        """Averages with accelerations that are smoothed further, for their noise is in the residual
+        too. Not those of a recording that is low-passed: little noise is left in them, and
+        smoothing would take motion."""
         if self.motion.recording.cutoff > 0:
             return blocks
         smooth = {
@@ -420,7 +432,8 @@ class Predictor:
         return effect.expansion_point(self.robot.body(target))
 
     def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
-        """What that noise adds to the signature of an inertia effect: regressors are measured too."""
+        """What that noise adds to the signature of an inertia effect: regressors are measured
+        too."""
         point = self._expansion_point(effect, target)
         if point is not None:
             values, _ = self._slopes(effect, target, point, np.zeros(0), noisier=True)
@@ -480,7 +493,8 @@ class Predictor:
         nonlinear: np.ndarray,
         elsewhere: Signature,
     ) -> Signature:
-        """The signature of an inertia, geometry or sensor effect about values of its parameters, for what it adds is not quite linear.
+        """The signature of an inertia, geometry or sensor effect about values of its parameters,
+        for what it adds is not quite linear.
 
         Args:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
@@ -523,8 +537,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """What an inertia, geometry or sensor effect with these values adds to the residual, (B, R); an inertia effect also if the
-        sensors' noise were in its regressors once more."""
+        """What an inertia, geometry or sensor effect with these values adds to the residual, (B,
+        R); an inertia effect also if the sensors' noise were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -552,16 +566,19 @@ class Predictor:
         )
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
-        """What an effect remembers over the log. It depends on the nonlinear parameters alone, where `undone` needs it."""
+        """What an effect remembers over the log. It depends on the nonlinear parameters alone,
+        where `undone` needs it."""
         key = (effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
             self._memories[key] = self._remembered(resolved)
         return self._memories[key]
 
     def _remembered(self, effect: ResolvedEffect) -> np.ndarray:
-        """What an effect remembers over the log, of torques without their white noise: it would become an acceleration.
+        """What an effect remembers over the log, of torques without their white noise: it would
+        become an acceleration.
 
-        A simulation of ours begins with no memory; any other log begins as if it had always been as it is then.
+        A simulation of ours begins with no memory; any other log begins as if it had always been as
+        it is then.
         """
         motion, signals = self.motion, self.motion.signals
         torque = signals.torque_command
@@ -661,8 +678,8 @@ class Predictor:
 
     @cached_property
     def _contact_rotations(self) -> list[np.ndarray]:
-        """Axes of each foot's contact in every block, (B, 3, 3), in base axes: those of its sole; of
-        a point foot, which stands at any angle, level ones."""
+        """Axes of each foot's contact in every block, (B, 3, 3), in base axes: those of its sole;
+        of a point foot, which stands at any angle, level ones."""
         rotations = self.motion.equation.sole_rotations(self.motion.blocks.joint_position)
         for foot in self._point_feet:
             rotations[foot] = np.broadcast_to(self._level, rotations[foot].shape)
@@ -680,7 +697,8 @@ class Predictor:
 
     @cached_property
     def _level(self) -> np.ndarray:
-        """R_BL of axes whose z is up in the mean over the log; a base without tilt has them itself."""
+        """R_BL of axes whose z is up in the mean over the log; a base without tilt has them
+        itself."""
         motion = self.motion
         up = motion.equation.R_BI @ motion.signals.specific_force.mean(axis=0)
         return RotationMatrix.MakeFromOneVector(up, 2).matrix()
@@ -692,7 +710,8 @@ class Predictor:
         )
 
     def ground_gives_way(self) -> np.ndarray:
-        """What the model's own ground adds: it gives way a little under the soles and lets them creep, (B, R)."""
+        """What the model's own ground adds: it gives way a little under the soles and lets them
+        creep, (B, R)."""
         sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
 
@@ -736,7 +755,8 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _without_rounding(values: np.ndarray) -> np.ndarray:
-    """Columns (..., p) in which nothing but the rounding of the others is left, made zero: they would ask for boundless parameters."""
+    """Columns (..., p) in which nothing but the rounding of the others is left, made zero: they
+    would ask for boundless parameters."""
     largest = np.abs(values).max(axis=tuple(range(values.ndim - 1)))
     return np.where(largest > _ROUNDING * largest.max(), values, 0.0)
 

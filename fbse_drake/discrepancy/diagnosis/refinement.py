@@ -1,4 +1,5 @@
-"""What becomes of an explanation that is taken at its word: linear about its own values, with possible bodies, added to the model."""
+"""What becomes of an explanation that is taken at its word: linear about its own values, with
+possible bodies, added to the model."""
 
 from dataclasses import replace
 
@@ -120,7 +121,8 @@ def consistent(
 
 
 def remeasured(fits: Fits) -> Fits:
-    """Fits in which what the log says clearly of untrusted bodies is not held back by the belief in the model.
+    """Fits in which what the log says clearly of untrusted bodies is not held back by the belief in
+    the model.
 
     Plain friction is fitted along; see `inertial` for bodies that are in conflict with the model.
     """
@@ -136,11 +138,11 @@ def remeasured(fits: Fits) -> Fits:
 
 
 def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedResidual, np.ndarray]:
-    """An explanation when its inertia, geometry and sensor effects are in the model, where it has any; the residual that is
-    measured by; and what is left of it, whitened, (B, R).
+    """An explanation when its inertia, geometry and sensor effects are in the model, where it has
+    any; the residual that is measured by; and what is left of it, whitened, (B, R).
 
-    An impact shows a heavy foot's mass only if accelerations are not smoothed, noise grows with the masses, and which soles stand is
-    seen when the forces are set right.
+    An impact shows a heavy foot's mass only if accelerations are not smoothed, noise grows with the
+    masses, and which soles stand is seen when the forces are set right.
     """
     if fits.dictionary.inertia is not None or not any(
         issubclass(c.effect, InertiaEffect | GeometryEffect | SensorEffect)

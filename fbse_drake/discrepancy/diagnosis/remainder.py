@@ -22,7 +22,8 @@ class _Beside:
     # Of each column, 1 for an offset, (Q,); and which have a parameter.
     amounts: np.ndarray
     fitted: np.ndarray
-    # Of the fitted columns X: a root of what stands for (X^T X)^-1, (P, k), and what a fit to what is left would change in the parameters.
+    # Of the fitted columns X: a root of what stands for (X^T X)^-1, (P, k), and what a fit to what
+    # is left would change in the parameters.
     root: np.ndarray
     shift: np.ndarray
 
@@ -35,9 +36,10 @@ class _Beside:
 class Remainder:
     """What an explanation leaves.
 
-    Of new columns x in one row its columns X there leave x - X (X^T X)^-1 X^T x. Columns of inertia however tie all
-    rows together: with all columns X, rows one below the other and weighted, new columns in row r keep
-    x^T x - x^T X_r (X^T X)^-1 X_r^T x of their sum of squares.
+    Of new columns x in one row its columns X there leave x - X (X^T X)^-1 X^T x. Columns of inertia
+    however tie all
+    rows together: with all columns X, rows one below the other and weighted, new columns in row r
+    keep x^T x - x^T X_r (X^T X)^-1 X_r^T x of their sum of squares.
     """
 
     def __init__(
@@ -71,8 +73,8 @@ class Remainder:
         return self._rows[row]
 
     def moments(self, signature: Signature, place: int) -> tuple[np.ndarray, np.ndarray]:
-        """Inner products of a signature's columns in one of its rows, with each other (p, p) and with what is left (p,), of the parts that
-        the explanation leaves."""
+        """Inner products of a signature's columns in one of its rows, with each other (p, p) and
+        with what is left (p,), of the parts that the explanation leaves."""
         within = self._regression.products(signature, signature)[2][place]
         gram, right = self.moments_of_sets(signature, place, within[None])
         return gram[0], right[0]
@@ -129,7 +131,8 @@ class Remainder:
     def _row_moments(
         self, row: int, signatures: tuple[Signature, ...]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inner products of an explanation's columns in a row with each other and with the residual; which have a parameter."""
+        """Inner products of an explanation's columns in a row with each other and with the
+        residual; which have a parameter."""
         places = [int(np.flatnonzero(s.rows == row)[0]) for s in signatures]
         rights = [
             self._regression.target(s)[:, place].sum(axis=0)
@@ -154,7 +157,8 @@ class Remainder:
 
     @cached_property
     def _of_all(self) -> tuple[np.ndarray, np.ndarray]:
-        """(X^T X)^-1 of all columns in all rows, weighted, and what a fit without any prior would change in the parameters."""
+        """(X^T X)^-1 of all columns in all rows, weighted, and what a fit without any prior would
+        change in the parameters."""
         size = len(self._parameters)
         gram, left = np.zeros((size, size)), np.zeros(size)
         for row in range(len(self.scale)):

@@ -1,6 +1,8 @@
-"""Which findings matter: their size beside the torques, forces and motions of the rows that they are in.
+"""Which findings matter: their size beside the torques, forces and motions of the rows that they
+are in.
 
-What is significant statistically may be too small for anybody to care: long logs with little noise show a millionth of a radian.
+What is significant statistically may be too small for anybody to care: long logs with little noise
+show a millionth of a radian.
 """
 
 import numpy as np
@@ -18,8 +20,8 @@ class Significance:
     def __init__(self, predictor: Predictor):
         """Measures the log.
 
-        Joint rows are measured by their torque, base rows by what the feet give, those of soles by how fast single joints turn and
-        move them, and by gravity.
+        Joint rows are measured by their torque, base rows by what the feet give, those of soles by
+        how fast single joints turn and move them, and by gravity.
         """
         motion, equation = predictor.motion, predictor.motion.equation
         blocks, rows = motion.blocks, motion.residual.rows
@@ -41,7 +43,8 @@ class Significance:
                 self._sizes[[kind in row.name for row in rows]] = size
 
     def share(self, explanation: Explanation, candidate: Candidate) -> float:
-        """Largest root mean square of what a member of an explanation adds to a row, as a share of its size; NaN if no row has one."""
+        """Largest root mean square of what a member of an explanation adds to a row, as a share of
+        its size; NaN if no row has one."""
         start, raw = explanation.start(candidate), candidate.raw
         parameters = explanation.fit.parameters[start : start + raw.values.shape[2]]
         added = rms(raw.values @ parameters + raw.offset, self._known[:, raw.rows])
@@ -50,7 +53,8 @@ class Significance:
         return float((added[measured] / sizes[measured]).max()) if measured.any() else np.nan
 
     def left_share(self, structure: Structure, white: WhitenedResidual) -> float:
-        """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it has none."""
+        """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it
+        has none."""
         noise = white.residual.noise_floor[structure.index]
         return float(
             np.sqrt(max(structure.ratio**2 - 1.0, 0.0)) * noise / self._sizes[structure.index]

@@ -87,7 +87,8 @@ def _fitted_to(fits: Fits, explanation: Explanation, inside: np.ndarray) -> Expl
 
 
 def _told(explanation: Explanation, member: Candidate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values of a member's parameters, their standard deviations and degrees of freedom, (m,) each."""
+    """Values of a member's parameters, their standard deviations and degrees of freedom, (m,)
+    each."""
     _, values, part = explanation.fitted(member)
     assert explanation.fit is not None
     spread = explanation.fit.spread

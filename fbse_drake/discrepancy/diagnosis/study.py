@@ -27,9 +27,11 @@ from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.scenario import Scenario
 from fbse_drake.walking.reference import Recorded
 
-# Share by which a later round must lower the held-out error: the first one finds what there is, the others mend what is not linear.
+# Share by which a later round must lower the held-out error: the first one finds what there is, the
+# others mend what is not linear.
 _LEAST_GAIN = 0.01
-# The same where no more than the sensors' noise was left: what is found there is mostly noise, unless more noise is believed than there is.
+# The same where no more than the sensors' noise was left: what is found there is mostly noise,
+# unless more noise is believed than there is.
 _LEAST_GAIN_IN_NOISE = 0.1
 # Less of a log than this many blocks is not set aside.
 _SHORTEST_REST = 40
@@ -38,7 +40,8 @@ _MOST_ROUNDS = 4
 
 
 def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
-    """The share of a log that models are fitted to, and the rest; see `RecordingConfig.train_share`.
+    """The share of a log that models are fitted to, and the rest; see
+    `RecordingConfig.train_share`.
 
     The rest is None, and all of the log is fitted, where it would be too short to be read.
     """
@@ -52,7 +55,8 @@ def train_and_rest(scenario: Scenario, log: Log) -> tuple[Log, Log | None]:
 
 @dataclass(frozen=True)
 class StudyStep:
-    """The model after an addition. Errors of the residual are root mean squares in multiples of the sensors' noise."""
+    """The model after an addition. Errors of the residual are root mean squares in multiples of the
+    sensors' noise."""
 
     added: tuple[Finding, ...]
     held_out_rmse: float
@@ -186,7 +190,8 @@ def study(
 
 
 def is_better(model: Predictor, other: Predictor) -> bool:
-    """Does a model leave less of a log than another, every row measured by how much it has improved?
+    """Does a model leave less of a log than another, every row measured by how much it has
+    improved?
 
     By the likelihood of both with the noise of the other, so that a row with a large error does not
     decide alone.

@@ -1,4 +1,5 @@
-"""Errors of models: is a completed one better on data that was set aside before anything was looked at?
+"""Errors of models: is a completed one better on data that was set aside before anything was looked
+at?
 
 Both models are put against the same blocks, weighted by the same noise, so that what both do not
 know cancels in the change of the error. Its intervals are those of a ratio of sums by batch means:
@@ -36,11 +37,13 @@ class Measured:
 class Validation:
     """Errors of a model as given and completed on one log that nothing was fitted to."""
 
-    # Root mean square of all rows in multiples of the sensors' noise, and the second over the first.
+    # Root mean square of all rows in multiples of the sensors' noise, and the second over the
+    # first.
     before: Measured
     after: Measured
     change: Measured
-    # |residual| / |torque|, 2-norms over all joints, and the second over the first; NaN without torques.
+    # |residual| / |torque|, 2-norms over all joints, and the second over the first; NaN without
+    # torques.
     relative_before: Measured
     relative_after: Measured
     relative_change: Measured

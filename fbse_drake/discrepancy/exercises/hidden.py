@@ -1,4 +1,5 @@
-"""Blind exercises: the log of a robot with physics that its model lacks, the answer sealed, and a score for whoever finds it."""
+"""Blind exercises: the log of a robot with physics that its model lacks, the answer sealed, and a
+score for whoever finds it."""
 
 import base64
 import hashlib
@@ -102,7 +103,8 @@ def _sharp(draw: Draw) -> dict[str, float]:
     return {"transition": draw.between(0.005, 0.02)}
 
 
-# The paper's robot still walks with the largest sizes on most joints; the smallest are near what its walk can show.
+# The paper's robot still walks with the largest sizes on most joints; the smallest are near what
+# its walk can show.
 _RECIPES = {
     "TorqueGain": Recipe((0.01, 0.2), _signed("shortfall")),
     "TorqueBias": Recipe((1.0, 10.0), _signed("bias")),
@@ -198,7 +200,8 @@ _RECIPES = {
 
 
 def _recipe(effect: type[Effect]) -> Recipe:
-    """The recipe of an effect; one of a user's own gets a tenth to a half of the largest plausible value."""
+    """The recipe of an effect; one of a user's own gets a tenth to a half of the largest plausible
+    value."""
     if effect.__name__ in _RECIPES:
         return _RECIPES[effect.__name__]
     name, parameter = next(iter(effect.parameters.items()))
@@ -287,10 +290,13 @@ def draw(
     Args:
         scenario: whose robot it is hidden in.
         seed: the same seed hides the same.
-        what: `any` of what follows (one in eight hides nothing, one in eight a stranger), `library` for effects of the library, `decoy`
-            for none, `stranger` for one that the library does not have, or the name of an effect or stranger.
-        size: a third of the sizes of each effect's recipe (in logarithms); by default drawn as well.
-        count: how many different effects, where the library's are drawn; if more than one, each on one joint.
+        what: `any` of what follows (one in eight hides nothing, one in eight a stranger), `library`
+            for effects of the library, `decoy` for none, `stranger` for one that the library does
+            not have, or the name of an effect or stranger.
+        size: a third of the sizes of each effect's recipe (in logarithms); by default drawn as
+            well.
+        count: how many different effects, where the library's are drawn; if more than one, each on
+            one joint.
         shrunk: factor on all sizes.
 
     Raises:
@@ -366,7 +372,8 @@ def _hidden_effect(
 
 
 def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
-    """Can the robot have it? In a gantry, only in its joints; feet creep only if the contact solver lets them."""
+    """Can the robot have it? In a gantry, only in its joints; feet creep only if the contact solver
+    lets them."""
     if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in (
         "lagged",
         "similar",
@@ -383,7 +390,8 @@ def _targets(
     *,
     alone: bool,
 ) -> tuple[str, ...]:
-    """One target, none of those taken; or, unless it is to be alone, a joint of every leg, or all joints."""
+    """One target, none of those taken; or, unless it is to be alone, a joint of every leg, or all
+    joints."""
     names = robot.description
     if effect.acts_on == "robot":
         return ("robot",)
@@ -505,7 +513,8 @@ def unseal(text: str) -> Answer:
 
 
 def reveal(folder: Path) -> "Revealed":
-    """Opens the answer of an exercise; scores the diagnosis or study in the same folder, if there is one.
+    """Opens the answer of an exercise; scores the diagnosis or study in the same folder, if there
+    is one.
 
     Raises:
         InputError: no exercise, a damaged answer or diagnosis.
@@ -534,17 +543,21 @@ def reveal(folder: Path) -> "Revealed":
 class Score:
     """How good a diagnosis of an exercise is."""
 
-    # Does the verdict fit? `effect_found` for effects of the library, `unknown_effect` for a stranger; a decoy has nothing missing.
+    # Does the verdict fit? `effect_found` for effects of the library, `unknown_effect` for a
+    # stranger; a decoy has nothing missing.
     verdict: bool
-    # By hidden effect of the library: was it found, or an effect that is declared to say the same; and on exactly its targets?
+    # By hidden effect of the library: was it found, or an effect that is declared to say the same;
+    # and on exactly its targets?
     found: dict[str, bool]
     confusable: dict[str, bool]
     targets: dict[str, bool]
     # Is the first of the ranking hidden?
     first: bool
-    # Effects that the diagnosis chose although they are not hidden, nor said to be confusable with one that is.
+    # Effects that the diagnosis chose although they are not hidden, nor said to be confusable with
+    # one that is.
     wrong: tuple[str, ...]
-    # Does the interval hold the true value? By effect, target and parameter, of what was found; one target for a shared value.
+    # Does the interval hold the true value? By effect, target and parameter, of what was found; one
+    # target for a shared value.
     covered: dict[str, bool]
     # For a stranger: are exactly its joints said to have something unexplained?
     joints: bool
@@ -595,7 +608,8 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
     chosen = [
         finding for diagnosis in diagnoses for finding in diagnosis["ranking"] if finding["chosen"]
     ]
-    # What is small and said to be so is found, too; but who names something too small to matter claims nothing.
+    # What is small and said to be so is found, too; but who names something too small to matter
+    # claims nothing.
     small = [
         finding
         for diagnosis in diagnoses

@@ -1,4 +1,5 @@
-"""Effects that the library does not have. Blind exercises hide them, to see whether the diagnosis admits that it does not know."""
+"""Effects that the library does not have. Blind exercises hide them, to see whether the diagnosis
+admits that it does not know."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,8 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise
 # Velocity over which friction changes its sign [rad/s].
 _TRANSITION = 0.01
 _SHARP = Rise(speeds=(np.array(_TRANSITION),))
-# Frequencies of the two waves that make dropouts look random [Hz]; their ratio is that of the golden section.
+# Frequencies of the two waves that make dropouts look random [Hz]; their ratio is that of the
+# golden section.
 _DROPOUT_FREQUENCIES = (1.9, 1.9 * (1 + 5**0.5) / 2)
 # The torque drops while the sum of the two waves is above this.
 _DROPOUT_LEVEL = 1.7
@@ -21,7 +23,8 @@ _DROPOUT_LEVEL = 1.7
 
 @dataclass(frozen=True)
 class TorqueHum(JointTorqueEffect):
-    """A torque that swings in time, whatever the joint does: u = amplitude sin(2 pi frequency t)."""
+    """A torque that swings in time, whatever the joint does: u = amplitude sin(2 pi frequency
+    t)."""
 
     description: ClassVar[str] = "A torque of fixed frequency, as from a fan or the mains."
     signature: ClassVar[str] = "One line in the spectrum."
@@ -43,7 +46,8 @@ class TorqueHum(JointTorqueEffect):
 
 @dataclass(frozen=True)
 class NeighbourTorque(JointTorqueEffect):
-    """Some of the torque that is commanded to the joint before it in the order of the joints: u = share * command of the neighbour."""
+    """Some of the torque that is commanded to the joint before it in the order of the joints: u =
+    share * command of the neighbour."""
 
     description: ClassVar[str] = (
         "A joint feels the torque of its neighbour, as through crossed wires or a coupled gear."
@@ -66,7 +70,8 @@ class NeighbourTorque(JointTorqueEffect):
 
 @dataclass(frozen=True)
 class UnevenFriction(JointTorqueEffect):
-    """Coulomb friction that changes along the way: u = coulomb (1 + unevenness sin(3 q)) tanh(w / 0.01 rad/s)."""
+    """Coulomb friction that changes along the way: u = coulomb (1 + unevenness sin(3 q)) tanh(w /
+    0.01 rad/s)."""
 
     description: ClassVar[str] = "Friction that depends on the angle, as of a bent shaft."
     signature: ClassVar[str] = (
@@ -96,7 +101,8 @@ class UnevenFriction(JointTorqueEffect):
 
 @dataclass(frozen=True)
 class TorqueDropouts(JointTorqueEffect):
-    """The motor lacks a share of the commanded torque for moments that seem to come at random: u = depth * command, or 0 between them."""
+    """The motor lacks a share of the commanded torque for moments that seem to come at random: u =
+    depth * command, or 0 between them."""
 
     description: ClassVar[str] = "The motor fails for moments, as from a loose contact."
     signature: ClassVar[str] = "Torque in proportion to the command, now and then."
@@ -120,7 +126,8 @@ class TorqueDropouts(JointTorqueEffect):
 
 @dataclass(frozen=True)
 class RoughSpot(JointTorqueEffect):
-    """Friction about one angle only: u = coulomb exp(-((q - angle) / width)^2) tanh(w / 0.01 rad/s)."""
+    """Friction about one angle only: u = coulomb exp(-((q - angle) / width)^2) tanh(w / 0.01
+    rad/s)."""
 
     description: ClassVar[str] = "A joint that sticks at one angle, as from a dent in a bearing."
     signature: ClassVar[str] = "Torque against the motion within a small range of angles."

@@ -1,4 +1,5 @@
-"""Checks of a recording's channels by themselves: clock, stuck, clipped, held, coarse, filtered and noisy channels."""
+"""Checks of a recording's channels by themselves: clock, stuck, clipped, held, coarse, filtered and
+noisy channels."""
 
 from collections.abc import Iterable
 
@@ -24,12 +25,13 @@ _MANY_GAPS = 0.1
 _STUCK, _STUCK_SAMPLES = 0.25, 20
 # How long a filtered velocity runs on after its joint [s].
 _SETTLING = 0.1
-# A velocity that adds up to less than this while an angle rests, and to less than an offset of the velocity would, says nothing
-# [rad or m, rad/s or m/s].
+# A velocity that adds up to less than this while an angle rests, and to less than an offset of the
+# velocity would, says nothing [rad or m, rad/s or m/s].
 _FAR, _VELOCITY_OFFSET = 0.02, 0.02
 # White noise stays within so many of its standard deviations.
 _NOISE_WIDTH = 10.0
-# Shortest run at its largest value of a channel that is clipped [samples], and the share of the log that such runs need.
+# Shortest run at its largest value of a channel that is clipped [samples], and the share of the log
+# that such runs need.
 _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
 # A channel whose neighbouring samples are equal this often is sampled more slowly than the log.
 _REPEATED = 0.2
@@ -79,7 +81,8 @@ def _runs(equal: np.ndarray) -> np.ndarray:
 
 
 def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """A channel that repeats itself exactly while the robot moves; one of a joint, while that joint moves."""
+    """A channel that repeats itself exactly while the robot moves; one of a joint, while that joint
+    moves."""
     least = max(_STUCK_SAMPLES, round(_STUCK / evidence.period))
     position = evidence.log["joint/position"]
     # Farther than steps and noise of the encoder.
@@ -103,7 +106,8 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
             )
             columns = [k] if name.startswith("joint/") else list(range(len(evidence.joints)))
             travel = travelled[:, columns]
-            # A velocity that was filtered still runs on for a while after its joint has come to rest.
+            # A velocity that was filtered still runs on for a while after its joint has come to
+            # rest.
             late = settling if name == "joint/position" else 0
             runs = [(a, b) for a, b in _runs(np.diff(values[:, k]) == 0) if b - a >= least + late]
             # Farther than what an offset of a velocity adds up to.
@@ -221,7 +225,8 @@ def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 
 def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
-    """White noise of the sensors, for `sensors:` and `recording:` of a scenario: from differences of high order, which motion hardly has.
+    """White noise of the sensors, for `sensors:` and `recording:` of a scenario: from differences
+    of high order, which motion hardly has.
 
     A filtered channel has less noise than its sensor.
     """
@@ -253,8 +258,8 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
 
 
 def white_noise(motion: RecordedMotion, values: np.ndarray) -> np.ndarray:
-    """White noise of each component of a channel (N, components): standard deviation in the quiet parts of the log, which have no
-    impacts; NaN where it has none."""
+    """White noise of each component of a channel (N, components): standard deviation in the quiet
+    parts of the log, which have no impacts; NaN where it has none."""
     whole = (
         np.convolve(np.diff(motion.log.time) < 1.5 * motion.period, np.ones(_DIFFERENCE), "valid")
         == _DIFFERENCE

@@ -1,7 +1,9 @@
-"""Can a recording be believed? What is wrong with its clocks, channels, units and frames, before anybody looks for physics in it.
+"""Can a recording be believed? What is wrong with its clocks, channels, units and frames, before
+anybody looks for physics in it.
 
-A log that makes the equation of motion meaningless is refused (`sanity.check_sensors`). What is found here says what of a diagnosis is
-not to be believed; torques that are not to be trusted are not explained (`Hygiene.trusted`).
+A log that makes the equation of motion meaningless is refused (`sanity.check_sensors`). What is
+found here says what of a diagnosis is not to be believed; torques that are not to be trusted are
+not explained (`Hygiene.trusted`).
 """
 
 from collections.abc import Sequence
@@ -31,7 +33,8 @@ _ORDER = ("untrustworthy", "warning", "note")
 
 @dataclass(frozen=True)
 class Hygiene:
-    """Everything that is remarkable about a recording, worst first, and the noise of its channels."""
+    """Everything that is remarkable about a recording, worst first, and the noise of its
+    channels."""
 
     findings: tuple[HygieneFinding, ...] = ()
     noise: tuple[NoiseLevel, ...] = ()
@@ -41,10 +44,12 @@ class Hygiene:
         return [finding for finding in self.findings if finding.severity == "untrustworthy"]
 
     def untrusted_joints(self, identified: Sequence[str] = ()) -> list[str]:
-        """Joints whose torque, or whose place among the joints, is not to be trusted at any time; `*` for all.
+        """Joints whose torque, or whose place among the joints, is not to be trusted at any time;
+        `*` for all.
 
         Args:
-            identified: bodies whose inertia is not trusted: with them no scale of a torque is known.
+            identified: bodies whose inertia is not trusted: with them no scale of a torque is
+                known.
         """
         kinds = [kind for kind in _WHOLE_LOG if not (identified and kind == "torque_scale")]
         found = [
@@ -80,7 +85,8 @@ def inspect(motion: RecordedMotion, noise: Noise | None = None) -> Hygiene:
     """Inspects a recording; no findings for one in which all is well.
 
     Args:
-        motion: the log, seen by the model. Works for fixed and floating bases, with and without torques.
+        motion: the log, seen by the model. Works for fixed and floating bases, with and without
+            torques.
         noise: what the log shows of the rows' noise, where that is to be said.
     """
     evidence = Evidence(motion)

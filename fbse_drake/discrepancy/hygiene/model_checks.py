@@ -1,4 +1,5 @@
-"""Checks of a recording's channels against each other and against the model: clocks, torques, swapped joints, weight and gravity."""
+"""Checks of a recording's channels against each other and against the model: clocks, torques,
+swapped joints, weight and gravity."""
 
 import itertools
 from collections.abc import Iterable
@@ -28,25 +29,30 @@ from fbse_drake.discrepancy.residual.evidence import (
 )
 from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, rms
 
-# Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation from which on a delay can be told.
+# Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation
+# from which on a delay can be told.
 _LARGEST_OFFSET, _SMALLEST_OFFSET, _CORRELATED = 20, 1.5, 0.7
 # Moments of feet are smoothed over so many samples before they are differenced.
 _SMOOTHED = 11
-# What a delay or a low-pass must take off the mismatch of two channels to be named, as a share of its sum of squares.
+# What a delay or a low-pass must take off the mismatch of two channels to be named, as a share of
+# its sum of squares.
 _WORTHWHILE = 0.1
 # Root mean square rate of a joint that moves well [rad/s or m/s].
 _MOVING = 0.05
 # Two swapped joints leave at most this share of the squared residual when they are swapped back.
 _SWAPPED = 0.5
 _SWAP_BLOCKS = 40
-# Static checks: share of the weight, tilt of the force [rad], share of gravity, share of the weight on a foot in the air.
+# Static checks: share of the weight, tilt of the force [rad], share of gravity, share of the weight
+# on a foot in the air.
 _WEIGHT, _TILT, _GRAVITY, _AIR = 0.02, 0.025, 0.01, 0.01
-# Fewest blocks from which something is said of a foot, and how long it takes a foot to read nothing after it is lifted [s].
+# Fewest blocks from which something is said of a foot, and how long it takes a foot to read nothing
+# after it is lifted [s].
 _FEWEST, _SETTLED = 20, 0.1
 
 
 def _offset(x: np.ndarray, y: np.ndarray, inside: np.ndarray | None = None) -> tuple[float, float]:
-    """By how many samples y comes later than x, and the correlation of the two then; columns (M, k) count by their power.
+    """By how many samples y comes later than x, and the correlation of the two then; columns (M, k)
+    count by their power.
 
     Args:
         inside: samples of x that count, (M,).
@@ -87,7 +93,8 @@ def _clock(
 
 
 def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """Angles and velocities of one joint are the same motion: what is between them is between their clocks."""
+    """Angles and velocities of one joint are the same motion: what is between them is between their
+    clocks."""
     if "joint/velocity" not in evidence.log:
         return
     velocity = evidence.log["joint/velocity"]
@@ -103,8 +110,8 @@ def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 
 def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """While a sole stands, its leg tells how the base turns. So does a sole that rolls or gives way, or an angle that is read too much,
-    look like a clock."""
+    """While a sole stands, its leg tells how the base turns. So does a sole that rolls or gives
+    way, or an angle that is read too much, look like a clock."""
     if not evidence.robot.has_floating_base:
         return
     motion, at = evidence.motion, evidence.instants
@@ -128,7 +135,8 @@ def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
 def _is_late(
     evidence: Evidence, by_legs: np.ndarray, gyro: np.ndarray, stands: np.ndarray, samples: int
 ) -> bool:
-    """Is a gyro (M, 3) so many samples late for sure, whatever mixes its axes and however soles turn with their moments?"""
+    """Is a gyro (M, 3) so many samples late for sure, whatever mixes its axes and however soles
+    turn with their moments?"""
     motion = evidence.motion
     moments = np.hstack([w[:, :3] for w in motion.equation.wrenches(evidence.instants.pad_force)])
     turning = uniform_filter1d(np.gradient(moments, axis=0), _SMOOTHED, axis=0)
@@ -150,7 +158,8 @@ def _is_late(
 
 
 def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """Forces under the feet against what the masses need: do they come late, as by a clock, or as by a low-pass of first order?"""
+    """Forces under the feet against what the masses need: do they come late, as by a clock, or as
+    by a low-pass of first order?"""
     if not evidence.robot.has_floating_base or len(evidence.instants.joint_position) < SPECTRUM:
         return
     # Impacts are vertical.
@@ -259,8 +268,9 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 
 def _fits_better(evidence: Evidence, other: Instants, places: list[int]) -> bool:
-    """Do the torques of some joints fit significantly better in another order, and none of them worse, whatever friction, inertia or
-    offsets they may have? Without torques there is nothing to doubt it by."""
+    """Do the torques of some joints fit significantly better in another order, and none of them
+    worse, whatever friction, inertia or offsets they may have? Without torques there is nothing to
+    doubt it by."""
     if "joint/torque_command" not in evidence.log:
         return True
     recorded, rival = JointTorques(evidence), JointTorques(evidence, other)
@@ -275,7 +285,8 @@ def _fits_better(evidence: Evidence, other: Instants, places: list[int]) -> bool
 
 
 def _zero_prediction(motion: RecordedMotion, at: Instants) -> np.ndarray:
-    """What the rows would be without a model: torques, wrench of the feet; the scale of each row. (B, R)"""
+    """What the rows would be without a model: torques, wrench of the feet; the scale of each row.
+    (B, R)"""
     n = len(motion.robot.joint_names)
     rows = motion.equation.residual(at)
     rows[:, :n] = at.torque_command
@@ -316,7 +327,8 @@ def _tilt(vector: np.ndarray, axis: int) -> float:
 
 
 def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """While one foot alone carries the robot, its force is what the masses need: in its mean direction, and in its course."""
+    """While one foot alone carries the robot, its force is what the masses need: in its mean
+    direction, and in its course."""
     if not evidence.robot.has_floating_base:
         return
     motion, n = evidence.motion, len(evidence.joints)

@@ -1,4 +1,5 @@
-"""Is it calibration or the model? A log whose signs, units or frames are wrong is said to be so, before anybody looks for physics in it."""
+"""Is it calibration or the model? A log whose signs, units or frames are wrong is said to be so,
+before anybody looks for physics in it."""
 
 from dataclasses import replace
 
@@ -10,11 +11,13 @@ from fbse_drake.discrepancy.residual.evidence import Evidence
 from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion
 from fbse_drake.errors import InputError
 
-# Gravity on the IMU and the weight on the feet may be off by this share; an error of calibration is an effect of the library.
+# Gravity on the IMU and the weight on the feet may be off by this share; an error of calibration is
+# an effect of the library.
 _TOLERANCE = 0.3
 # A torque that is so many times what the model needs is in another unit.
 _ANOTHER_UNIT = 20.0
-# Angles beyond this, or this many times as large as the joint's limits and beyond them by so much, are no angles in radians [rad].
+# Angles beyond this, or this many times as large as the joint's limits and beyond them by so much,
+# are no angles in radians [rad].
 _LARGEST_ANGLE, _BEYOND_LIMITS, _BEYOND = 4 * np.pi, 3.0, 1.0
 # A base that turns less than this, root mean square, says nothing about its gyroscope [rad/s].
 _SMALLEST_RATE = 0.02
@@ -99,7 +102,8 @@ def _check_gravity(motion: RecordedMotion) -> None:
 
 
 def _check_weight(motion: RecordedMotion) -> None:
-    """The feet together must carry what the base's specific force makes of the robot's mass, on average the weight."""
+    """The feet together must carry what the base's specific force makes of the robot's mass, on
+    average the weight."""
     wrenches = motion.equation.wrenches(motion.steps.pad_force)
     for side, wrench in zip(motion.robot.description.sides, wrenches, strict=True):
         pull, push = -np.quantile(wrench[:, 5], (0.02, 0.98)) / motion.equation.weight

@@ -1,7 +1,9 @@
-"""Checks of the torques: is the channel dead, its sign reversed or lost, its unit wrong, its clock off, is it a torque at all?
+"""Checks of the torques: is the channel dead, its sign reversed or lost, its unit wrong, its clock
+off, is it a torque at all?
 
-Nothing is asserted that friction, inertia, a counterbalance, an encoder offset or a load could explain as well; see
-`torque_readings`. All tests together call a good log wrong with the probability `torque_readings.FALSE_ALARM`.
+Nothing is asserted that friction, inertia, a counterbalance, an encoder offset or a load could
+explain as well; see `torque_readings`. All tests together call a good log wrong with the
+probability `torque_readings.FALSE_ALARM`.
 """
 
 from collections.abc import Iterable
@@ -24,9 +26,11 @@ from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding, r
 CHANNEL = "joint/torque_command"
 # Tests of each joint: its sign is reversed or lost, it is dead, its unit or its clock is wrong.
 _TESTS = 5
-# A torque in another unit is off by more than this factor; by more than the smaller one its scale is doubtful.
+# A torque in another unit is off by more than this factor; by more than the smaller one its scale
+# is doubtful.
 _ANOTHER_UNIT, _DOUBTFUL = 3.0, 1.3
-# A dead channel varies by less than this share of what the model needs; the torque of the other sign, of one whose sign was lost, too.
+# A dead channel varies by less than this share of what the model needs; the torque of the other
+# sign, of one whose sign was lost, too.
 _DEAD = 0.05
 # Another reading of a torque leaves at most this share of what the recorded one leaves.
 _BETTER = 0.8
@@ -34,7 +38,8 @@ _BETTER = 0.8
 _VISIBLE = 2.0
 # Largest clock offset that is looked for [blocks], and the smallest that counts [samples, blocks].
 _LARGEST_OFFSET, _SMALLEST_OFFSET = 5, (1.5, 0.25)
-# What the model needs, in another unit and with friction, explains at least so much of a torque's variance.
+# What the model needs, in another unit and with friction, explains at least so much of a torque's
+# variance.
 _EXPLAINED = 0.5
 # A PWM follows the velocity: more than this share of its variance.
 _BY_VELOCITY = 0.3
@@ -160,7 +165,8 @@ def _test_scale(torques: JointTorques, k: int, joint: str, found: _Found) -> Non
 
 
 def _is_better(torques: JointTorques, k: int, rival: Reading, recorded: Reading) -> bool:
-    """Is another reading of a joint's torque significantly likelier than the recorded one, and does it leave less to speak of?"""
+    """Is another reading of a joint's torque significantly likelier than the recorded one, and does
+    it leave less to speak of?"""
     if not rival.left.std() < _BETTER * recorded.left.std():
         return False
     return chance(gain(recorded.left, rival.left), torques.stretches(k)) < level(torques)

@@ -1,9 +1,12 @@
-"""Ways to read a torque channel: as it was recorded, with its sign reversed or lost, in another unit, late, or as no torque at all.
+"""Ways to read a torque channel: as it was recorded, with its sign reversed or lost, in another
+unit, late, or as no torque at all.
 
-Every reading may have what a machine may have that its model lacks: friction, more or less reflected inertia, a spring, a
-counterbalance, an offset of its current sensor, crooked encoders, a load at its end. Another reading than the recorded one is believed
-only if it is significantly likelier with all that: likelihoods are compared stretch by stretch of time (Vuong 1989, "Likelihood ratio
-tests for model selection and non-nested hypotheses", Econometrica 57), with Student's t.
+Every reading may have what a machine may have that its model lacks: friction, more or less
+reflected inertia, a spring, a counterbalance, an offset of its current sensor, crooked encoders, a
+load at its end. Another reading than the recorded one is believed
+only if it is significantly likelier with all that: likelihoods are compared stretch by stretch of
+time (Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses",
+Econometrica 57), with Student's t.
 """
 
 from dataclasses import dataclass, replace
@@ -23,13 +26,15 @@ FALSE_ALARM = 1e-3
 STRETCH, FEWEST_STRETCHES = 0.25, 6
 # Speed at which Coulomb friction has its full size [rad/s].
 TRANSITION = 0.02
-# Change of an angle by which the effect of a crooked encoder is taken, and the largest offset of one [rad].
+# Change of an angle by which the effect of a crooked encoder is taken, and the largest offset of
+# one [rad].
 _SMALL_ANGLE, _LARGEST_OFFSET = 1e-3, 0.5
 # How often the sign of a torque that is recorded without one is guessed anew.
 _GUESSES = 5
 # A column may be a combination of others but for this share of its length.
 _COLLINEAR = 1e-6
-# A channel that is at an end of its range for this share of a log is constant; one that is there more often than so is limited.
+# A channel that is at an end of its range for this share of a log is constant; one that is there
+# more often than so is limited.
 _MOSTLY, _OFTEN = 0.5, 4
 # What explains less than this share of what the largest cause explains is not named.
 _GOOD_SHARE = 0.2
@@ -85,14 +90,16 @@ def gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """How much likelier each block is by one reading than by another, as logarithms.
 
     Args:
-        before, after: what the readings leave of the torque, normally distributed with a variance of its own.
+        before, after: what the readings leave of the torque, normally distributed with a variance
+            of its own.
     """
     spread = [float((left**2).mean()) + 1e-300 for left in (before, after)]
     return 0.5 * (np.log(spread[0] / spread[1]) + before**2 / spread[0] - after**2 / spread[1])
 
 
 def chance(gains: np.ndarray, stretch: np.ndarray) -> float:
-    """Probability that one reading seems so much likelier than another by chance alone, if both are equally good.
+    """Probability that one reading seems so much likelier than another by chance alone, if both are
+    equally good.
 
     Args:
         gains: of each block; see `gain`.
@@ -158,7 +165,8 @@ class JointTorques:
         """What a joint's torque may have beside what the model needs.
 
         Args:
-            everything: crooked encoders and a load at the end of the machine too, which take longer.
+            everything: crooked encoders and a load at the end of the machine too, which take
+                longer.
         """
         at, joint = self._blocks, self._evidence.joints[k]
         q, v, a = at.joint_position[:, k], at.joint_velocity[:, k], at.joint_acceleration[:, k]
@@ -195,8 +203,8 @@ class JointTorques:
 
     @cached_property
     def _load(self) -> np.ndarray:
-        """Torque per mass and first moments of a load on the last body of a machine on a fixed base, (B, n, 4); none on a floating
-        one, whose base would show it."""
+        """Torque per mass and first moments of a load on the last body of a machine on a fixed
+        base, (B, n, 4); none on a floating one, whose base would show it."""
         evidence, n = self._evidence, self.torque.shape[1]
         if evidence.robot.has_floating_base:
             return np.zeros((len(self.torque), n, 0))
@@ -209,7 +217,8 @@ class JointTorques:
         return fitted(self.torque[:, k] - self.needed[:, k], columns, self.known[:, k])
 
     def scaled(self, k: int, columns: Columns, sign: float = 1.0) -> Reading:
-        """In a unit of its own, with the sign reversed if so wished; the last amount is the scale."""
+        """In a unit of its own, with the sign reversed if so wished; the last amount is the
+        scale."""
         return fitted(sign * self.torque[:, k], self._with_scale(k, columns), self.known[:, k])
 
     def without_sign(self, k: int, columns: Columns) -> Reading:
@@ -243,7 +252,8 @@ class JointTorques:
 
 
 def causes_of(reading: Reading, columns: Columns, known: np.ndarray) -> list[str]:
-    """What the columns of a reading stand for that vary by a good share of what the largest does; the largest first."""
+    """What the columns of a reading stand for that vary by a good share of what the largest does;
+    the largest first."""
     sizes = dict.fromkeys(columns.causes, 0.0)
     for cause in sizes:
         own = np.array([c == cause for c in columns.causes])

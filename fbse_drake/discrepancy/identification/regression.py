@@ -1,5 +1,5 @@
-"""Linear regression of residuals on signatures of effects: noise whitened, intervals that respect what is left of correlation in time, and
-scores on held-out blocks of time."""
+"""Linear regression of residuals on signatures of effects: noise whitened, intervals that respect
+what is left of correlation in time, and scores on held-out blocks of time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,9 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.residual import Residual
 
-# Length of a stretch whose errors may be correlated in any way [s], not less than so many blocks, and in how many folds these stretches are
-# held out in turn. Folds and stretches of a step have no common divisor, so that no phase of the gait is held out as a whole.
+# Length of a stretch whose errors may be correlated in any way [s], not less than so many blocks,
+# and in how many folds these stretches are held out in turn. Folds and stretches of a step have no
+# common divisor, so that no phase of the gait is held out as a whole.
 STRETCH = 0.25
 _FEWEST_BLOCKS = 10
 FOLDS = 5
@@ -23,9 +24,11 @@ FOLDS = 5
 _LONG = 4
 # How often the rows are weighted anew by what is left in them.
 _REWEIGHTINGS = 3
-# Columns, scaled to the same length, of which one keeps less than this share of its length beside the others are collinear.
+# Columns, scaled to the same length, of which one keeps less than this share of its length beside
+# the others are collinear.
 _COLLINEAR = 1e-4
-# Rounding of a sum of products as a share of its terms, and the share of the sum that may be rounding.
+# Rounding of a sum of products as a share of its terms, and the share of the sum that may be
+# rounding.
 _ROUNDING, _NEGLIGIBLE = 1e-15, 1e-7
 # So many numbers are kept of columns by fold, and of inner products; and so many fits.
 _MOST_NUMBERS, _KEPT_FITS = 15_000_000, 500
@@ -33,7 +36,8 @@ _MOST_NUMBERS, _KEPT_FITS = 15_000_000, 500
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What one effect adds to some rows of the residual: offset + values @ parameters, for p parameters."""
+    """What one effect adds to some rows of the residual: offset + values @ parameters, for p
+    parameters."""
 
     # Places of the rows, shape (r,).
     rows: np.ndarray
@@ -41,7 +45,8 @@ class Signature:
     values: np.ndarray
     # What it adds whatever the parameters are, shape (B, r) or 0.
     offset: np.ndarray | float = 0.0
-    # What is believed of the parameters beforehand: that they are 0, with this inverse variance, shape (p,) or 0.
+    # What is believed of the parameters beforehand: that they are 0, with this inverse variance,
+    # shape (p,) or 0.
     prior: np.ndarray | float = 0.0
     # Smallest value that each parameter can have, shape (p,) or -inf.
     lowest: np.ndarray | float = -np.inf
@@ -51,7 +56,8 @@ class Signature:
 class Spread:
     """How sure P fitted parameters are."""
 
-    # Standard deviation of each parameter, shape (P,): sandwich estimate by stretches of time, not less than what the noise alone gives.
+    # Standard deviation of each parameter, shape (P,): sandwich estimate by stretches of time, not
+    # less than what the noise alone gives.
     deviation: np.ndarray
     # Degrees of freedom of each parameter's interval: stretches that bear on it, shape (P,).
     freedom: np.ndarray
@@ -64,7 +70,8 @@ class Fit:
     """Regression on several signatures at once; P parameters in their order, R rows."""
 
     parameters: np.ndarray
-    # Sum of squares of the whitened residual in each row: over all blocks, and with each block predicted from the other folds, (R,).
+    # Sum of squares of the whitened residual in each row: over all blocks, and with each block
+    # predicted from the other folds, (R,).
     sse: np.ndarray
     held_out_sse: np.ndarray
     # What was fitted together, and where its parameters stand.
@@ -95,7 +102,8 @@ class Fit:
 
 
 class WhitenedResidual:
-    """A residual with its noise made white and of unit variance, row by row; zero where a row is not known. It does not change."""
+    """A residual with its noise made white and of unit variance, row by row; zero where a row is
+    not known. It does not change."""
 
     def __init__(self, residual: Residual):
         self.residual = residual
@@ -116,7 +124,8 @@ class WhitenedResidual:
         )
         # Blocks that are known in each row, (R,).
         self.count = residual.known.sum(axis=0)
-        # How many blocks' worth of each row's variance is doubt about laws rather than noise of sensors, (R,).
+        # How many blocks' worth of each row's variance is doubt about laws rather than noise of
+        # sensors, (R,).
         self.doubt = np.where(
             residual.known, residual.doubt / np.maximum(residual.variance, 1e-18), 0.0
         ).sum(axis=0)
@@ -156,7 +165,8 @@ class WhitenedResidual:
         return (self.y**2).sum(axis=0)
 
     def scale(self, sse: np.ndarray) -> np.ndarray:
-        """Mean square of each row's whitened residual, not less than 1: what the sensors' noise is to be multiplied with, shape (R,)."""
+        """Mean square of each row's whitened residual, not less than 1: what the sensors' noise is
+        to be multiplied with, shape (R,)."""
         return np.maximum(sse / np.maximum(self.count, 1), 1.0)
 
     def deviance_by_row(self, sse: np.ndarray) -> np.ndarray:
@@ -189,7 +199,8 @@ class PartialFit:
         """What the fit came to.
 
         Args:
-            gram: with the rows weighted by the inverse of their `scale`, and what is believed beforehand, (P, P).
+            gram: with the rows weighted by the inverse of their `scale`, and what is believed
+                beforehand, (P, P).
         """
         self._white, self._signatures, self._gram, self._scale = white, signatures, gram, scale
         self.rows, self.parameters, self.sse, self.held_out_sse = (
@@ -201,7 +212,8 @@ class PartialFit:
 
     @cached_property
     def spread(self) -> Spread:
-        """Sandwich: what is left in a stretch may be correlated in any way. Of many short stretches and few long ones, the wider counts."""
+        """Sandwich: what is left in a stretch may be correlated in any way. Of many short stretches
+        and few long ones, the wider counts."""
         white, size = self._white, len(self.parameters)
         left = leftover(white, self._signatures, self.parameters)[:, self.rows] / self._scale
         by_block, information = np.empty((len(left), size)), np.empty((len(left), size))
@@ -244,7 +256,8 @@ class PartialFit:
 
 @dataclass(frozen=True)
 class _Assembled:
-    """Inner products of several signatures' columns and the residual, by fold and row: F folds, r rows, Q columns, offsets among them."""
+    """Inner products of several signatures' columns and the residual, by fold and row: F folds, r
+    rows, Q columns, offsets among them."""
 
     rows: np.ndarray
     # (F, r, Q, Q) and (F, r, Q).
@@ -264,8 +277,9 @@ class _Assembled:
 class Regression:
     """Fits of signatures to one whitened residual.
 
-    Columns meet the data, and each other, once: their inner products by row and fold are kept, and a fit is algebra
-    with them. Where a sum of squares is too small a difference of theirs, it is found from the data.
+    Columns meet the data, and each other, once: their inner products by row and fold are kept, and
+    a fit is algebra with them. Where a sum of squares is too small a difference of theirs, it is
+    found from the data.
     """
 
     def __init__(self, white: WhitenedResidual):
@@ -284,7 +298,8 @@ class Regression:
             Signature, WeakKeyDictionary[Signature, tuple[np.ndarray, ...]]
         ] = WeakKeyDictionary()
         self._rights: WeakKeyDictionary[Signature, np.ndarray] = WeakKeyDictionary()
-        # In the order in which signatures were first seen: what is tried last stands last, and all before it are known together already.
+        # In the order in which signatures were first seen: what is tried last stands last, and all
+        # before it are known together already.
         self._age: WeakKeyDictionary[Signature, int] = WeakKeyDictionary()
         self._assembled: Memory[_Assembled] = Memory(_MOST_NUMBERS, lambda a: a.gram.size)
         self._parts: Memory[PartialFit] = Memory(_KEPT_FITS)
@@ -315,7 +330,8 @@ class Regression:
         """Inner products of the columns of two whitened signatures in the rows that they share.
 
         Returns:
-            Places of these rows in each of the two, (s,), and the products by fold, (F, s, p_a, p_b); an offset is a last column.
+            Places of these rows in each of the two, (s,), and the products by fold, (F, s, p_a,
+            p_b); an offset is a last column.
         """
         known = self._grams.setdefault(a, WeakKeyDictionary())
         if b not in known and a in self._grams.get(b, ()):
@@ -331,7 +347,8 @@ class Regression:
         return known[b]
 
     def target(self, signature: Signature) -> np.ndarray:
-        """Inner products of a signature's columns with the residual, (F, r, p); an offset is a last column."""
+        """Inner products of a signature's columns with the residual, (F, r, p); an offset is a last
+        column."""
         if signature not in self._targets:
             self._targets[signature] = np.array(
                 [

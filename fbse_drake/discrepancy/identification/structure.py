@@ -1,4 +1,5 @@
-"""What no effect of the library explains: is anything left in a residual, where, and which variable does it live in?"""
+"""What no effect of the library explains: is anything left in a residual, where, and which variable
+does it live in?"""
 
 from dataclasses import dataclass
 
@@ -9,9 +10,11 @@ from fbse_drake.discrepancy.residual.residual import RecordedMotion
 
 # Pieces of a piecewise linear function of one variable.
 _PIECES = 8
-# A row whose held-out residual exceeds the sensors' noise by more than this factor has something left.
+# A row whose held-out residual exceeds the sensors' noise by more than this factor has something
+# left.
 EXCESS = 1.2
-# Drop of the held-out deviance at which a smooth function of several variables counts as found, beside what is doubted about known laws.
+# Drop of the held-out deviance at which a smooth function of several variables counts as found,
+# beside what is doubted about known laws.
 _DROP = 25.0
 # How many times as large as it was taken the doubt about known laws may be.
 _DOUBT = 3.0
@@ -28,7 +31,8 @@ class Structure:
     index: int
     # Root mean square of what is left, in multiples of the sensors' noise.
     ratio: float
-    # Variable that explains most of it: position, velocity, load, acceleration, time or phase; and the share that it explains.
+    # Variable that explains most of it: position, velocity, load, acceleration, time or phase; and
+    # the share that it explains.
     variable: str
     share: float
 
@@ -69,12 +73,14 @@ def leftover_structure(
 
 
 def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
-    """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces) each."""
+    """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces)
+    each."""
     blocks, n = motion.blocks, len(motion.robot.joint_names)
     result = {"time": hat_functions(motion.time)}
 
     def without_own_noise(values: np.ndarray) -> np.ndarray:
-        # The noise of a block is in its residual too: its neighbours beyond the next ones tell what was measured without it.
+        # The noise of a block is in its residual too: its neighbours beyond the next ones tell what
+        # was measured without it.
         padded = np.concatenate([values[:1]] * 3 + [values] + [values[-1:]] * 3)
         n = len(values)
         return 0.25 * (padded[:n] + padded[1 : n + 1] + padded[5 : n + 5] + padded[6 : n + 6])

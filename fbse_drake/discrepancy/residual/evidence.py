@@ -13,9 +13,11 @@ Severity = Literal["note", "warning", "untrustworthy"]
 
 # Samples at which channels are compared at the log's own rate.
 _SAMPLES = 4000
-# A joint that moves less than this does not move [rad or m]; nor one that moves by few of its encoder's steps.
+# A joint that moves less than this does not move [rad or m]; nor one that moves by few of its
+# encoder's steps.
 STILL, _STEPS = 1e-4, 3
-# A foot is in the air while it carries less than this share of the weight and the others more than that one.
+# A foot is in the air while it carries less than this share of the weight and the others more than
+# that one.
 _UNLOADED, _LOADED = 0.06, 0.85
 
 
@@ -56,7 +58,8 @@ class Evidence:
 
     @cached_property
     def channels(self) -> dict[str, tuple[np.ndarray, list[str]]]:
-        """Sensor channels as they are in the log: values (N, components), and what each component is called."""
+        """Sensor channels as they are in the log: values (N, components), and what each component
+        is called."""
         axes = ["x", "y", "z"]
         names = {
             "joint/position": self.joints,
@@ -91,7 +94,8 @@ class Evidence:
 
     @cached_property
     def instants(self) -> Instants:
-        """Steps at the log's own rate and not filtered for the diagnosis, at most some thousand from its middle."""
+        """Steps at the log's own rate and not filtered for the diagnosis, at most some thousand
+        from its middle."""
         motion = self._read(cutoff=0.0)
         start = max(0, (len(motion.steps.joint_position) - _SAMPLES) // 2)
         return Instants(
@@ -110,11 +114,13 @@ class Evidence:
 
     @cached_property
     def known(self) -> np.ndarray:
-        """Which averages of which rows are known, those that nothing is fitted to as well, (B, R)."""
+        """Which averages of which rows are known, those that nothing is fitted to as well, (B,
+        R)."""
         return self._read(unused_rows=[]).known
 
     def needed_and_given(self, at: Instants) -> tuple[np.ndarray, np.ndarray]:
-        """What the masses need of the feet and what the feet give, [moment, force] on the base in its axes, (M, 6) each."""
+        """What the masses need of the feet and what the feet give, [moment, force] on the base in
+        its axes, (M, 6) each."""
         unloaded = replace(at, pad_force=np.zeros_like(at.pad_force))
         without, left = (
             self.motion.equation.residual(one, kinematic=False)[:, len(self.joints) :]
@@ -189,7 +195,8 @@ def remarks(
     unit: str | Mapping[str, str],
     text: str,
 ) -> list[HygieneFinding]:
-    """One finding for all components of a channel that show the same; the worst comes first, and its size is that of the finding.
+    """One finding for all components of a channel that show the same; the worst comes first, and
+    its size is that of the finding.
 
     Args:
         sizes: by component; empty for no finding.
@@ -210,7 +217,8 @@ def remarks(
 
 
 def travel_of(position: np.ndarray) -> np.ndarray:
-    """How far joints move in measured positions (N, n), from the smallest to the largest, (n,) [rad or m].
+    """How far joints move in measured positions (N, n), from the smallest to the largest, (n,) [rad
+    or m].
 
     It is 0 where their sensors do not tell it from rest.
     """

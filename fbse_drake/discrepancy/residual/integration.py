@@ -1,5 +1,5 @@
-"""In what steps the motion of a log was integrated: where between two samples the equation of motion
-holds, with the torque held from one to the other.
+"""In what steps the motion of a log was integrated: where between two samples the equation of
+motion holds, with the torque held from one to the other.
 
 A real robot moves on while a command is held: what the torque is to be compared with is the motion
 amid the samples. Simulators mostly take steps of semi-implicit Euler, one or several a sample, each

@@ -1,5 +1,5 @@
-"""How noisy the rows of a residual are: white noise shows in differences of neighbours, of which what
-is missing in a model has next to nothing."""
+"""How noisy the rows of a residual are: white noise shows in differences of neighbours, of which
+what is missing in a model has next to nothing."""
 
 from dataclasses import dataclass, replace
 
@@ -15,12 +15,14 @@ from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
 # Order of the differences of neighbours, and their number in a window.
 _ORDER, _WINDOW = 4, 20
-# Impacts and trembling joints are no noise: this quantile of windows, and of a channel's components,
-# counts. It is as good as the mean of that share of the windows.
+# Impacts and trembling joints are no noise: this quantile of windows, and of a channel's
+# components, counts. It is as good as the mean of that share of the windows.
 _QUIET, _EFFICIENCY = 0.25, 0.54
-# Orders at which a channel's noise is measured; of what is not white, the lower shows this factor more.
+# Orders at which a channel's noise is measured; of what is not white, the lower shows this factor
+# more.
 _ORDERS, _WHITE = (3, 6), 1.1
-# Smallest factor of a row's noise that is worth a word, and probability of saying so of any by chance.
+# Smallest factor of a row's noise that is worth a word, and probability of saying so of any by
+# chance.
 _LEAST, _FALSE_ALARM = 1.15, 1e-3
 # The same of a channel, in which motion that is as fast as noise may be most of the excess.
 _LEAST_OF_CHANNEL = 1.3
@@ -38,8 +40,8 @@ class Noise:
     channels: tuple[NoiseLevel, ...]
     # Variance of a step's white noise to be added in each of R rows to that of the sensors, (R,).
     white: np.ndarray
-    # What averages over blocks differ from their neighbours, over what is believed; 1 where that may
-    # be right, (R,).
+    # What averages over blocks differ from their neighbours, over what is believed; 1 where that
+    # may be right, (R,).
     factor: np.ndarray
 
 

@@ -1,16 +1,19 @@
-"""What the equation of motion leaves over on a log: joint, base and kinematic residuals, with the noise that the sensors put into them.
+"""What the equation of motion leaves over on a log: joint, base and kinematic residuals, with the
+noise that the sensors put into them.
 
-Per plant step, with the base's origin at rest and the measured specific force in the place of gravity (see `estimators.floating_base`):
+Per plant step, with the base's origin at rest and the measured specific force in the place of
+gravity (see `estimators.floating_base`):
 
-    joint and base rows   S tau - (H v_dot + C v - J_m^T f_m)     torque that the motors gave and the links did not get [Nm];
-                                                                  six unactuated rows [Nm, N], which no joint effect can touch
-    kinematic rows        of every standing sole but a point foot's, in its frame: angular velocity, and specific force less that of a
-                          level resting sole;
-                          while both feet stand also the velocity of one sole relative to the other; on more than two feet,
-                          of one standing point foot relative to the next that stands
+* joint and base rows, S tau - (H v_dot + C v - J_m^T f_m): torque that the motors gave and the
+  links did not get [Nm]; and six unactuated rows [Nm, N], which no joint effect can touch;
+* kinematic rows, of every standing sole but a point foot's, in its frame: angular velocity, and
+  specific force less that of a level resting sole; while both feet stand also the velocity of one
+  sole relative to the other; on more than two feet, of one standing point foot relative to the next
+  that stands.
 
-All are averaged over blocks of time. Averages of one and the same window have one group delay, telescope what is differentiated, and leave
-noise whose covariance is known: white noise (accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
+All are averaged over blocks of time. Averages of one and the same window have one group delay,
+telescope what is differentiated, and leave noise whose covariance is known: white noise
+(accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
 average of order one, so that each row's covariance is tridiagonal.
 """
 
@@ -37,17 +40,19 @@ from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
 from fbse_drake.sensors.foot_pads import FootPads, measured_pad_forces
 
-# Order of the low-pass of a recording, and how far it continues a stretch beyond its ends [samples].
+# Order of the low-pass of a recording, and how far it continues a stretch beyond its ends
+# [samples].
 _ORDER, _PADDING = 4, 100
 # A sole stands still while it carries more than this share of what it would if all carried alike,
 # and each of its pads this share of the weight.
 _STANDING = 0.3
 _STANDING_PAD = 0.01
-# Soles settle for this long at the start of a recording [s]. A foot that has just touched down, or is
-# about to lift, may still roll over an edge: its sole is not at rest in this time [s].
+# Soles settle for this long at the start of a recording [s]. A foot that has just touched down, or
+# is about to lift, may still roll over an edge: its sole is not at rest in this time [s].
 _SETTLING, _ROLLING = 0.1, 0.03
 _AXES = ("x", "y", "z")
-# Results that the equation of motion keeps of each of its functions, and instants that are computed at once: Jacobians take room.
+# Results that the equation of motion keeps of each of its functions, and instants that are computed
+# at once: Jacobians take room.
 _REMEMBERED = 3
 _MOST_INSTANTS = 20_000
 
@@ -66,9 +71,9 @@ class Row:
 
 
 def foot_pairs(robot: Robot) -> list[tuple[int, int]]:
-    """Places of the feet whose velocity relative to each other is in rows: of two feet both, of more
-    all pairs of point feet. How a point foot is turned while it stands is not known, but that it
-    does not move."""
+    """Places of the feet whose velocity relative to each other is in rows: of two feet both, of
+    more all pairs of point feet. How a point foot is turned while it stands is not known, but that
+    it does not move."""
     legs = robot.description.legs
     if len(legs) == 2:
         return [(0, 1)]
@@ -115,11 +120,12 @@ def read_signals(
 ) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
-    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are differenced; without
-    `joint/torque_command` torques are 0.
+    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are
+    differenced; without `joint/torque_command` torques are 0.
 
     Returns:
-        The signals, N samples, and which of them are measured (not interpolated over a gap), shape (N,).
+        The signals, N samples, and which of them are measured (not interpolated over a gap), shape
+        (N,).
 
     Raises:
         InputError: other joints than the model's, missing IMU or foot channels of a floating robot.
@@ -194,7 +200,8 @@ def read_signals(
 def _low_passed(
     values: np.ndarray, cutoff: float, period: float, stretches: list[slice]
 ) -> np.ndarray:
-    """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a corner of 0."""
+    """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a
+    corner of 0."""
     if cutoff == 0:
         return values
     result = values.copy()
@@ -280,7 +287,8 @@ def within_steps(values: np.ndarray, share: float) -> np.ndarray:
 
 
 def block_means(values: np.ndarray, length: int) -> np.ndarray:
-    """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at the end is dropped."""
+    """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at
+    the end is dropped."""
     blocks = len(values) // length
     by_block = values[: blocks * length].reshape(blocks, length, *values.shape[1:])
     # Faster than `mean`, which takes the few samples of a block one by one.
@@ -334,7 +342,8 @@ class EquationOfMotion:
             else []
         )
         self._pairs = foot_pairs(robot) if robot.has_floating_base else []
-        # An effect that is tried changes some signals; what depends on the others is not computed again.
+        # An effect that is tried changes some signals; what depends on the others is not computed
+        # again.
         self._inverse_dynamics = _LastResults()
         self._jacobians = _LastResults()
         self._bias_accelerations = _LastResults()
@@ -486,8 +495,8 @@ class EquationOfMotion:
         return np.concatenate([self._order[self._joints], self._order[: self._joints.start]])
 
     def plant_motion(self, at: Instants) -> tuple[np.ndarray, np.ndarray]:
-        """States (M, positions + velocities) and accelerations (M, velocities) of the plant, with a floating base's origin at rest and its
-        specific force in the place of its acceleration."""
+        """States (M, positions + velocities) and accelerations (M, velocities) of the plant, with a
+        floating base's origin at rest and its specific force in the place of its acceleration."""
         robot, plant, order = self.robot, self.robot.plant, self._order
         states = np.zeros((len(at.joint_position), plant.num_multibody_states()))
         positions, rates = states[:, : plant.num_positions()], states[:, plant.num_positions() :]
@@ -509,8 +518,8 @@ class EquationOfMotion:
         """Variance that sensor noise puts into each row of one step, to first order.
 
         Returns:
-            Of what is white, and of the integral over time of what is differenced white noise, each (M, rows), in the rows' units squared
-            (the second times s^2).
+            Of what is white, and of the integral over time of what is differenced white noise, each
+            (M, rows), in the rows' units squared (the second times s^2).
         """
         robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
         M, n, v = len(at.joint_position), len(robot.joint_names), len(order)
@@ -579,18 +588,20 @@ class Residual:
     rows: list[Row]
     # Centre of each block [s], shape (B,).
     time: np.ndarray
-    # (B, R); and which are known: no gap in the log and no force at the end of its sensor's range, for joint rows a torque, for kinematic
-    # rows a sole that stands; no unused row.
+    # (B, R); and which are known: no gap in the log and no force at the end of its sensor's range,
+    # for joint rows a torque, for kinematic rows a sole that stands; no unused row.
     value: np.ndarray
     known: np.ndarray
-    # Noise of the sensors: variance of each average, and its covariance with the next block's, each (B, R).
+    # Noise of the sensors: variance of each average, and its covariance with the next block's, each
+    # (B, R).
     variance: np.ndarray
     covariance: np.ndarray
     # Which soles stand, (B, feet).
     standing: np.ndarray
     # Averages of the signals, for tables and plots.
     signals: Instants
-    # What of the variance is no noise of sensors but doubt about laws that were taken off, (B, R) or 0.
+    # What of the variance is no noise of sensors but doubt about laws that were taken off, (B, R)
+    # or 0.
     doubt: np.ndarray | float = 0.0
 
     @cached_property
@@ -599,7 +610,8 @@ class Residual:
 
     @cached_property
     def noise_floor(self) -> np.ndarray:
-        """Root mean square of the sensors' noise in each row, shape (R,); NaN for a row that is never known."""
+        """Root mean square of the sensors' noise in each row, shape (R,); NaN for a row that is
+        never known."""
         return rms(np.sqrt(self.variance), self.known)
 
     def minus(self, predicted: np.ndarray) -> "Residual":
@@ -615,7 +627,8 @@ def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 class RecordedMotion:
-    """A log seen by a model: makes residuals, and finds how they change with the signals or the model."""
+    """A log seen by a model: makes residuals, and finds how they change with the signals or the
+    model."""
 
     def __init__(
         self,
@@ -679,11 +692,13 @@ class RecordedMotion:
         return steps(signals, self.period, self.recording.rows, self.integration_step)
 
     def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
-        """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0 Hz."""
+        """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0
+        Hz."""
         return _low_passed(values, corner, self.period, _stretches(self.measured))
 
     def averages(self, predicted: np.ndarray) -> np.ndarray:
-        """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording would hold it."""
+        """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording
+        would hold it."""
         return block_means(
             _low_passed(
                 predicted, self.recording.recorded_cutoff, self.period, self._measured_steps
@@ -766,7 +781,8 @@ class RecordedMotion:
         return known
 
     def torque_variance(self, torque: np.ndarray) -> np.ndarray:
-        """Variance of the white noise of a sample of torques (M, n), as the recording says it, (M, n)."""
+        """Variance of the white noise of a sample of torques (M, n), as the recording says it, (M,
+        n)."""
         names, recording = self.robot.description, self.recording
         noise, share = (
             names.per_joint(getattr(recording, key), key=f"recording.{key}", default=0.0)

@@ -26,10 +26,11 @@ from fbse_drake.station import build_station
 from fbse_drake.walking.reference import Recorded, RecordedReference
 from fbse_drake.wiring import release
 
-# Where velocities were not measured, that at the start of a stretch is the slope of a parabola through so many samples.
+# Where velocities were not measured, that at the start of a stretch is the slope of a parabola
+# through so many samples.
 _STARTING_SAMPLES = 10
-# A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and then noise alone lets a foot land or a
-# joint slip otherwise, and the rest of the walk is another.
+# A walk is simulated with so many draws of the sensors' noise, of which the median counts: now and
+# then noise alone lets a foot land or a joint slip otherwise, and the rest of the walk is another.
 _DRAWS = 3
 # How often runs in other processes are looked at [s].
 _LOOK_PERIOD = 0.2
@@ -47,7 +48,8 @@ class RolloutError:
     # Simulated time [s], and why it ended early, or None.
     time: float
     failure: str | None
-    # By joint: mean absolute error of the position [rad], and |simulated - recorded| / |recorded| of it, 2-norms.
+    # By joint: mean absolute error of the position [rad], and |simulated - recorded| / |recorded|
+    # of it, 2-norms.
     mean_absolute_position: dict[str, float] = field(default_factory=dict)
     relative_position: dict[str, float] = field(default_factory=dict)
     # Error over time: N sample times [s], and simulated less recorded position (N, n) [rad].
@@ -77,7 +79,8 @@ def rollout(
     progress: Progress = silent,
     jobs: int = 1,
 ) -> RolloutError | None:
-    """Simulates the scenario's model, with all its effects, in the place of the robot and compares it with a log.
+    """Simulates the scenario's model, with all its effects, in the place of the robot and compares
+    it with a log.
 
     Reference and controller are the scenario's, and so are estimator and compensation where there
     is one: what is compensated moves the robot. Sensor noise is drawn anew, three times, and the
@@ -94,7 +97,8 @@ def rollout(
             by default the scenario's.
 
     Returns:
-        None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the log has no `reference/joint/position`.
+        None where nobody knows what the robot was asked for: the reference is `!Recorded`, but the
+        log has no `reference/joint/position`.
 
     Raises:
         InputError: see `simulate`; or the log and the simulation share no time.
@@ -122,7 +126,8 @@ def _side_by_side(
 ) -> list[RolloutError]:
     """The errors of several scenarios, so many at a time.
 
-    Processes are forked: a plant's configuration does not go through a pipe, and a user's own effects are known here only.
+    Processes are forked: a plant's configuration does not go through a pipe, and a user's own
+    effects are known here only.
     """
     context = multiprocessing.get_context("fork")
     waiting = dict(enumerate(scenarios))
@@ -301,7 +306,8 @@ def _first_state(
     log: Log,
     period: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint positions and velocities with which a stretch starts, (n,) each, without what the model's sensors add."""
+    """Joint positions and velocities with which a stretch starts, (n,) each, without what the
+    model's sensors add."""
     few = slice(0, _STARTING_SAMPLES)
     q = log["joint/position"][0]
     v = (

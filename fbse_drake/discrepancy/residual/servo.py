@@ -29,7 +29,8 @@ def stretches(log: Log) -> Iterator[tuple[slice, Mapping[str, Any]]]:
 def scaled_gains(
     control: PositionLoopConfig, recorded: Recorded, constants: Mapping[str, Any]
 ) -> PositionLoopConfig:
-    """The controller of one stretch: its gains times the number that the log keeps with the stretch, see `Recorded.gain`.
+    """The controller of one stretch: its gains times the number that the log keeps with the
+    stretch, see `Recorded.gain`.
 
     Raises:
         InputError: the log keeps no such number.
@@ -50,10 +51,12 @@ def scaled_gains(
 
 
 def with_command(scenario: Scenario, log: Log, names: RobotDescription) -> Log:
-    """A log with the torques of its own position loop, where it has none but says what the robot was asked for (`reference: !Recorded`).
+    """A log with the torques of its own position loop, where it has none but says what the robot
+    was asked for (`reference: !Recorded`).
 
-    The position loop's torque (paper eq. 68) with the gains of `control`, plus the recorded feed-forward, within the limits; none while a
-    drive is off. A reference without velocities is taken as at rest.
+    The position loop's torque (paper eq. 68) with the gains of `control`, plus the recorded
+    feed-forward, within the limits; none while a drive is off. A reference without velocities is
+    taken as at rest.
 
     Raises:
         InputError: see `scaled_gains`; or a derivative gain, but no velocities in the log.
