@@ -70,11 +70,13 @@ def identify(
     """
     if velocity.ndim != 2 or velocity.shape != torque.shape or velocity.shape[1] != len(joints):
         raise InputError(
-            f"expected velocity and torque of shape N x {len(joints)}, found {velocity.shape} and {torque.shape}"
+            f"expected velocity and torque of shape N x {len(joints)}, found "
+            f"{velocity.shape} and {torque.shape}"
         )
     if len(velocity) <= len(effect.parameters):
         raise InputError(
-            f"expected more than {len(effect.parameters)} samples for {effect.__name__}, found {len(velocity)}"
+            f"expected more than {len(effect.parameters)} samples for "
+            f"{effect.__name__}, found {len(velocity)}"
         )
     linear = [name for name, parameter in effect.parameters.items() if parameter.linear]
     nonlinear = {

@@ -81,8 +81,9 @@ _SHOWN = 500
 _PASSED = ("effect_found", "nothing_missing")
 
 _METHOD = (
-    "The recorded motion is put into the model's equation of motion. What it leaves over, the residual, is what the model does not "
-    "explain; it stands beside the noise that the sensors must put into it."
+    "The recorded motion is put into the model's equation of motion. What it leaves over, the "
+    "residual, is what the model does not explain; it stands beside the noise that the "
+    "sensors must put into it."
 )
 
 _RATIOS = (
@@ -91,11 +92,14 @@ _RATIOS = (
 )
 
 _BY_PHASE = (
-    f"{_RATIOS} No joint effect can show in the base's channels: what does is mass, foot sensor, IMU or contact. The soles' channels "
-    "are the motion of feet that stand."
+    f"{_RATIOS} No joint effect can show in the base's channels: what does is mass, foot sensor, "
+    "IMU or contact. The soles' channels are the motion of feet that stand."
 )
 
-_FALLING = "Root mean square of what the equation of motion leaves over, on stretches of the log that the values were not fitted to."
+_FALLING = (
+    "Root mean square of what the equation of motion leaves over, on stretches of the log that "
+    "the values were not fitted to."
+)
 
 
 def write_compare_report(
@@ -107,7 +111,8 @@ def write_compare_report(
         ("Error of the whole residual", times_noise(comparison.rmse)),
         (
             "Is it a mere offset?",
-            f"A constant taken off every channel leaves {times_noise(comparison.held_out_rmse)} on held-out data.",
+            "A constant taken off every channel leaves "
+            f"{times_noise(comparison.held_out_rmse)} on held-out data.",
         ),
         ("Where it fails", kinds_of_failures(comparison)),
     )
@@ -277,8 +282,9 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
         blocks.append(
             FigureBlock(
                 "The worst channels against what they may depend on",
-                "Mean error in bins. Where the interval is narrow and away from zero, the error follows that variable; where it is "
-                "wide, the error depends on something else. A positive error means that the model's torque (or force) is too low.",
+                "Mean error in bins. Where the interval is narrow and away from zero, the error "
+                "follows that variable; where it is wide, the error depends on something else. A "
+                "positive error means that the model's torque (or force) is too low.",
                 figures.error_bins(binned),
             )
         )
@@ -286,7 +292,8 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
         blocks += [
             FigureBlock(
                 "The worst channels over time",
-                f"Averages over {number(1e3 * motion.length * motion.period)} ms. Inside the grey band is what sensor noise explains.",
+                f"Averages over {number(1e3 * motion.length * motion.period)} ms. Inside the grey "
+                "band is what sensor noise explains.",
                 figures.errors_over_time(residual, robot.description.sides, worst),
             ),
         ]
@@ -378,8 +385,9 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
     )
     block = FigureBlock(
         "What this log can show",
-        "How small an effect could be and still be found, against what is plausible on a robot of this kind. What lies in the grey area is "
-        "not visible in this log, which is not the same as absent.",
+        "How small an effect could be and still be found, against what is plausible on a "
+        "robot of this kind. What lies in the grey area is not visible in this log, which "
+        "is not the same as absent.",
         figures.detectability(statuses),
     )
     order = [words(verdict) for verdict in figures.VERDICT_COLORS]
@@ -401,7 +409,10 @@ def _fall(
     """What the completed model brings: step by step, by channel, over time; and what it leaves."""
     robot, (first, last) = before[0].robot, (study.steps[index].rollout for index in (0, -1))
     rolled = first is not None and last is not None
-    simulated = " Below: the model with everything added so far is simulated in the place of the robot; its joints against the log's."
+    simulated = (
+        " Below: the model with everything added so far is simulated in the place of the robot; "
+        "its joints against the log's."
+    )
     channels = zip(before[1].channels, after[1].channels, strict=True)
     known = [
         (given, completed)
@@ -421,9 +432,9 @@ def _fall(
     blocks += _measured_torque(study.scenario, before[0], tests)
     if rolled and len(first.sample_time) and len(last.sample_time):
         caption = (
-            "Simulated less recorded position of the joints that the model as given misses most, over "
-            "the whole log. replay.html, which is saved beside this report, shows the log (grey), the "
-            "model as given (orange) and the completed one (teal) in motion."
+            "Simulated less recorded position of the joints that the model as given misses most, "
+            "over the whole log. replay.html, which is saved beside this report, shows the log "
+            "(grey), the model as given (orange) and the completed one (teal) in motion."
         )
         blocks.append(
             FigureBlock(
@@ -460,7 +471,8 @@ def _relative_fall(study: Study) -> list[tuple[str, str]]:
     """The relative error of all torques together, before and after, as a row of the summary."""
     first, last = study.steps[0].errors, study.steps[-1].errors
     falls = [
-        f"on {log_name(name)} {number(100 * error.relative)} % before, {number(100 * last[name].relative)} % after"
+        f"on {log_name(name)} {number(100 * error.relative)} % before, "
+        f"{number(100 * last[name].relative)} % after"
         for name, error in first.items()
         if np.isfinite(error.relative)
     ]
@@ -489,8 +501,9 @@ def _measured_torque(
         ", the part in which the model as given errs most" if len(time) < len(residual.time) else ""
     )
     caption = (
-        f"What the motors gave, and what the model needs for the same motion; {number(float(time[-1] - time[0]), 2)} s of {log_name(name)}"
-        f"{part}. Right above each panel: |error| / |measured| there (2-norms)."
+        "What the motors gave, and what the model needs for the same motion; "
+        f"{number(float(time[-1] - time[0]), 2)} s of {log_name(name)}{part}. Right above each "
+        "panel: |error| / |measured| there (2-norms)."
     )
     drawn = figures.torques_over_time(residual, after.residual, places, stretch)
     return [FigureBlock("Measured torque and the model's, before and after", caption, drawn)]
@@ -531,15 +544,22 @@ def _hygiene(predictor: Predictor, inputs: Inputs) -> Section:
     """What was measured, and how it was read."""
     motion, robot, standing = predictor.motion, predictor.robot, predictor.motion.standing
     time, recording = motion.log.time, predictor.scenario.recording
-    length = f"{number(float(time[-1] - time[0]))} s, {len(time)} samples, {number(1 / motion.period)} Hz"
+    length = (
+        f"{number(float(time[-1] - time[0]))} s, {len(time)} samples, "
+        f"{number(1 / motion.period)} Hz"
+    )
     if recording.train_share < 1:
-        length += f"; the first {number(100 * recording.train_share, 2)} % of the log, the rest is to test on"
+        length += (
+            f"; the first {number(100 * recording.train_share, 2)} % of the "
+            "log, the rest is to test on"
+        )
     rows = [
         ("Log", ", ".join(inputs.logs)),
         ("Length", length),
         (
             "Samples that are missing",
-            f"{number(100 * float(1 - motion.measured.mean()), 2)} %; nothing is said about the gaps",
+            f"{number(100 * float(1 - motion.measured.mean()), 2)} %; "
+            "nothing is said about the gaps",
         ),
         ("Joints", ", ".join(map(words, robot.joint_names))),
         (

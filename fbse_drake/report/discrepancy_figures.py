@@ -551,7 +551,8 @@ def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
         colors,
     )
     axes.set_xlabel(
-        "held-out error of the channels that the effect moves, in multiples of the sensors' noise [1]"
+        "held-out error of the channels that the effect moves, in multiples "
+        "of the sensors' noise [1]"
     )
     add_legend(figure)
     return figure
@@ -618,7 +619,8 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
     axes.set_xscale("log")
     axes.set_xlim(right=1.3 * highest)
     axes.set_xlabel(
-        "smallest detectable size over largest plausible size; a dot for each joint, foot or body [1]"
+        "smallest detectable size over largest plausible size; a dot for "
+        "each joint, foot or body [1]"
     )
     add_legend(figure)
     return figure

@@ -159,7 +159,10 @@ def channel_table(channels: Sequence[Channel]) -> Table:
         "Error over noise",
         "Relative error [%]",
     )
-    caption = "All channels. The relative error is that beside a model without any forces, which has 100 %."
+    caption = (
+        "All channels. The relative error is that beside a model without any "
+        "forces, which has 100 %."
+    )
     return Table(header, tuple(rows), caption, folded=True)
 
 
@@ -307,7 +310,10 @@ def simulated_position_tables(study: Study, robot: Robot) -> list[Table]:
         "Relative [%], as given",
         "completed",
     )
-    caption = "The model simulated in the place of the robot: errors of its positions; the relative one is |error| / |position|, 2-norms."
+    caption = (
+        "The model simulated in the place of the robot: errors of its positions; the relative one "
+        "is |error| / |position|, 2-norms."
+    )
     return [Table(header, tuple(rows), caption)]
 
 

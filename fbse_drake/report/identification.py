@@ -24,18 +24,18 @@ from fbse_drake.scenario import dump_scenario
 BASE_HEADER = ("combination", "unit", "model", "identified", "95 % interval", "known to")
 ERROR_HEADER = ("log", "error of the model", "identified")
 _BASE_TEXT = (
-    "What this log tells apart. `known to` is the standard deviation as a share of what a body of this size has, if what is left over were "
-    "white noise; intervals respect that it is not."
+    "What this log tells apart. `known to` is the standard deviation as a share of what a body of "
+    "this size has, if what is left over were white noise; intervals respect that it is not."
 )
 _BODIES_TEXT = (
-    "One of the many sets of values that have these combinations: the one nearest to the model that some distribution of mass has. "
-    "First moments and rotational inertia are about the origin of the body's frame. Where `known to` is near 100 % the value is that of "
-    "the model."
+    "One of the many sets of values that have these combinations: the one nearest to the model "
+    "that some distribution of mass has. First moments and rotational inertia are about the "
+    "origin of the body's frame. Where `known to` is near 100 % the value is that of the model."
 )
 
 _COMBINATIONS_CAPTION = (
-    "As the model has them, and as identified with 95 % intervals. Where an interval does not reach "
-    "the model's mark, the log contradicts the model."
+    "As the model has them, and as identified with 95 % intervals. Where an interval does not "
+    "reach the model's mark, the log contradicts the model."
 )
 _ERRORS_CAPTION = "What is left of the torque, by log; `train` is the one that was fitted."
 
@@ -80,7 +80,10 @@ def errors_table(result: Identification) -> Table:
 def identification_outcome(result: Identification) -> str:
     """The result in one sentence."""
     before, after = (errors["train"].relative for errors in (result.before, result.after))
-    return f"The relative torque error falls from {100 * before:.1f} % to {100 * after:.1f} % with identified inertia and plain friction."
+    return (
+        f"The relative torque error falls from {100 * before:.1f} % to {100 * after:.1f} % with "
+        "identified inertia and plain friction."
+    )
 
 
 def write_identification_report(path: str | Path, result: Identification, inputs: Inputs) -> None:

@@ -102,9 +102,9 @@ def law_step(law_error: Mapping[str, float]) -> Step | None:
 
 
 _CONSISTENCY = (
-    "A filter is consistent if its innovations are as large as it expects: then their normalised squares (NIS) average 1, and the mean "
-    "lies between the bounds with 95 % probability if the innovations are white. Errors that last make it leave the bounds without being "
-    "wrong."
+    "A filter is consistent if its innovations are as large as it expects: then their normalised "
+    "squares (NIS) average 1, and the mean lies between the bounds with 95 % probability if the "
+    "innovations are white. Errors that last make it leave the bounds without being wrong."
 )
 
 

@@ -54,11 +54,15 @@ class Inputs:
 def compare_outcome(comparison: Comparison) -> str:
     """The result of a comparison in one sentence."""
     if not comparison.failures:
-        return f"No failure above the noise: the model's error is {number(comparison.rmse)} times that of the sensors."
+        return (
+            f"No failure above the noise: the model's error is {number(comparison.rmse)} "
+            "times that of the sensors."
+        )
     channels = len({failure.row.name for failure in comparison.failures})
     return (
-        f"The model's error is {number(comparison.rmse)} times the sensors' noise and stands out in {channels} of "
-        f"{len(comparison.channels)} channels. Worst: {comparison.failures[0].text}."
+        f"The model's error is {number(comparison.rmse)} times the sensors' noise and stands out "
+        f"in {channels} of {len(comparison.channels)} channels. Worst: "
+        f"{comparison.failures[0].text}."
     )
 
 
@@ -90,12 +94,16 @@ def _course(log: str, validation: Validation) -> str:
     1.03) times the sensors' noise`."""
     before, after = validation.before, validation.after
     text = (
-        f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: from {number(before.value)} to "
-        f"{number(after.value)} ({_between(after, 1.0)}) times the sensors' noise"
+        f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: "
+        f"from {number(before.value)} to {number(after.value)} ({_between(after, 1.0)}) "
+        "times the sensors' noise"
     )
     if np.isfinite(validation.relative_after.value):
         shares = validation.relative_before, validation.relative_after
-        text += f", from {number(100 * shares[0].value)} to {number(100 * shares[1].value)} % ({_between(shares[1], 100.0)}) of the torque"
+        text += (
+            f", from {number(100 * shares[0].value)} to {number(100 * shares[1].value)} % "
+            f"({_between(shares[1], 100.0)}) of the torque"
+        )
     return text
 
 
@@ -114,7 +122,8 @@ def set_aside_rows(set_aside: Mapping[str, Validation]) -> list[tuple[str, str]]
     if not set_aside:
         return []
     texts = [
-        f"{as_sentence(_course(name, one))} That is {number(one.change.value)} ({_between(one.change, 1.0)}) of it."
+        f"{as_sentence(_course(name, one))} That is {number(one.change.value)} "
+        f"({_between(one.change, 1.0)}) of it."
         for name, one in set_aside.items()
     ]
     return [("On data set aside", " ".join([*texts, "Intervals are 95 %, by batch means."]))]
@@ -130,8 +139,9 @@ def _disturbed(disturbance: Disturbance) -> str:
     rows = _enumerated([words(row) for row in disturbance.rows[:_DISTURBED]])
     more = len(disturbance.rows) - _DISTURBED
     return (
-        f"Something acted on {rows}{f' and {more} more rows' if more > 0 else ''} from "
-        f"{disturbance.start:.2f} to {disturbance.end:.2f} s and not again; that was left out of the fit."
+        f"Something acted on {rows}{f' and {more} more rows' if more > 0 else ''} "
+        f"from {disturbance.start:.2f} to {disturbance.end:.2f} s and not again; that "
+        "was left out of the fit."
     )
 
 
@@ -148,7 +158,8 @@ def too_small_rows(findings: Sequence[Finding]) -> list[tuple[str, str]]:
     return [
         (
             "Too small to matter",
-            f"{listed_effects(findings)}: at most {100 * max(f.share for f in findings):.2g} % of what these rows are made of.",
+            f"{listed_effects(findings)}: at most {100 * max(f.share for f in findings):.2g} % of "
+            "what these rows are made of.",
         )
     ]
 
@@ -157,7 +168,10 @@ def _partly(diagnosis: Diagnosis) -> str:
     """What is known of a search that ended early."""
     if not diagnosis.chosen:
         return "Nothing was found until then; that rules nothing out."
-    return f"Until then it seems that the model lacks {listed_effects(diagnosis.chosen)}; rivals were not compared."
+    return (
+        f"Until then it seems that the model lacks {listed_effects(diagnosis.chosen)}; "
+        "rivals were not compared."
+    )
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
@@ -166,7 +180,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
         doubtful = dict.fromkeys(
             name for finding in diagnosis.chosen for name in finding.confusable_with
         )
-        return f"The model lacks {found}{f'; this log cannot tell that from {either_effect(doubtful)}' if doubtful else ''}."
+        doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
+        return f"The model lacks {found}{doubt}."
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
@@ -198,7 +213,10 @@ def study_outcome(study: Study) -> str:
     if study.partial and not study.diagnoses[-1].partial:
         return f"Partial: {study.stopped_because}. {_study_result(study)}"
     if study.partial and study.found:
-        return f"Partial: {study.stopped_because} before the search was through. {_study_result(study)}"
+        return (
+            f"Partial: {study.stopped_because} before the search was "
+            f"through. {_study_result(study)}"
+        )
     return _study_result(study)
 
 
@@ -212,8 +230,9 @@ def _study_result(study: Study) -> str:
         first, last = study.steps[0], study.steps[-1]
         course = "falls" if last.held_out_rmse < first.held_out_rmse else "rises"
         result += (
-            f" With it, the held-out error {course} from {number(first.held_out_rmse)} to {number(last.held_out_rmse)} times "
-            "the sensors' noise; no data was set aside to test that."
+            f" With it, the held-out error {course} from "
+            f"{number(first.held_out_rmse)} to {number(last.held_out_rmse)} times the "
+            "sensors' noise; no data was set aside to test that."
         )
     if study.diagnoses[-1].verdict == "unknown_effect":
         result += f" {_unexplained(study.diagnoses[-1])}"
@@ -232,8 +251,9 @@ def how_sure(
     """
     if found:
         return (
-            f"On blocks that were held out in turn, the error of all channels falls from {number(before)} to {number(after)} times the "
-            f"sensors' noise ({number(train)} on the data that it was fitted to). Noise alone brings a finding once in a thousand logs."
+            "On blocks that were held out in turn, the error of all channels falls from "
+            f"{number(before)} to {number(after)} times the sensors' noise ({number(train)} on the "
+            "data that it was fitted to). Noise alone brings a finding once in a thousand logs."
         )
     nothing = (
         "nothing was found by then" if partial else "no effect makes it smaller on held-out data"
@@ -360,14 +380,18 @@ def what_else(found: Sequence[Finding], *, partial: bool) -> str:
     for finding in found:
         equal.setdefault(finding.confusable_with, []).append(finding)
     told = [
-        f"{as_sentence(either_effect(names))[:-1]} explains this log as well as {listed_effects(findings)}."
+        f"{as_sentence(either_effect(names))[:-1]} explains this log as well as "
+        f"{listed_effects(findings)}."
         for names, findings in equal.items()
         if names
     ]
     if told:
         return " ".join(told)
     if not found:
-        return "Nothing else in the library: an effect smaller than the sizes below would not have shown."
+        return (
+            "Nothing else in the library: an effect smaller than the sizes "
+            "below would not have shown."
+        )
     return "No other effect of the library explains this log as well."
 
 

@@ -34,8 +34,9 @@ class Averaging:
         if self.block == self.asked:
             return ""
         return (
-            f"The log is long and its motion slow ({100 * _HELD:g} % of it below {self.bandwidth:.2g} Hz), so it was averaged over "
-            f"{1e3 * self.block:.3g} ms, not {1e3 * self.asked:.3g} ms."
+            f"The log is long and its motion slow ({100 * _HELD:g} % of it below "
+            f"{self.bandwidth:.2g} Hz), so it was averaged over {1e3 * self.block:.3g} ms, not "
+            f"{1e3 * self.asked:.3g} ms."
         )
 
 

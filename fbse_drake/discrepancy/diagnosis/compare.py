@@ -581,13 +581,25 @@ def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
         )
     elif row.kind == "joint":
         along = " along the motion" if where.variable == "speed" else ""
-        what = f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too {'low' if more else 'high'}{along}"
+        what = (
+            f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too "
+            f"{'low' if more else 'high'}{along}"
+        )
     elif kind == "force" and axis == "z":
-        what = f"the feet push {size} N {'more' if more else 'less'} upwards than the model's masses need"
+        what = (
+            f"the feet push {size} N {'more' if more else 'less'} upwards "
+            "than the model's masses need"
+        )
     elif kind == "force":
-        what = f"the feet push {size} N more {_WAYS[axis][0 if more else 1]} than the model's masses need"
+        what = (
+            f"the feet push {size} N more {_WAYS[axis][0 if more else 1]} "
+            "than the model's masses need"
+        )
     elif kind == "moment":
-        what = f"the feet's moment about the {axis} axis is {size} Nm {'larger' if more else 'smaller'} than the model's masses need"
+        what = (
+            f"the feet's moment about the {axis} axis is {size} Nm "
+            f"{'larger' if more else 'smaller'} than the model's masses need"
+        )
     elif kind == "angular_velocity":
         what = f"turns at {size} {unit} about its {axis} axis although it stands"
     elif kind == "specific_force":

@@ -1,4 +1,4 @@
-"""Which experiment would decide? What effects would do in the motions of other scenarios, predicted from those motions as planned."""
+"""Which experiment would decide between effects, told from the planned motions of scenarios."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +29,7 @@ _SAMPLES = 2
 
 
 def planned_log(scenario: Scenario) -> Log:
-    """What ideal sensors would record if the scenario's model followed its reference exactly: a log without any simulation.
+    """What ideal sensors would record if the model followed its reference exactly; no simulation.
 
     The trunk stays upright; feet that stand share the load with the least forces.
 
@@ -158,7 +158,7 @@ class Experiments:
         }
 
     def that_shows(self, effect: type[Effect]) -> str | None:
-        """Name of the scenario that would show the smallest size of an effect, if that is a plausible one."""
+        """Scenario that would show an effect at the smallest size, if that size is plausible."""
         sizes = {}
         for name, fits in self._fits(effect).items():
             found = smallest_detectable(fits, fits.noise_alone, effect)
@@ -173,7 +173,7 @@ class Experiments:
         values: Mapping[str, float],
         rival: type[Effect],
     ) -> str | None:
-        """Name of the scenario in which an effect, with its values, could least be taken for a rival, if it could not."""
+        """Scenario that separates an effect with its values best from a rival, if any does."""
         differences = {
             name: separation(fits, effect, targets, values, rival)
             for name, fits in self._fits(rival).items()

@@ -67,7 +67,8 @@ def identify(
     """
     if not scenario.identify.inertia:
         raise InputError(
-            "identify.inertia: names no body, so there is nothing to identify (as in identify: {inertia: [all]})"
+            "identify.inertia: names no body, so there is nothing to identify (as in "
+            "identify: {inertia: [all]})"
         )
     progress("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
@@ -101,12 +102,15 @@ def identifiability_text(inertia: IdentifiedInertia) -> str:
         sum(base.identified for base in inertia.base_parameters),
     )
     text = (
-        f"Of {inertia.change.size} inertial parameters of {len(inertia.bodies)} bodies this log shows {seen} combinations "
-        f"(condition number {inertia.condition:.3g}), {known} of them to within a tenth of what a body of this size has; "
-        "the rest stays with the model."
+        f"Of {inertia.change.size} inertial parameters of {len(inertia.bodies)} bodies this log "
+        f"shows {seen} combinations (condition number {inertia.condition:.3g}), {known} of them to "
+        "within a tenth of what a body of this size has; the rest stays with the model."
     )
     if inertia.at_the_edge:
-        text += f" At the edge of what a distribution of mass can have: {', '.join(inertia.at_the_edge)}."
+        text += (
+            " At the edge of what a distribution of mass can have: "
+            f"{', '.join(inertia.at_the_edge)}."
+        )
     return text
 
 

@@ -204,7 +204,10 @@ def is_better(model: Predictor, other: Predictor) -> bool:
 def _reason(diagnoses: list[Diagnosis]) -> str:
     last = diagnoses[-1]
     if last.chosen and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > 1.0:
-        return f"{len(diagnoses)} rounds were made and each found something: the library does not fit this robot well"
+        return (
+            f"{len(diagnoses)} rounds were made and each found something: the library "
+            "does not fit this robot well"
+        )
     if last.verdict == "unknown_effect":
         rows = ", ".join(words(structure.row) for structure in last.unexplained)
         return f"no effect of the library explains what is left in {rows}"

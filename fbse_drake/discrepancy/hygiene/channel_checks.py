@@ -56,13 +56,16 @@ def check_sampling(evidence: Evidence) -> Iterable[HygieneFinding]:
     if gaps.any():
         lost = float((steps[gaps] - evidence.period).sum())
         share = lost / float(evidence.log.time[-1] - evidence.log.time[0])
-        text = f"{int(gaps.sum())} gaps, {lost:.3g} s in all ({100 * share:.2g} % of the log); nothing is said about them"
+        text = (
+            f"{int(gaps.sum())} gaps, {lost:.3g} s in all ({100 * share:.2g} % of the log); "
+            "nothing is said about them"
+        )
         yield remark("gap", "warning" if share > _MANY_GAPS else "note", "time", lost, "s", text)
     jitter = float(np.std(steps[~gaps]) / evidence.period)
     if jitter > _JITTER:
         text = (
-            f"the period of {1e3 * evidence.period:.4g} ms scatters by {100 * jitter:.2g} %; channels are interpolated on an even grid, "
-            "which smoothes their noise"
+            f"the period of {1e3 * evidence.period:.4g} ms scatters by {100 * jitter:.2g} %; "
+            "channels are interpolated on an even grid, which smoothes their noise"
         )
         yield remark(
             "jitter",
@@ -131,7 +134,10 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
                 runs = [(a, b) for a, b in runs if values[a, k] != 0]
             if runs and np.ptp(values[:, k]) > 0:
                 found[part] = sum(b - a for a, b in runs) * evidence.period
-        text = "{where} repeats one value for {size} while the robot moves; what is found in this time is the sensor's doing"
+        text = (
+            "{where} repeats one value for {size} while the robot moves; what is found in this "
+            "time is the sensor's doing"
+        )
         yield from remarks("stuck", "untrustworthy", name, found, "s", text)
 
 
@@ -153,7 +159,10 @@ def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:
                     share += sum(long) / len(column)
             if share > CLIPPED_SHARE:
                 found[part] = 100 * share
-        text = "{where} stays at its limit for {size} of the log; there it says nothing of the true value"
+        text = (
+            "{where} stays at its limit for {size} of the log; there it says "
+            "nothing of the true value"
+        )
         if name != "joint/position":
             yield from remarks("clipped", "warning", name, found, "%", text)
 
@@ -220,7 +229,10 @@ def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
                     frequency[max(1, int(np.argmax(beyond < _EDGE)))] or frequency[-1]
                 )
         lowest = dict.fromkeys(found, min(found.values(), default=0.0))
-        text = "{where} was filtered before it was recorded: it holds nothing above {size}; intervals take its noise to be white"
+        text = (
+            "{where} was filtered before it was recorded: it holds nothing above {size}; "
+            "intervals take its noise to be white"
+        )
         yield from remarks("filtered", "note", name, lowest, "Hz", text)
 
 
@@ -293,7 +305,10 @@ def check_noise(evidence: Evidence) -> Iterable[HygieneFinding]:
             continue
         factor = noise.level / noise.believed
         if factor < 1 / _NOISE_FACTOR:
-            text = f"its white noise is {noise.level:.2g} {noise.unit} a sample, the scenario believes {noise.believed:.2g}; "
+            text = (
+                f"its white noise is {noise.level:.2g} {noise.unit} a sample, the scenario "
+                f"believes {noise.believed:.2g}; "
+            )
             text += "small effects are missed"
             yield remark("noise_level", "note", noise.channel, factor, "1", text)
 

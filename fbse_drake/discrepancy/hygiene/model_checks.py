@@ -86,8 +86,9 @@ def _clock(
     if correlation > _CORRELATED and abs(offset) > _SMALLEST_OFFSET:
         seconds = offset * evidence.period
         text = (
-            f"comes {1e3 * abs(seconds):.3g} ms {'late' if offset > 0 else 'early'} against {against}, which no mechanism "
-            "does; accelerations will look like friction and the other way round"
+            f"comes {1e3 * abs(seconds):.3g} ms {'late' if offset > 0 else 'early'} "
+            f"against {against}, which no mechanism does; accelerations will look like "
+            "friction and the other way round"
         )
         yield remark("clock_offset", "warning", channel, seconds, "s", text)
 
@@ -126,8 +127,9 @@ def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
         return
     seconds = offset * evidence.period
     text = (
-        f"seems {1e3 * abs(seconds):.3g} ms {'late' if offset > 0 else 'early'} against {against}; this may be its clock, but soles "
-        "that roll or give way, or angles that are read too much, look the same"
+        f"seems {1e3 * abs(seconds):.3g} ms {'late' if offset > 0 else 'early'} against "
+        f"{against}; this may be its clock, but soles that roll or give way, or angles that are "
+        "read too much, look the same"
     )
     yield remark("clock_or_sole", "note", "imu/angular_velocity", seconds, "s", text)
 
@@ -195,8 +197,9 @@ def check_force_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     if causal.min() < (1 - _WORTHWHILE) * smooth.min():
         constant = float(constants[np.unravel_index(causal.argmin(), causal.shape)[0]])
         text = (
-            f"the vertical force follows what the masses need through a low-pass of first order of {1e3 * constant:.2g} ms "
-            f"({1 / (2 * np.pi * constant):.2g} Hz), not through a mere delay; the base's rows may miss force where it changes"
+            "the vertical force follows what the masses need through a low-pass of first order of "
+            f"{1e3 * constant:.2g} ms ({1 / (2 * np.pi * constant):.2g} Hz), not through a mere "
+            "delay; the base's rows may miss force where it changes"
         )
         yield remark("low_pass", "warning", "foot/<side>", constant, "s", text)
     elif smooth.min() < (1 - _WORTHWHILE) * smooth[:, _LARGEST_OFFSET].min():
@@ -260,8 +263,9 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
         ):
             names = [evidence.joints[k] for k in (*first, *second)]
             text = (
-                f"with {' and '.join(names) if len(names) == 2 else 'the legs'} in each other's place the error falls to "
-                f"{100 * np.sqrt(after / before):.0f} %; they are swapped, and whatever is found in them is wrong"
+                f"with {' and '.join(names) if len(names) == 2 else 'the legs'} in each other's "
+                f"place the error falls to {100 * np.sqrt(after / before):.0f} %; they are "
+                "swapped, and whatever is found in them is wrong"
             )
             yield remark("swapped_joints", "untrustworthy", what, after / before, "1", text, names)
             return
@@ -315,8 +319,9 @@ def check_weight(evidence: Evidence) -> Iterable[HygieneFinding]:
             abs(excess) / evidence.motion.equation.gravity,
         )
         text = (
-            f"the feet carry {abs(excess):.3g} N ({100 * abs(share):.2g} %) {more} than the model's masses need; {kilograms:.2g} kg {more} "
-            "and a gain that all force sensors share explain this alike, and no motion tells them apart"
+            f"the feet carry {abs(excess):.3g} N ({100 * abs(share):.2g} %) {more} than the "
+            f"model's masses need; {kilograms:.2g} kg {more} and a gain that all force sensors "
+            "share explain this alike, and no motion tells them apart"
         )
         yield remark("weight", "warning", "foot/<side>", excess, "N", text)
 
@@ -369,8 +374,9 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
             if correlation < -0.2 and needed[:, k].std() > _AIR * motion.equation.weight:
                 against[f"force_{axis}"] = correlation
         text = (
-            "{where} moves against what the motion needs while this foot alone carries the robot (correlation {size}); its sign or "
-            "calibration is wrong, and so is what is found in the base's rows that it enters"
+            "{where} moves against what the motion needs while this foot alone carries the robot "
+            "(correlation {size}); its sign or calibration is wrong, and so is what is found in "
+            "the base's rows that it enters"
         )
         yield from remarks(
             "force_against_motion", "untrustworthy", f"foot/{side}", against, "1", text
@@ -401,7 +407,10 @@ def check_feet_in_the_air(evidence: Evidence) -> Iterable[HygieneFinding]:
             for k, axis in enumerate("xyz")
             if abs(reading[k]) > _AIR * weight
         }
-        text = "{where} reads {size} while the foot is in the air; the sensor has an offset (FootForceBias)"
+        text = (
+            "{where} reads {size} while the foot is in the air; the sensor has "
+            "an offset (FootForceBias)"
+        )
         yield from remarks("air_reading", "warning", f"foot/{side}", found, "N", text)
 
 
@@ -412,7 +421,10 @@ def check_gravity(evidence: Evidence) -> Iterable[HygieneFinding]:
     equation = evidence.motion.equation
     mean = float(np.linalg.norm(evidence.motion.signals.specific_force.mean(axis=0)))
     if abs(mean / equation.gravity - 1) > _GRAVITY:
-        text = f"its mean is {mean:.3f} m/s^2, gravity is {equation.gravity:.2f}; bias or scale of the accelerometer looks like mass"
+        text = (
+            f"its mean is {mean:.3f} m/s^2, gravity is {equation.gravity:.2f}; bias or scale of "
+            "the accelerometer looks like mass"
+        )
         yield remark(
             "gravity", "warning", "imu/linear_acceleration", mean - equation.gravity, "m/s^2", text
         )

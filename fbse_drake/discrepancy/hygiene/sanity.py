@@ -50,7 +50,8 @@ def _check_angles(motion: RecordedMotion) -> None:
         if angle > _LARGEST_ANGLE or angle > max(_BEYOND_LIMITS * limit, limit + _BEYOND):
             allowed = f" (the model's limit is {limit:.2g} rad)" if np.isfinite(limit) else ""
             raise InputError(
-                f"channel joint/position: {joint} reaches {angle:.3g} rad{allowed}; are these degrees?"
+                f"channel joint/position: {joint} reaches {angle:.3g} "
+                f"rad{allowed}; are these degrees?"
             )
 
 
@@ -75,7 +76,8 @@ def _check_velocity(motion: RecordedMotion) -> None:
             )
             joint = motion.robot.joint_names[k]
             raise InputError(
-                f"channel joint/velocity: {joint} reads {slope:.2g} times the rate of joint/position; {hint}"
+                f"channel joint/velocity: {joint} reads {slope:.2g} times the rate "
+                f"of joint/position; {hint}"
             )
 
 
@@ -89,11 +91,13 @@ def _check_gravity(motion: RecordedMotion) -> None:
     )
     if np.linalg.norm(mean) < _TOLERANCE * g:
         raise InputError(
-            f"{channel}; gravity is missing (expected the specific force, {g:.2f} m/s^2 upwards at rest)"
+            f"{channel}; gravity is missing (expected the specific force, "
+            f"{g:.2f} m/s^2 upwards at rest)"
         )
     if mean[2] < -(1 - _TOLERANCE) * g:
         raise InputError(
-            f"{channel}; its sign is reversed (expected the specific force, {g:.2f} m/s^2 upwards at rest)"
+            f"{channel}; its sign is reversed (expected the specific force, "
+            f"{g:.2f} m/s^2 upwards at rest)"
         )
     if not abs(np.linalg.norm(mean) / g - 1) < _TOLERANCE:
         raise InputError(f"{channel}; its unit is wrong (expected {g:.2f} m/s^2 upwards at rest)")
@@ -113,8 +117,9 @@ def _check_weight(motion: RecordedMotion) -> None:
             and sum(w[:, 5].mean() < 0 for w in wrenches) < len(wrenches)
         ):
             raise InputError(
-                f"channel foot/{side}: this foot pulls at the ground, with up to {100 * pull:.0f} % of the weight; its sign is reversed "
-                "(expected the ground's force on the foot, upwards)"
+                f"channel foot/{side}: this foot pulls at the ground, with up to "
+                f"{100 * pull:.0f} % of the weight; its sign is reversed (expected the ground's "
+                "force on the foot, upwards)"
             )
     total = np.sum([wrench[:, 3:].mean(axis=0) for wrench in wrenches], axis=0)
     weight = motion.equation.weight
@@ -127,15 +132,18 @@ def _check_weight(motion: RecordedMotion) -> None:
     sideways = np.abs(total[:2]).max() / weight
     if -1 - _TOLERANCE < share < -1 + _TOLERANCE:
         raise InputError(
-            f"channel foot/<side>: the mean force on the feet is {text}; its sign is reversed (expected upwards)"
+            f"channel foot/<side>: the mean force on the feet is {text}; its sign is "
+            "reversed (expected upwards)"
         )
     if sideways > 0.5:
         raise InputError(
-            f"channel foot/<side>: the mean force on the feet is {text}; its frame is wrong (expected along z)"
+            f"channel foot/<side>: the mean force on the feet is {text}; its frame is "
+            "wrong (expected along z)"
         )
     if abs(share - 1) > _TOLERANCE:
         raise InputError(
-            f"channel foot/<side>: the mean force on the feet is {text}; unit, scale or the model's mass is wrong"
+            f"channel foot/<side>: the mean force on the feet is {text}; unit, scale or "
+            "the model's mass is wrong"
         )
 
 
@@ -178,7 +186,8 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
             else "its unit or frame is wrong"
         )
         raise InputError(
-            f"channel imu/angular_velocity: reads {slope:.2g} times the rate at which the legs that stand turn the base; {hint}"
+            f"channel imu/angular_velocity: reads {slope:.2g} times the rate at which the legs "
+            f"that stand turn the base; {hint}"
         )
 
 
@@ -191,5 +200,6 @@ def _check_torque(motion: RecordedMotion) -> None:
             worst, size = finding.where[0], finding.size
             if size > _ANOTHER_UNIT:
                 raise InputError(
-                    f"channel {finding.channel}: {worst} reads {size:.3g} times what the model needs; its unit is wrong (Nm)"
+                    f"channel {finding.channel}: {worst} reads {size:.3g} times what the model "
+                    "needs; its unit is wrong (Nm)"
                 )

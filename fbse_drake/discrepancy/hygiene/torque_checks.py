@@ -187,20 +187,21 @@ def _findings(evidence: Evidence, found: _Found) -> Iterable[HygieneFinding]:
     text = "{where} pulls against what the model needs ({size} times); its sign is reversed"
     yield from remarks("torque_sign", "untrustworthy", CHANNEL, found.reversed, "1", text)
     text = (
-        "{where} never changes its sign, though what the model needs does (up to {size}); only the absolute value was "
-        "recorded: its sign is lost"
+        "{where} never changes its sign, though what the model needs does (up to {size}); only "
+        "the absolute value was recorded: its sign is lost"
     )
     yield from remarks("torque_sign", "untrustworthy", CHANNEL, found.lost, units, text)
     text = (
-        "{where} saturates at {size} and follows the velocity rather than what the model needs: this is PWM or voltage, not a "
-        "torque; a motor model makes a torque of it, without one no effect found here is mechanical"
+        "{where} saturates at {size} and follows the velocity rather than what the model needs: "
+        "this is PWM or voltage, not a torque; a motor model makes a torque of it, without one no "
+        "effect found here is mechanical"
     )
     yield from remarks("not_a_torque", "untrustworthy", CHANNEL, found.duty, units, text)
     doubtful = {j: s for j, s in found.scale.items() if 1 / _ANOTHER_UNIT < s < _ANOTHER_UNIT}
     hopeless = {j: s for j, s in found.scale.items() if j not in doubtful}
     text = (
-        "{where} reads {size} times what the model needs: unit, gear ratio or torque constant is wrong, or the model's masses; "
-        "friction cannot be told in its unit"
+        "{where} reads {size} times what the model needs: unit, gear ratio or torque constant is "
+        "wrong, or the model's masses; friction cannot be told in its unit"
     )
     yield from remarks("torque_scale", "untrustworthy", CHANNEL, hopeless, "1", text)
     yield from remarks("torque_scale", "warning", CHANNEL, doubtful, "1", text)
@@ -224,16 +225,16 @@ def _clock(
         where = () if len(late) > 0.5 * len(places) else tuple(late)
         seconds = float(np.median([*late.values()]))
         text = (
-            f"{', '.join(where)}{' ' if where else ''}comes {1e3 * seconds:.3g} ms late against the motion that it makes, by its "
-            "clock or by a filter before it was recorded, for no mechanism does that; accelerations will look like friction and the "
-            "other way round"
+            f"{', '.join(where)}{' ' if where else ''}comes {1e3 * seconds:.3g} ms late against "
+            "the motion that it makes, by its clock or by a filter before it was recorded, for no "
+            "mechanism does that; accelerations will look like friction and the other way round"
         )
         yield remark("clock_offset", "untrustworthy", CHANNEL, seconds, "s", text, where)
     if early:
         seconds = float(np.median(early))
         text = (
-            f"the motion follows {1e3 * seconds:.3g} ms behind it; this can be the robot's own delay or lag (TorqueDelay, "
-            "TorqueLag) as well as its clocks"
+            f"the motion follows {1e3 * seconds:.3g} ms behind it; this can be the robot's own "
+            "delay or lag (TorqueDelay, TorqueLag) as well as its clocks"
         )
         yield remark("command_ahead", "note", CHANNEL, seconds, "s", text)
 

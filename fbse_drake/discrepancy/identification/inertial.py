@@ -1,17 +1,20 @@
-"""Inertial parameters that a log shows: which combinations of them, how well, and values that some distribution of mass has.
+"""Combinations of inertial parameters that a log shows, and physically consistent values of all.
 
-The joint and base rows of the residual are linear in the ten inertial parameters phi of every body (see `InertialParameters`):
+The joint and base rows of the residual are linear in the ten inertial parameters phi of every body
+(see `InertialParameters`):
 
     residual = Y(motion) (phi of the robot - phi of the model)
 
-Parameters are measured in the body's own size. With the model's pseudo-inertia J0 = L L^T, a change is J = L (1 + Z) L^T with a symmetric
-4 x 4 matrix Z, whose ten coordinates z (orthonormal: |z| = |Z|) are free of units and of the choice of frame; z is the geodesic distance
-of Lee and Park (2018) to first order. The model is believed with a standard deviation of 1 in each: within about its own size. What the
-log does not show stays there. A body is physical just if 1 + Z is positive semidefinite (Wensing, Kim and Slotine 2018): a convex
-constraint.
+A change of a body is measured relative to the body itself. With the model's pseudo-inertia
+J0 = L L^T, the changed one is J = L (1 + Z) L^T with a symmetric 4 x 4 matrix Z. Its ten
+coordinates z (orthonormal: |z| = |Z|) have no unit and do not depend on the frame; to first order
+|z| is the geodesic distance of Lee and Park (2018). The prior of each is normal about the model
+with standard deviation 1, that is, a change of about the body's own size; where the log says
+nothing, the model stays. A body is physically consistent if and only if 1 + Z is positive
+semidefinite (Wensing, Kim and Slotine 2018), which is a convex constraint.
 
-A body that the log shows to be larger than the model's by many of these standard deviations (a hand that holds a load) was not believed
-in rightly: it is measured anew, in the mean of both sizes.
+If the log shows a change of many of these standard deviations (a hand that holds a load), the prior
+was too narrow: the body is then measured relative to the mean of its size before and after.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,19 +44,21 @@ from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 
 PARAMETERS = tuple(InertialParameters.parameters)
-# A body's mass is taken to be spread by at least this in every direction [m], also where its model is a point.
+# A body's mass is taken to be spread by at least this in every direction [m], also where its model
+# is a point.
 _LEAST_SPREAD = 0.02
-# A direction that raises the sum of squares, in units of the sensors' noise, by less than this per unit is left to the belief in the
-# model; so is one that is there by rounding alone.
+# A direction that raises the sum of squares, in units of the sensors' noise, by less than this per
+# unit is left to the belief in the model; so is one that is there by rounding alone.
 _LEAST_POWER = 1e-2
 _ROUNDING = 1e-12
 # A pseudo-inertia stays above this share of the model's own.
 _LEAST_SHARE = 1e-3
-# A combination counts as identified if its standard deviation is below this share of what is believed beforehand, as weak above.
+# A combination counts as identified if its standard deviation is below this share of the prior's,
+# and as weak otherwise.
 IDENTIFIED = 0.1
 # Half the width of a 95 % interval of a normal distribution, in standard deviations.
 _QUANTILE = 1.96
-# A coordinate of a body beyond so many standard deviations of what is believed of it is in conflict with that belief.
+# A coordinate z of a body is in conflict with its prior beyond so many standard deviations.
 _CONFLICT = 4.0
 # Terms below this share of the largest one are not written out.
 _SMALLEST_TERM = 0.01
@@ -69,9 +74,13 @@ def untrusted_bodies(robot: Robot, wanted: Sequence[str]) -> list[str]:
 
 
 def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> np.ndarray:
-    """What a unit of each inertial parameter of a body B adds to the joint and base rows, shape (M, rows, 10).
+    """What a unit of each inertial parameter of a body B adds to the joint and base rows.
 
-    From B's Jacobian J and its spatial velocity and acceleration about its origin Bo, all in B: J^T times the force and moment on the body.
+    J^T times the moment and force on the body, with its Jacobian J, spatial velocity and spatial
+    acceleration at its origin Bo, all expressed in B.
+
+    Returns:
+        Shape (M, rows, 10).
     """
     plant, context, frame = (
         equation.robot.plant,
@@ -106,10 +115,13 @@ def inertia_addition(
     effect: InertiaEffect,
     regressor: Callable[[str], np.ndarray],
 ) -> np.ndarray:
-    """What a robot whose inertia an effect changes has more than the model in the joint and base rows, shape (M, rows).
+    """What an effect on the inertia of bodies adds to the joint and base rows of the model.
 
     Args:
         regressor: `inertial_regressor` of a body at these instants.
+
+    Returns:
+        Shape (M, rows).
     """
     rotor_inertia, point_masses = inertia_changes({"effect": effect}, equation.robot)
     result = np.zeros((len(at.joint_acceleration), len(equation.row_velocities)))
@@ -126,10 +138,15 @@ def inertia_addition(
 
 
 def body_wrench(w: np.ndarray, alpha: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Wrench [moment about Bo, force] that moves a body B so, per unit of each inertial parameter, shape (M, 6, 10); all in B.
+    """Wrench [moment about Bo, force] that a motion of a body B needs, per unit of each parameter.
 
     Args:
-        w, alpha: angular velocity and acceleration, (M, 3); a: acceleration of Bo less gravity, (M, 3).
+        w: angular velocity, (M, 3), expressed in B like all others.
+        alpha: angular acceleration, (M, 3).
+        a: acceleration of Bo less gravity, (M, 3).
+
+    Returns:
+        Shape (M, 6, 10).
     """
     result = np.zeros((len(w), 6, len(PARAMETERS)))
     W = _cross(w)
@@ -178,8 +195,9 @@ def body_coordinates(parameters: np.ndarray, size: np.ndarray) -> tuple[np.ndarr
         size: of the body in whose size changes are measured, (10,).
 
     Returns:
-        T in phi = phi0 + T z, shape (10, 10), columns in the parameters' units; and L^-1 J0 L^-T, (4, 4), which is 1 for a body that is
-        measured in its own size, unless it is less spread than any body is taken to be.
+        T in phi = phi0 + T z, shape (10, 10), in the parameters' units; and L^-1 J0 L^-T, shape
+        (4, 4), which is the identity if the body is measured relative to itself and is no smaller
+        than any body is taken to be.
     """
     J0 = pseudo_inertia(parameters)
     spread = size[0] * _LEAST_SPREAD**2 * np.diag([1.0, 1.0, 1.0, 0.0])
@@ -190,16 +208,17 @@ def body_coordinates(parameters: np.ndarray, size: np.ndarray) -> tuple[np.ndarr
 
 @dataclass(frozen=True)
 class UntrustedInertia:
-    """What changes of bodies' inertial parameters add to a residual; P = 10 parameters for each of the bodies."""
+    """What changes of bodies' inertial parameters add to a residual; P = 10 times the bodies."""
 
     bodies: list[str]
     # Of the model as it stands, (P,), body by body.
     model: np.ndarray
     # Change of the parameters per unit of the coordinates z, (P, P).
     scale: np.ndarray
-    # Pseudo-inertia of each body in the coordinates of z, (bodies, 4, 4): with a change Z it is this + Z.
+    # Pseudo-inertia of each body in the coordinates of z, (bodies, 4, 4), to which Z is added.
     own: np.ndarray
-    # What a unit of each coordinate adds to the joint and base rows, averaged over blocks, (B, rows, P).
+    # What a unit of each coordinate adds to the joint and base rows, averaged over blocks,
+    # (B, rows, P).
     columns: np.ndarray
 
     @cached_property
@@ -208,12 +227,15 @@ class UntrustedInertia:
         return [(body, name) for body in self.bodies for name in PARAMETERS]
 
     def signature(self, directions: np.ndarray | None = None) -> Signature:
-        """As a signature for the regression, in the coordinates z or in some directions of them, (P, D)."""
+        """As a signature for the regression, in the coordinates z or in `directions` (P, D)."""
         values = self.columns if directions is None else self.columns @ directions
         return Signature(np.arange(self.columns.shape[1]), values, prior=np.ones(values.shape[2]))
 
     def measured_by(self, change: np.ndarray) -> "UntrustedInertia":
-        """The same, where a body's change (bodies, 10) is in conflict with what is believed of it in the mean size of both."""
+        """With bodies whose change (bodies, 10) is in conflict with their prior measured anew.
+
+        They are measured relative to the mean of their size before and after the change.
+        """
         size = len(PARAMETERS)
         scale, own, columns = self.scale.copy(), self.own.copy(), self.columns.copy()
         conflicts = 0
@@ -267,7 +289,7 @@ def _of_body(robot: Robot, name: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BaseParameter:
-    """A combination of inertial parameters that the log shows: one parameter, and what others add that look the same."""
+    """A combination of inertial parameters that the log shows: one, and others that look alike."""
 
     body: str
     parameter: str
@@ -278,7 +300,7 @@ class BaseParameter:
     model: float
     value: float
     interval: tuple[float, float]
-    # Standard deviation, if what is left over were white noise, as a share of what is believed beforehand: of the body's own size.
+    # Standard deviation if the remaining residual were white noise, as a share of the prior's.
     uncertainty: float
 
     @property
@@ -306,14 +328,16 @@ class IdentifiedInertia:
     """Inertial parameters of bodies as identified from a log; physically consistent."""
 
     bodies: list[str]
-    # Changes from the model (bodies, 10) in the order of `InertialParameters`, and half the width of their 95 % confidence intervals.
+    # Changes from the model (bodies, 10) in the order of `InertialParameters`, and half the width
+    # of their 95 % confidence intervals.
     change: np.ndarray
     half_width: np.ndarray
-    # Standard deviation of each as a share of what is believed beforehand: near 1 where the log says nothing of it by itself.
+    # Standard deviation of each as a share of the prior's: near 1 where the log says nothing of it.
     uncertainty: np.ndarray
     # Of the model, (bodies, 10).
     model: np.ndarray
-    # What the log shows of them, and condition number of that least-squares problem, its columns scaled to the same length.
+    # What the log shows of them, and the condition number of that least-squares problem with its
+    # columns scaled to the same length.
     base_parameters: tuple[BaseParameter, ...]
     condition: float
     # Bodies whose values are at the edge of what a distribution of mass can have.
@@ -345,7 +369,8 @@ def identified_inertia(
     columns = (signature.values / np.sqrt(white.scale(fit.sse))[signature.rows, None]).reshape(
         -1, P
     )
-    # Of changes of the parameters: as believed beforehand, as the log leaves it if what it leaves over is white noise, and as it is.
+    # Covariance of the parameters' changes: before the log, and after it if the remaining residual
+    # is white noise. Then squared half widths of their intervals, with the residual as it is.
     believed = T @ T.T
     informed = T @ np.linalg.inv(columns.T @ columns + np.eye(P)) @ T.T
     last = slice(len(fit.parameters) - directions.shape[1], None)
@@ -401,15 +426,17 @@ def identified_inertia(
 
 
 def base_columns(W: np.ndarray, sizes: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """Columns that the log tells apart, in their order, and what the others are in terms of them (Gautier 1991).
+    """Columns that the log tells apart, and the others in terms of them (Gautier 1991).
 
     Args:
         W: regressor in units of noise, (N, P).
-        sizes: change of each parameter that is about its own size, (P,). A column whose own part, beside the columns before it, is below
-            the noise for a change of that size is not told apart.
+        sizes: change of each parameter that is about its own size, (P,). A column is not told
+            apart if, for a change of that size, what the columns before it do not explain of it
+            is below the noise.
 
     Returns:
-        Places of the D base columns, and the factors of all parameters that each stands for, its own being 1, (D, P).
+        Indices of the D base columns in ascending order, and the factors with which all parameters
+        enter each, (D, P); that of its own parameter is 1.
     """
     R = np.linalg.qr(W, mode="r")
     kept: list[int] = []
@@ -430,10 +457,13 @@ def consistent_parameters(
     """Least squares with physically consistent bodies, by Drake's MathematicalProgram.
 
     Args:
-        X: (N, K + P) columns of K other parameters, then of the P coordinates z of the bodies, body by body; y: (N,). In units of noise.
+        X: columns of K other parameters, then of the P coordinates z of the bodies, body by body,
+            in units of noise, (N, K + P).
+        y: the residual in units of noise, (N,).
         prior: inverse variance of what is believed of each parameter, which is 0, (K + P,).
         lowest: lower bounds of the K others.
-        own: pseudo-inertia of each body in the coordinates of z, (bodies, 4, 4), see `UntrustedInertia`.
+        own: pseudo-inertia of each body in the coordinates of z, (bodies, 4, 4), see
+            `UntrustedInertia`.
 
     Returns:
         Other parameters (K,) and coordinates z (P,).
@@ -459,7 +489,8 @@ def consistent_parameters(
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
         raise InputError(
-            f"inertial parameters: no physically consistent values found ({result.get_solution_result().name})"
+            "inertial parameters: no physically consistent values found "
+            f"({result.get_solution_result().name})"
         )
     solution = result.GetSolution(variables) / norm
     return solution[:K], solution[K:]

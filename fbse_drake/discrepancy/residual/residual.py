@@ -655,13 +655,15 @@ class RecordedMotion:
         self.length = max(1, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(
-                f"the log is too short: {len(log.time)} samples, at least {20 * self.length} are needed"
+                f"the log is too short: {len(log.time)} samples, at least "
+                f"{20 * self.length} are needed"
             )
         names = [row.name for row in residual_rows(robot)]
         for pattern in recording.unused_rows:
             if not fnmatch.filter(names, pattern):
                 raise InputError(
-                    f"recording.unused_rows: {pattern}: there is no such row (there are: {', '.join(names)})"
+                    f"recording.unused_rows: {pattern}: there is no such row "
+                    f"(there are: {', '.join(names)})"
                 )
         self.start, self._left_out = float(log.time[0]), left_out
         self.equation = EquationOfMotion(robot)
@@ -811,8 +813,9 @@ class RecordedMotion:
                 "" if "joint/torque_command" in self.log else ", joint/torque_command is missing"
             )
             raise InputError(
-                f"the log has nothing to compare a model with{lacking} (needed: torques, or feet and an IMU, without gaps for "
-                f"{self.recording.block:g} s, in rows that recording.unused_rows and recording.least_speed leave)"
+                f"the log has nothing to compare a model with{lacking} (needed: torques, or feet "
+                f"and an IMU, without gaps for {self.recording.block:g} s, in rows that "
+                "recording.unused_rows and recording.least_speed leave)"
             )
         value = self.equation.residual(self.steps)
         if self.recording.recorded_cutoff > 0:

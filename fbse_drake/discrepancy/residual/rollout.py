@@ -283,7 +283,10 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     try:
         simulator.AdvanceTo(duration)
     except RuntimeError as error:
-        failure = f"t = {start + context.get_time():.3f} s: the solver failed: {str(error).splitlines()[0]}"
+        failure = (
+            f"t = {start + context.get_time():.3f} s: the solver failed: "
+            f"{str(error).splitlines()[0]}"
+        )
     found = sink.FindLog(context)
     time, rows = found.sample_times(), found.data().T
     finite = np.logical_and.accumulate(np.isfinite(rows).all(axis=1))

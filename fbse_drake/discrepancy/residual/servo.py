@@ -41,7 +41,8 @@ def scaled_gains(
     if not isinstance(factor, int | float):
         numbers = [name for name, value in constants.items() if isinstance(value, int | float)]
         raise InputError(
-            f"gain {recorded.gain}: expected a number that is kept with the log's stretches (there are: {', '.join(numbers)})"
+            f"gain {recorded.gain}: expected a number that is kept with the log's stretches "
+            f"(there are: {', '.join(numbers)})"
         )
     gains = {
         key: {joint: factor * value for joint, value in getattr(control, key).items()}
@@ -80,7 +81,8 @@ def with_command(scenario: Scenario, log: Log, names: RobotDescription) -> Log:
             )
             if kd.any() and "joint/velocity" not in log:
                 raise InputError(
-                    "kd: the log has no channel joint/velocity, from which the torque of the position loop would follow"
+                    "kd: the log has no channel joint/velocity, from which the torque of the "
+                    "position loop would follow"
                 )
         error, error_rate = (
             q_ref[rows] - q[rows],
