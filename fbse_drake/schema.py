@@ -297,7 +297,7 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
 def alternatives_of(schema: Any) -> tuple[Any, ...]:
     """What an open class can be: its own static method `alternatives` says so. A union says it by
     itself."""
-    return schema.alternatives() if "alternatives" in vars(schema) else ()
+    return schema.alternatives() if "alternatives" in getattr(schema, "__dict__", ()) else ()
 
 
 def _scalar(schema: type, value: Any, file: str, key: str) -> Any:
