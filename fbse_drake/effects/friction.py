@@ -19,7 +19,9 @@ def _sharp() -> dict[str, float]:
     return {"all": 0.01}
 
 
-def smooth_sign(velocity: np.ndarray, transition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def smooth_sign(
+    velocity: np.ndarray, transition: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
     """tanh(velocity / transition) and its derivative with respect to the velocity."""
     tanh = np.tanh(velocity / transition)
     return tanh, (1.0 - tanh * tanh) / transition

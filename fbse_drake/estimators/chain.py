@@ -172,8 +172,8 @@ class Chain:
         for row in estimates():
             size = self._sizes(row.estimator).get(row.field)
             if size is not None:
-                port = f"{row.port}{self._suffix}"
-                self.builder.ExportOutput(self._field(row.estimator, row.field), port)
+                name = f"{row.port}{self._suffix}"
+                self.builder.ExportOutput(self._field(row.estimator, row.field), name)
                 channels[row.channel] = row.sample_shape(n, size)
         return channels
 

@@ -214,11 +214,11 @@ def _topics(log: Log, types: dict[str, Any]) -> Iterator[tuple[str, Any, dict[st
         return types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
 
     joints = {field: log[name] for field, name in _NAMES["/joint_states"].items() if name in log}
-    values = [
+    zeros = [
         np.zeros(len(log.joints) if field in joints else 0)
         for field in ("position", "velocity", "effort")
     ]
-    yield "/joint_states", types[JOINT_STATE](header(""), list(log.joints), *values), joints
+    yield "/joint_states", types[JOINT_STATE](header(""), list(log.joints), *zeros), joints
 
     imu = {field: log[name] for field, name in _NAMES["/imu"].items() if name in log}
     if imu:

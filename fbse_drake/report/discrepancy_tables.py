@@ -15,6 +15,7 @@ from fbse_drake.report.discrepancy_figures import (
     targets_text,
 )
 from fbse_drake.report.html import (
+    Cell,
     Table,
     number,
 )
@@ -79,7 +80,7 @@ def steps_table(study: Study, *, tested: bool) -> Table:
 def _spread_rows(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
     """How far recordings that were fitted together agree in what was found; see
     `_SPREAD_HEADER`."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for finding in findings:
         for name, spread in finding.spread.items():
             unit = finding.parameters[name].unit
@@ -177,7 +178,7 @@ def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
     several = len(rounds) > 1
     tables = []
     for effect, findings in where.items():
-        rows = []
+        rows: list[tuple[Cell, ...]] = []
         for number_of, finding in findings:
             values = map(_value_text, finding.parameters.values())
             errors = (finding.held_out_before, finding.held_out_after)
@@ -255,7 +256,7 @@ def relative_error_tables(study: Study) -> list[Table]:
     if not any(np.isfinite(error.relative) for error in first.values()):
         return []
     joints = next(iter(first.values())).relative_by_joint
-    rows = [
+    rows: list[tuple[Cell, ...]] = [
         (
             words(joint),
             *(
@@ -320,7 +321,7 @@ def simulated_position_tables(study: Study, robot: Robot) -> list[Table]:
 def growth_table(steps: Sequence[StudyStep], robot: Robot) -> Table:
     """Errors step by step, and those of the simulated model where it was simulated."""
     header = ["Added", "Held-out error / noise", "Fitted error / noise"]
-    rows = [
+    rows: list[list[Cell]] = [
         [
             as_sentence(listed_effects(s.added)) if s.added else "The model as given.",
             s.held_out_rmse,
@@ -344,5 +345,7 @@ def growth_table(steps: Sequence[StudyStep], robot: Robot) -> Table:
                     rolled.failure or "complete",
                 ]
     return Table(
-        tuple(header), tuple(map(tuple, rows)), "Errors as the model grows, over all channels."
+        tuple(header),
+        tuple(tuple(row) for row in rows),
+        "Errors as the model grows, over all channels.",
     )

@@ -378,7 +378,9 @@ def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan 
     excess = np.maximum(lower - q, q - upper)
     if excess.max() > 0:
         sample, joint = np.unravel_index(excess.argmax(), excess.shape)
-        step = f"step {(plan.phase_at(time[sample])[0] + 1) // 2}, " if plan is not None else ""
+        step = (
+            f"step {(plan.phase_at(float(time[sample]))[0] + 1) // 2}, " if plan is not None else ""
+        )
         raise InputError(
             f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at "
             f"{q[sample, joint]:.3f} rad, "
@@ -549,9 +551,9 @@ def _joint_sines(config: JointSines, robot: Robot, time: np.ndarray) -> Referenc
     _check_limits(robot, time, motion[0], None)
     still = np.zeros((len(time), 3))
     X_WB = robot.base.EvalPoseInWorld(context)
-    return Reference(
-        time, *motion, torque, PointMotion(still + X_WB.translation(), still, still), None
-    )
+    base = PointMotion(still + X_WB.translation(), still, still)
+    position, velocity, acceleration = motion
+    return Reference(time, position, velocity, acceleration, torque, base, None)
 
 
 class ReferenceSource(Diagram):

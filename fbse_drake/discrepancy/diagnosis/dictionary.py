@@ -262,8 +262,8 @@ def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
     larger = motion._replace(
         command=100 * motion.command, load=(100 if load_too else 1) * motion.load
     )
-    columns = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
-    return not np.array_equal(*columns)
+    usual, changed = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
+    return not np.array_equal(usual, changed)
 
 
 def usual_values(effect: type[Effect]) -> np.ndarray:

@@ -87,12 +87,16 @@ def identify(
     findings += inertia_findings(fits.white, raw, alone, inertia)
     completed = add(scenario, findings)
     logs = {"train": log} | dict(tests or {})
-    errors = [
+    before, after = (
         {name: model_error(Predictor(one, other)) for name, other in logs.items()}
         for one in (scenario, completed)
-    ]
-    rmse = (root_mean_square(fits.white, sse) for sse in (fitted.held_out_sse, fitted.sse))
-    return Identification(inertia, tuple(findings), *errors, *rmse, completed)
+    )
+    held_out_rmse, train_rmse = (
+        root_mean_square(fits.white, sse) for sse in (fitted.held_out_sse, fitted.sse)
+    )
+    return Identification(
+        inertia, tuple(findings), before, after, held_out_rmse, train_rmse, completed
+    )
 
 
 def identifiability_text(inertia: IdentifiedInertia) -> str:

@@ -122,6 +122,7 @@ def study(
 
     # Of the tests, by every model.
     tested: list[dict[str, Predictor]] = []
+    interrupted: str | None = None
 
     def measured_step(
         added: Sequence[Finding], held_out_rmse: float, train_rmse: float, *, simulated: bool
@@ -152,7 +153,6 @@ def study(
 
     effects = None if effects is None else list(effects)
     predictor, planned_with = Predictor(scenario, log), scenario.believed
-    interrupted: str | None = None
     while len(diagnoses) < _MOST_ROUNDS and interrupted is None:
         diagnosis = diagnose(predictor, effects, progress=progress)
         diagnoses.append(diagnosis)

@@ -118,9 +118,7 @@ class TorqueDropouts(JointTorqueEffect):
         motion: JointMotion,
         nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
-        wave = sum(
-            np.sin(2 * np.pi * frequency * motion.time) for frequency in _DROPOUT_FREQUENCIES
-        )
+        wave = np.sum([np.sin(2 * np.pi * f * motion.time) for f in _DROPOUT_FREQUENCIES], axis=0)
         return (motion.command * (wave > _DROPOUT_LEVEL),), (0.0,)
 
 

@@ -244,7 +244,7 @@ def _lateness(evidence: Evidence, torques: JointTorques, k: int) -> float:
     columns, length = torques.columns(k), evidence.motion.length
     stretch = torques.stretches(k)
     inner = slice(_LARGEST_OFFSET, len(stretch) - _LARGEST_OFFSET)
-    offsets = length * np.arange(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1)
+    offsets = [length * k for k in range(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1)]
 
     def late_by(samples: int) -> np.ndarray:
         return torques.late(k, columns, samples).left[inner]

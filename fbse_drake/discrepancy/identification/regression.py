@@ -52,6 +52,12 @@ class Signature:
     lowest: np.ndarray | float = -np.inf
 
 
+# Places of the rows that two signatures share in each of them, and inner products of their columns.
+_Products = WeakKeyDictionary[
+    Signature, WeakKeyDictionary[Signature, tuple[np.ndarray, np.ndarray, np.ndarray]]
+]
+
+
 @dataclass(frozen=True)
 class Spread:
     """How sure P fitted parameters are."""
@@ -291,12 +297,8 @@ class Regression:
             _MOST_NUMBERS, lambda parts: sum(part.size for part in parts)
         )
         self._targets: WeakKeyDictionary[Signature, np.ndarray] = WeakKeyDictionary()
-        self._grams: WeakKeyDictionary[
-            Signature, WeakKeyDictionary[Signature, tuple[np.ndarray, ...]]
-        ] = WeakKeyDictionary()
-        self._products: WeakKeyDictionary[
-            Signature, WeakKeyDictionary[Signature, tuple[np.ndarray, ...]]
-        ] = WeakKeyDictionary()
+        self._grams: _Products = WeakKeyDictionary()
+        self._products: _Products = WeakKeyDictionary()
         self._rights: WeakKeyDictionary[Signature, np.ndarray] = WeakKeyDictionary()
         # In the order in which signatures were first seen: what is tried last stands last, and all
         # before it are known together already.
@@ -339,11 +341,11 @@ class Regression:
             return of_a, of_b, np.swapaxes(products, 2, 3)
         if b not in known:
             of_a, of_b = _shared(a, b)
-            products = [
+            by_fold = [
                 np.swapaxes(x[of_a], 1, 2) @ z[of_b]
                 for x, z in zip(self._by_fold(a), self._by_fold(b), strict=True)
             ]
-            known[b] = of_a, of_b, np.array(products)
+            known[b] = of_a, of_b, np.array(by_fold)
         return known[b]
 
     def target(self, signature: Signature) -> np.ndarray:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -105,7 +105,7 @@ class Evidence:
             }
         )
 
-    def _read(self, **changes: object) -> RecordedMotion:
+    def _read(self, **changes: Any) -> RecordedMotion:
         """The log read in another way."""
         motion = self.motion
         return RecordedMotion(

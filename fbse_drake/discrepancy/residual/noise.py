@@ -83,9 +83,9 @@ def noise_power(
         count = len(index) // _WINDOW
         if count < 2:
             continue
-        index = index[: count * _WINDOW].reshape(count, _WINDOW)
-        expected = believed[index + order // 2, row].mean(axis=1)
-        power = (differences[index, row] ** 2).mean(axis=1)
+        windowed = index[: count * _WINDOW].reshape(count, _WINDOW)
+        expected = believed[windowed + order // 2, row].mean(axis=1)
+        power = (differences[windowed, row] ** 2).mean(axis=1)
         ratio[row] = np.quantile(power / np.maximum(expected, _ROUNDING), _QUIET) / typical
         windows[row] = count
     return Power(ratio, _EFFICIENCY * freedom * windows)

@@ -44,11 +44,11 @@ def scaled_gains(
             f"gain {recorded.gain}: expected a number that is kept with the log's stretches "
             f"(there are: {', '.join(numbers)})"
         )
-    gains = {
-        key: {joint: factor * value for joint, value in getattr(control, key).items()}
-        for key in ("kp", "kd")
-    }
-    return replace(control, **gains)
+    kp, kd = (
+        {joint: factor * value for joint, value in gains.items()}
+        for gains in (control.kp, control.kd)
+    )
+    return replace(control, kp=kp, kd=kd)
 
 
 def with_command(scenario: Scenario, log: Log, names: RobotDescription) -> Log:
