@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import numpy as np
@@ -72,6 +73,8 @@ class Visit:
     contents: bool = False
     # Of the window, (height, width, 3).
     screenshot: np.ndarray = field(default_factory=lambda: np.empty(0))
+    # What a script of the test's own returned.
+    told: dict[str, Any] = field(default_factory=dict)
 
 
 Visitor = Callable[..., list[Visit]]
@@ -81,13 +84,31 @@ _LOOK = """() => {
   const page = document.documentElement;
   return {
     headings: [...document.querySelectorAll("h2")].map(heading => heading.textContent),
-    pictures: [...document.querySelectorAll("img, svg")].map(
-      picture => [picture.naturalWidth ?? picture.clientWidth, picture.clientWidth]),
+    pictures: [...document.querySelectorAll("img")].map(
+      picture => [picture.naturalWidth, picture.clientWidth]),
     overflow: page.scrollWidth - page.clientWidth,
     cut_off: [...document.querySelectorAll("h1, h2, h3, p, li, th, td, summary, img")]
       .filter(one => one.getBoundingClientRect().right > page.clientWidth + 0.5)
       .map(one => one.textContent || one.alt),
   };
+}"""
+
+# Zooms into the first chart, then chooses its second view.
+_LOOK_CLOSER = """async () => {
+  const chart = document.querySelector(".chart"), plot = chart.querySelector(".plot");
+  while (!plot.querySelector(".trace")) await new Promise(done => setTimeout(done, 50));
+  const select = chart.querySelector("select");
+  const seen = () => ({
+    name: select.value, lines: plot.querySelectorAll(".trace").length,
+    range: plot.layout.xaxis.range, y: plot.data.at(-1).y.bdata,
+  });
+  await Plotly.relayout(plot, {"xaxis.range": [0.1, 0.2]});
+  const first = seen();
+  select.selectedIndex = 1;
+  select.dispatchEvent(new Event("change"));
+  await new Promise(done => setTimeout(done, 200));
+  const buttons = [...plot.querySelectorAll(".modebar-btn")].map(button => button.dataset.title);
+  return {joints: [first, seen()], buttons};
 }"""
 
 _CONTENTS_AT_THE_END = """() => {
@@ -106,7 +127,7 @@ def visit() -> Iterator[Visitor]:
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=executable, args=_OPTIONS)
 
-        def opened(path: Path, *views: tuple[int, str]) -> list[Visit]:
+        def opened(path: Path, *views: tuple[int, str], script: str = "") -> list[Visit]:
             requests: list[str] = []
             errors: list[str] = []
             context = browser.new_context(offline=True)
@@ -134,6 +155,8 @@ def visit() -> Iterator[Visitor]:
                 seen.screenshot = _pixels(page.screenshot())
                 if picture := page.query_selector("figure img"):
                     seen.brightness = float(_pixels(picture.screenshot()).mean())
+                if script:
+                    seen.told = page.evaluate(script)
                 seen.contents = page.evaluate(_CONTENTS_AT_THE_END)
                 found.append(seen)
             context.close()
@@ -231,6 +254,20 @@ def test_report_of_a_run(visit: Visitor, run: Callable[..., Log], folder: Path):
         [SUMMARY, "Motion", "Joints", "Foot forces", "Friction", "Sensors", "Scenario"],
         10,
     )
+
+
+def test_charts_of_a_run_share_their_time_axis(visit: Visitor, folder: Path):
+    """What is zoomed into stays so for another joint; nothing can be sent away."""
+    log = joints_only_log()
+    write_run_report(folder / "joints.html", log, run_metrics(log, 1.0), name="joints")
+    (seen,) = visit(folder / "joints.html", (1280, "light"), script=_LOOK_CLOSER)
+    assert (seen.requests, seen.errors) == ([], [])
+    first, second = seen.told["joints"]
+    assert [first["name"], second["name"]] == [name.replace("_", " ") for name in log.joints[:2]]
+    assert first["lines"] == second["lines"] > 0
+    assert first["range"] == second["range"] == [0.1, 0.2]
+    assert first["y"] != second["y"]
+    assert not any("share" in title.lower() for title in seen.told["buttons"])
 
 
 def test_runs_beside_each_other(visit: Visitor, folder: Path):

@@ -44,6 +44,7 @@ from fbse_drake.report.html import (
     number,
     write_report,
 )
+from fbse_drake.report.residual_chart import residual_chart
 from fbse_drake.report.sentences import (
     Inputs,
     applicable,
@@ -231,7 +232,7 @@ def write_study_report(
     completed = dump_scenario(study.scenario, inputs.name) if study.found else None
     sections = [
         _summary(rows),
-        _where(before[1], before[0]),
+        _where(before[1], before[0], after[0] if study.found else None),
         *_why(
             [step.added for step in study.steps[1:]],
             study.diagnoses[0].ranking,
@@ -263,8 +264,14 @@ def _summary(rows: Sequence[tuple[str, str]]) -> Section:
     return Section("Summary", tables=(Table(("", ""), tuple(rows)),))
 
 
-def _where(comparison: Comparison, predictor: Predictor) -> Section:
-    """Where the model fails: in words, on the robot, against each variable and over time."""
+def _where(
+    comparison: Comparison, predictor: Predictor, completed: Predictor | None = None
+) -> Section:
+    """Where the model fails: in words, on the robot, against each variable and over time.
+
+    Args:
+        completed: the model with what was found, if anything was.
+    """
     robot, residual, motion = predictor.robot, predictor.residual, predictor.motion
     known = [channel for channel in comparison.channels if not np.isnan(channel.rmse)]
     if robot.description.legs:
@@ -297,6 +304,7 @@ def _where(comparison: Comparison, predictor: Predictor) -> Section:
                 figures.errors_over_time(residual, robot.description.sides, worst),
             ),
         ]
+    blocks.append(residual_chart(predictor, completed))
     text = _METHOD if comparison.failures else f"{_METHOD} No failure above the noise."
     return Section(
         "Where the model fails",

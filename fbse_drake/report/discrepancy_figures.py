@@ -42,9 +42,9 @@ _RATIO_COLORS = LinearSegmentedColormap.from_list(
     "ratio", ["#f3f5f7", "#fbe3c8", "#f4a562", "#d65f1a", "#8f1313"]
 )
 _RATIO_NORM = LogNorm(1.0, _DARKEST, clip=True)
-_NOISE = "#8a9199"
+NOISE = "#8a9199"
 # A model before something was added to it.
-_BEFORE = "#d65f1a"
+BEFORE = "#d65f1a"
 # Effects that a tick names, panels in a row.
 _MOST_NAMED = 3
 _PANELS = 3
@@ -276,7 +276,7 @@ def _draw_falls(
         text = number(last)
         if first != last:
             axes.hlines(place, *sorted((first, last)), color=color, linewidth=1.5, alpha=0.4)
-            axes.plot(first, place, "o", color=_BEFORE, markersize=6, label=labels[0])
+            axes.plot(first, place, "o", color=BEFORE, markersize=6, label=labels[0])
             text = f"{number(first)} → {text}"
         axes.plot(last, place, "o", color=color, markersize=6, label=label)
         style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": PLANNED}
@@ -358,7 +358,7 @@ def _draw_bins(axes: Axes, bins: Sequence[Bin]) -> None:
         centre,
         -noise,
         noise,
-        color=_NOISE,
+        color=NOISE,
         alpha=0.45,
         linewidth=0,
         label="± 2 standard deviations of the noise",
@@ -388,7 +388,7 @@ def errors_over_time(
             residual.time,
             -noise,
             noise,
-            color=_NOISE,
+            color=NOISE,
             alpha=0.45,
             linewidth=0,
             label="± 2 standard deviations of the noise",
@@ -440,9 +440,7 @@ def torques_over_time(
             decorate(axes)
             axes.margins(x=0)
         torques.plot(time, measured, color="#15181b", linewidth=1.8, alpha=0.35, label="measured")
-        torques.plot(
-            time, measured - left, color=_BEFORE, linewidth=0.9, label="the model as given"
-        )
+        torques.plot(time, measured - left, color=BEFORE, linewidth=0.9, label="the model as given")
         torques.plot(
             time, measured - rest, color=ESTIMATE, linewidth=0.9, label="the completed model"
         )
@@ -450,12 +448,12 @@ def torques_over_time(
             time,
             -noise,
             noise,
-            color=_NOISE,
+            color=NOISE,
             alpha=0.45,
             linewidth=0,
             label="± 2 standard deviations of the noise",
         )
-        errors.plot(time, left, color=_BEFORE, linewidth=0.9)
+        errors.plot(time, left, color=BEFORE, linewidth=0.9)
         errors.plot(time, rest, color=ESTIMATE, linewidth=0.9)
         size = np.linalg.norm(measured[known])
         shares = [
@@ -492,7 +490,7 @@ def position_errors(before: RolloutError, after: RolloutError, units: Sequence[s
         decorate(axes)
         axes.margins(x=0)
         for error, color, label in (
-            (before, _BEFORE, "the model as given"),
+            (before, BEFORE, "the model as given"),
             (after, ESTIMATE, "the completed model"),
         ):
             time = error.sample_time
@@ -609,7 +607,7 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
     axes.axvspan(
         1.0,
         1.3 * highest,
-        facecolor=_NOISE,
+        facecolor=NOISE,
         alpha=0.2,
         linewidth=0,
         label="larger than plausible: could not be seen",

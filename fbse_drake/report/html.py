@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from fbse_drake.files import write_text
+from fbse_drake.report.chart import Chart, plotly_gzip
 
 _DPI = 130
 
@@ -104,7 +105,7 @@ class Section:
     title: str
     text: str | Step = ""
     tables: tuple[Table, ...] = ()
-    figures: tuple[FigureBlock | FigureRow, ...] = ()
+    figures: tuple[FigureBlock | FigureRow | Chart, ...] = ()
     details: tuple[Details, ...] = ()
 
 
@@ -169,6 +170,8 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters["number"] = number
     environment.filters["png"] = _png_uri
+    environment.globals["plotly_gzip"] = plotly_gzip
+    environment.tests["chart"] = lambda block: isinstance(block, Chart)
     environment.tests["measure"] = lambda cell: isinstance(cell, Measure)
     return environment
 

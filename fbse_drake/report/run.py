@@ -9,6 +9,7 @@ import numpy as np
 from fbse_drake.effects.effect import library, spaced
 from fbse_drake.log import Log
 from fbse_drake.report.figures import run_figures
+from fbse_drake.report.figures.joint_chart import joint_chart
 from fbse_drake.report.html import (
     Details,
     Report,
@@ -42,7 +43,11 @@ def write_run_report(
     sections = [
         Section("Summary", log.meta.get("title", ""), tables=(key_figures(metrics),)),
         Section("Motion", figures=figures["walk"]),
-        Section("Joints", tables=_tracking_table(metrics), figures=figures["joints"]),
+        Section(
+            "Joints",
+            tables=_tracking_table(metrics),
+            figures=(joint_chart(log), *figures["joints"]),
+        ),
         Section("Foot forces", figures=figures["forces"]),
         Section(
             "Friction",
