@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import scenario
 from pydrake.multibody.tree import JacobianWrtVariable
-from recorded_arm import ARM, Course
+from recorded_arm import ARM, Course, Machine
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.diagnosis.detectability import separation
@@ -16,7 +16,9 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.diagnosis.rivals import fitted
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.rivals import fitted, indistinguishable, rivals
+from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.sensor import ImuMisalignment, TransmissionElasticity
 
@@ -181,3 +183,31 @@ def test_experiments_of_an_arm_are_planned() -> None:
     """Another scenario's estimator may need sensors that the arm does not have."""
     experiments = Experiments(ARM.scenario)
     assert experiments.that_shows(library()["CoulombFriction"]) is not None
+
+
+class Wrench(TorqueBias):
+    """Not in the library: a constant torque by another name."""
+
+
+def test_a_rival_that_differs_where_drift_hides_it_is_not_passed_over() -> None:
+    """A bias of two joints and one of the first joint alone differ in the second, whose torque
+    drifts: few samples there are independent. How many are in the first joint does not matter.
+    """
+    machine = Machine(
+        "double_pendulum",
+        posture=(0.3, 0.2),
+        amplitude=(0.8, 0.9),
+        rotor_inertia=(0.0, 0.0),
+        torque_noise=(0.6, 0.05),
+    )
+    course = machine.course(1)
+    torque = course.torque + 0.3
+    torque[:, 1] += 0.2 * np.sin(2 * np.pi * course.time / machine.duration)
+    predictor = machine.predictor(machine.log(course, torque))
+    proposals = Proposals(Fits(Dictionary(predictor, [TorqueBias, Wrench])))
+    fits, first = proposals.fits, (machine.joints[0],)
+    both = proposals.beside(fits.explain([]), TorqueBias, tuple(machine.joints))
+    alone = proposals.beside(fits.explain([]), Wrench, first)
+    assert list(indistinguishable(fits, {0: [alone]}, both)[0]) == [alone]
+    of_both = indistinguishable(fits, rivals(proposals, both), both)[0]
+    assert (Wrench, first) in [(e.candidates[-1].effect, e.candidates[-1].targets) for e in of_both]

@@ -141,6 +141,10 @@ class Judge:
         drop, gain = (f(base, wider).sum() for f in (self.drop_by_row, self.gain_by_row))
         return min(1.0, float(gain / drop)) if min(drop, gain) > 0 else 1.0
 
+    def least_share(self, rows: np.ndarray) -> float:
+        """The same of any drop in some rows, at least: as if what explains it were constant."""
+        return float(1.0 / blocks_per_sample(self._left[:, rows]).max())
+
     def pays(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
         """Is a member worth its parameters, is it more than nothing, and does it worsen no row?"""
         fits = self._fits

@@ -1,12 +1,13 @@
 """Proposals: which candidates, alone, would take off enough of what an explanation leaves over."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect
@@ -59,8 +60,7 @@ class Proposals:
             for candidate in fits.fixed_candidates
             if (candidate.effect, candidate.targets) not in known
             and np.intersect1d(candidate.signature.rows, rows).size
-            and (gain := fixed_gain(beside, candidate)) > 0.5 * fits.required(candidate)
-            and self._may_reach(wanted, base, candidate.signature.rows, gain)
+            and self._gains_enough(candidate, base, wanted)
         ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
             group: [] for group in dictionary.groups
@@ -72,9 +72,11 @@ class Proposals:
                 places = [dictionary.joints.index(joint) for joint in group]
                 if taken & set(group) or not np.intersect1d(places, rows).size:
                     continue
-                gain = self._gain(effect, places, beside)
+                moments = self._grid_moments(effect, places, beside)
+                gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
                 best = int(gain.argmax())
-                if self._may_reach(wanted, base, places, float(gain[best])):
+                alone = (float(grid_gain(effect, *of_row).max()) for of_row in moments)
+                if self._may_reach(wanted, base, places, alone):
                     coarse[group].append((float(gain[best]), effect, best))
         for group, found in coarse.items():
             # What the grid shows far behind the best does not catch up between its points.
@@ -128,14 +130,25 @@ class Proposals:
         """An explanation with one more joint torque effect, with the nonlinear values that fit best beside it."""
         remainder = self.fits.remainder(base)
         places = [self.fits.dictionary.joints.index(joint) for joint in targets]
-        gain = self._gain(effect, places, remainder)
+        moments = self._grid_moments(effect, places, remainder)
+        gain = grid_gain(effect, *_weighted(moments, remainder.scale[places]))
         best = self._best_on(effect, targets, int(gain.argmax()), remainder)
         return self.fits.explain([*base.candidates, best])
 
-    def _gain(
+    def _gains_enough(self, candidate: Candidate, base: Explanation, wanted: float) -> bool:
+        """Is a candidate that is no joint torque effect worth a fit?"""
+        beside, s = self.fits.remainder(base), candidate.signature
+        moments = [beside.moments(s, k) for k in range(len(s.rows))]
+        gain = fixed_gain(*_weighted(moments, beside.scale[s.rows]))
+        alone = (fixed_gain(*of_row) for of_row in moments)
+        return gain > 0.5 * self.fits.required(candidate) and self._may_reach(
+            wanted, base, s.rows, alone
+        )
+
+    def _grid_moments(
         self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
-    ) -> np.ndarray:
-        """Drop of the sum of squares for each set of an effect's first grid, in joints at these places together, (G,)."""
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Inner products of the sets of an effect's first grid, in each of the joints at these places."""
         grid, moments = self.fits.grid(effect), []
         for place in places:
             # Found once for what an explanation has in a row.
@@ -144,26 +157,20 @@ class Proposals:
                 sets = grid.sets[place]
                 self._moments[key] = beside.moments_of_sets(sets.signature, 0, sets.gram)
             moments.append(self._moments[key])
-        return grid_gain(effect, *_weighted(moments, beside.scale[places]))
+        return moments
 
     def _may_reach(
-        self, wanted: float, base: Explanation, rows: Sequence[int], gain: float
+        self, wanted: float, base: Explanation, rows: Sequence[int], alone: Iterable[float]
     ) -> bool:
-        """May a candidate that takes this off the weighted sum of squares of some rows lower the
-        deviance as much as is wanted?
+        """May a candidate lower the deviance as much as is wanted?
 
-        The deviance of a row falls the faster the less is left in it. So it falls most if all that
-        is there is taken from one row, then from the next.
+        Args:
+            alone: what it would take off the sum of squares of each of these rows with values that
+                suit this row best.
         """
         if wanted <= 0:
             return True
-        deviance, scale = self.fits.white.deviance, self.fits.remainder(base).scale
-        left = base.sse.copy()
-        for row in sorted(rows, key=lambda row: -scale[row]):
-            taken = min(gain, left[row] / scale[row])
-            left[row] -= scale[row] * taken
-            gain -= taken
-        return deviance(base.sse) - deviance(left) > _CATCHES_UP * wanted
+        return largest_drop(self.fits.white, base.sse, rows, [*alone]) > _CATCHES_UP * wanted
 
     def _best_on(
         self,
@@ -226,11 +233,26 @@ def _weighted(
     )
 
 
-def fixed_gain(beside: Remainder, candidate: Candidate) -> float:
-    """Drop of the sum of squares by a candidate that is no joint torque effect, roughly."""
-    s = candidate.signature
-    moments = [beside.moments(s, k) for k in range(len(s.rows))]
-    gram, right = _weighted(moments, beside.scale[s.rows])
+def largest_drop(
+    white: WhitenedResidual, sse: np.ndarray, rows: Sequence[int], alone: Sequence[float]
+) -> float:
+    """More than this no effect lowers the deviance, whatever its values are.
+
+    Together its rows lose no more than each of them with values that suit this row best. (Rows are
+    not to be weighed against each other: where little is left in one row, it weighs more.)
+
+    Args:
+        sse: sums of squares that it is added to, (R,).
+        rows: in which it acts.
+        alone: what it takes off the sum of squares of each of them with such values.
+    """
+    left = sse.copy()
+    left[rows] -= np.clip(alone, 0.0, sse[rows])
+    return white.deviance(sse) - white.deviance(left)
+
+
+def fixed_gain(gram: np.ndarray, right: np.ndarray) -> float:
+    """Drop of the sum of squares by columns with these inner products, roughly."""
     return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
 
 

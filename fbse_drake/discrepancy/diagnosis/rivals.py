@@ -35,8 +35,10 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
     for k, member in enumerate(final.candidates):
         fits.dictionary.progress("fitting what looks alike", k / len(final.candidates))
         rest = fits.explain([c for c in final.candidates if c is not member])
-        # What chance may tell apart, and what explains much of what the member does.
-        alike = fits.threshold[-1] / judge.independent_share(rest, final)
+        # What chance may tell apart, however little of the difference counts, and what explains much
+        # of what the member does.
+        share = min(judge.independent_share(rest, final), judge.least_share(member.signature.rows))
+        alike = fits.threshold[-1] / share
         near = max(alike, (1.0 - _NEAR) * (rest.deviance - final.deviance))
         additions = [
             e

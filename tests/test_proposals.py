@@ -1,0 +1,57 @@
+"""Which candidates a search looks at: none that could come up to what is wanted is passed over."""
+
+import numpy as np
+import pytest
+from test_regression import white_of
+
+from fbse_drake.discrepancy.diagnosis.proposals import fixed_gain, largest_drop
+from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.identification.regression import Regression, Signature
+
+BLOCKS, ROWS = 400, 3
+
+
+def bound_and_drop(residual: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
+    """The largest drop of the deviance that is held possible for columns (B, R, p) beside one that
+    is in the first row already, and the drop that they bring."""
+    white = white_of(residual)
+    regression, rng = Regression(white), np.random.default_rng(1)
+    known = Signature(np.array([0]), rng.normal(size=(BLOCKS, 1, 1)))
+    added = Signature(np.arange(ROWS), columns)
+    before, after = regression.fit([known]), regression.fit([known, added])
+    beside = Remainder(regression, (known,), before.parameters, white.scale(before.sse), tied=False)
+    alone = [fixed_gain(*beside.moments(added, row)) for row in range(ROWS)]
+    bound = largest_drop(white, before.sse, added.rows, alone)
+    return bound, white.deviance(before.sse) - white.deviance(after.sse)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_fit_takes_off_more_than_is_held_possible(seed: int) -> None:
+    """Rows at the noise, below it and far above it."""
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(BLOCKS, ROWS, 2)) * 10.0 ** rng.uniform(-2, 2, ROWS)[:, None]
+    residual = rng.normal(size=(BLOCKS, ROWS)) * 10.0 ** rng.uniform(-0.5, 1.5, ROWS)
+    residual += columns @ rng.normal(size=2) * rng.integers(0, 2, ROWS)
+    bound, drop = bound_and_drop(residual, columns)
+    assert drop <= bound * (1 + 1e-9) + 1e-6
+
+
+def test_in_one_row_that_is_what_a_fit_takes_off() -> None:
+    rng = np.random.default_rng(0)
+    columns = rng.normal(size=(BLOCKS, ROWS, 1)) * [[1.0], [0.0], [0.0]]
+    residual = rng.normal(size=(BLOCKS, ROWS)) + 5.0 * columns[:, :, 0]
+    bound, drop = bound_and_drop(residual, columns)
+    assert drop > 1000
+    assert bound == pytest.approx(drop, rel=1e-6)
+
+
+def test_a_row_that_gains_much_is_not_weighed_down_by_one_that_does_not() -> None:
+    """The first row asks for an amount of 10, the others for none. As rows are weighed before the
+    fit, it brings little; but once the first row is explained, that counts for more."""
+    rng = np.random.default_rng(0)
+    columns = np.tile(rng.normal(size=(BLOCKS, 1, 1)), (1, ROWS, 1))
+    columns[:, 1:] *= 0.15
+    residual = rng.normal(size=(BLOCKS, ROWS))
+    residual[:, 0] += 10.0 * columns[:, 0, 0]
+    bound, drop = bound_and_drop(residual, columns)
+    assert 500 < drop <= bound
