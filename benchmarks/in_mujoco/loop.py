@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.in_mujoco.physics import Physics, Readings
-from benchmarks.in_mujoco.robot import Machine, make_machine
+from benchmarks.in_mujoco.robot import Machine, make_machine, pad_bodies
 from fbse_drake import Log
 from fbse_drake.control.position_loop import position_loop
 from fbse_drake.robot.plant import Ground
@@ -146,13 +146,16 @@ def _simulate(run: Run, machine: Machine, reference: Reference) -> _States:
 
 
 def _set_start(machine: Machine, data: mujoco.MjData, reference: Reference, ground: Ground) -> None:
-    """The reference's first posture, as deep in the ground as that carries the weight."""
+    """The reference's first posture, on its lowest pad and as deep in the ground as carries the
+    weight."""
     data.qpos[machine.position_index] = reference.joint_position[0]
     if machine.robot.has_floating_base:
         weight = -machine.model.opt.gravity[2] * machine.model.body_mass.sum()
         data.qpos[:3] = reference.base.position[0]
-        data.qpos[2] -= weight / (machine.model.nsensor * ground.stiffness)
         data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
+        mujoco.mj_kinematics(machine.model, data)
+        data.qpos[2] -= min(data.body(name).xpos[2] for name in pad_bodies(machine.robot))
+        data.qpos[2] -= weight / (machine.model.nsensor * ground.stiffness)
 
 
 def _imu(machine: Machine, states: _States, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -159,6 +159,22 @@ class CentreOfMass(Physics):
 
 
 @dataclass(frozen=True)
+class LongLink(Physics):
+    """A link that is longer [m]: the body behind it is further away, and no mass is moved."""
+
+    body: str
+    length: float
+
+    @property
+    def answers(self) -> tuple[HiddenEffect, ...]:
+        return (_values("LinkLength", (self.body,), abs(self.length), length=self.length),)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        (behind,) = spec.body(self.body).bodies
+        behind.pos = behind.pos * (1.0 + self.length / np.linalg.norm(behind.pos))
+
+
+@dataclass(frozen=True)
 class Payload(Physics):
     """A ball that is fixed to a body off its centre of mass."""
 

@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from fbse_drake.report.figures.style import INK
+from fbse_drake.report.style import INK
 
 # For captions.
 HOW_TO_ZOOM = (

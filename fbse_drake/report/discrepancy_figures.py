@@ -24,7 +24,8 @@ from fbse_drake.discrepancy.diagnosis.study import StudyStep
 from fbse_drake.discrepancy.residual.residual import Residual, Row
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.effects.effect import library, spaced
-from fbse_drake.report.figures.style import (
+from fbse_drake.report.html import number
+from fbse_drake.report.style import (
     ERROR,
     ESTIMATE,
     PLANNED,
@@ -33,7 +34,6 @@ from fbse_drake.report.figures.style import (
     add_legend,
     decorate,
 )
-from fbse_drake.report.html import number
 from fbse_drake.robot.plant import Robot
 
 # Ratios of error to noise: white is noise alone, the darkest red is this many times it and more.

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from fbse_drake.discrepancy.diagnosis.identify import Identification
 from fbse_drake.discrepancy.identification.inertial import BaseParameter
-from fbse_drake.report.figures.style import ERROR, ESTIMATE, PLANNED, WIDTH, add_legend, decorate
 from fbse_drake.report.html import number
+from fbse_drake.report.style import ERROR, ESTIMATE, PLANNED, WIDTH, add_legend, decorate
 
 # Of a line in a picture [inch].
 _LINE = 0.24

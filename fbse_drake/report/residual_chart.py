@@ -10,8 +10,8 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.report.chart import HOW_TO_ZOOM, Chart, Line, Panel, View
 from fbse_drake.report.discrepancy_figures import BEFORE, NOISE
-from fbse_drake.report.figures.style import ESTIMATE, INK, SIDE_COLORS
 from fbse_drake.report.html import number
+from fbse_drake.report.style import ESTIMATE, INK, SIDE_COLORS
 
 
 def residual_chart(given: Predictor, completed: Predictor | None = None) -> Chart:

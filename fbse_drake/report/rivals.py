@@ -6,7 +6,6 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from fbse_drake.report.figures.style import ESTIMATE, SIDE_COLORS, WIDTH, add_legend, decorate
 from fbse_drake.report.html import (
     Details,
     FigureBlock,
@@ -16,6 +15,7 @@ from fbse_drake.report.html import (
     number,
     write_report,
 )
+from fbse_drake.report.style import ESTIMATE, SIDE_COLORS, WIDTH, add_legend, decorate
 from fbse_drake.rivals.cases import NOMINAL
 from fbse_drake.rivals.comparison import PHASES, Comparison, Mean
 from fbse_drake.rivals.methods import OURS, START

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydrake.systems.framework import Context
 
-from fbse_drake.report.figures.style import add_legend, decorate
+from fbse_drake.report.style import add_legend, decorate
 from fbse_drake.robot.plant import Robot
 
 _LIMB, _SOLE, _MASS = "#5b6670", "#2979b5", "#d65f1a"

@@ -16,13 +16,13 @@ from fbse_drake.report.figures.panels import (
     stretches,
     time_grid,
 )
-from fbse_drake.report.figures.style import BROAD, ESTIMATE, INK, THIN, add_legend
 from fbse_drake.report.metrics import (
     attitude_error_deg,
     base_velocity_error,
     has_feet,
     roll_and_pitch_deg,
 )
+from fbse_drake.report.style import BROAD, ESTIMATE, INK, THIN, add_legend
 
 # The least that a panel shows.
 _ANGLE_SPAN = 0.1  # [deg]

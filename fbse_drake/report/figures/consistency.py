@@ -20,8 +20,8 @@ from fbse_drake.report.figures.panels import (
     stride,
     time_grid,
 )
-from fbse_drake.report.figures.style import COM, ESTIMATE, INK, WIDTH, add_legend, decorate
 from fbse_drake.report.metrics import nis_bounds, normalised_innovations, settled
+from fbse_drake.report.style import COM, ESTIMATE, INK, WIDTH, add_legend, decorate
 
 _PART_COLORS = (ESTIMATE, "#d65f1a", COM, "#8a8f14", "#7b3fa0", "#5c5c5c", "#b8436f", "#3f6fb8")
 _STATUS_COLORS = {

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from fbse_drake.log import Log
 from fbse_drake.report.figures.kind import figure_kind
 from fbse_drake.report.figures.panels import name_phases, plot, side_color, time_grid
-from fbse_drake.report.figures.style import INK, PLANNED
 from fbse_drake.report.metrics import has_feet
+from fbse_drake.report.style import INK, PLANNED
 
 # The direction of a foot's force means little below this share of the feet's mean load.
 _LOADED_SHARE = 0.05

@@ -8,8 +8,8 @@ from fbse_drake.log import Log
 from fbse_drake.report.chart import HOW_TO_ZOOM, Chart, Line, Panel, View
 from fbse_drake.report.figures.forces import feels_feet, foot_force
 from fbse_drake.report.figures.panels import joint_color, side_color, source
-from fbse_drake.report.figures.style import ESTIMATE, INK, TRUTH
 from fbse_drake.report.metrics import ended_step, joint_position_channel, joint_sides
+from fbse_drake.report.style import ESTIMATE, INK, TRUTH
 
 _CAPTION = (
     "What is known of a joint, sample by sample; the band is twice the estimate's standard "

@@ -26,7 +26,15 @@ from fbse_drake.report.figures.panels import (
     time_grid,
     widen,
 )
-from fbse_drake.report.figures.style import (
+from fbse_drake.report.html import number
+from fbse_drake.report.metrics import (
+    broken_laws,
+    ended_step,
+    friction_error,
+    friction_law_error,
+    settled,
+)
+from fbse_drake.report.style import (
     BROAD,
     ERROR,
     ESTIMATE,
@@ -36,14 +44,6 @@ from fbse_drake.report.figures.style import (
     WIDTH,
     add_legend,
     decorate,
-)
-from fbse_drake.report.html import number
-from fbse_drake.report.metrics import (
-    broken_laws,
-    ended_step,
-    friction_error,
-    friction_law_error,
-    settled,
 )
 from fbse_drake.scenario import Scenario
 

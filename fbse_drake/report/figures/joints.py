@@ -13,8 +13,8 @@ from fbse_drake.report.figures.panels import (
     source,
     widen,
 )
-from fbse_drake.report.figures.style import INK, add_legend
 from fbse_drake.report.metrics import joint_position_channel
+from fbse_drake.report.style import INK, add_legend
 
 # The least that a panel shows of an error [mrad].
 _ERROR_SPAN = 0.2

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fbse_drake.log import Log
-from fbse_drake.report.figures.style import (
+from fbse_drake.report.metrics import joint_sides, settled, stance
+from fbse_drake.report.style import (
     INK,
     PLANNED,
     SIDE_COLORS,
@@ -16,7 +17,6 @@ from fbse_drake.report.figures.style import (
     WIDTH,
     decorate,
 )
-from fbse_drake.report.metrics import joint_sides, settled, stance
 from fbse_drake.walking.plan import Phase
 
 # Points drawn of one line, about two per pixel of a wide panel.

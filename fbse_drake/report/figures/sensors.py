@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from fbse_drake.log import Log
 from fbse_drake.report.figures.kind import figure_kind
 from fbse_drake.report.figures.panels import plot, time_grid
-from fbse_drake.report.figures.style import PLANNED, add_legend
+from fbse_drake.report.style import PLANNED, add_legend
 
 
 @figure_kind(

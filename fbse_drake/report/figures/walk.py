@@ -22,7 +22,8 @@ from fbse_drake.report.figures.panels import (
     stride,
     time_grid,
 )
-from fbse_drake.report.figures.style import (
+from fbse_drake.report.metrics import com_rse, has_feet
+from fbse_drake.report.style import (
     BROAD,
     COM,
     ESTIMATE,
@@ -34,7 +35,6 @@ from fbse_drake.report.figures.style import (
     add_legend,
     decorate,
 )
-from fbse_drake.report.metrics import com_rse, has_feet
 from fbse_drake.walking.plan import Phase
 
 
