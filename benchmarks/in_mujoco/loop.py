@@ -153,8 +153,15 @@ def _set_start(machine: Machine, data: mujoco.MjData, reference: Reference, grou
         weight = -machine.model.opt.gravity[2] * machine.model.body_mass.sum()
         data.qpos[:3] = reference.base.position[0]
         data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
+        pads = [data.body(name) for name in pad_bodies(machine.robot)]
         mujoco.mj_kinematics(machine.model, data)
-        data.qpos[2] -= min(data.body(name).xpos[2] for name in pad_bodies(machine.robot))
+        x, y, z = np.transpose([pad.xpos - data.qpos[:3] for pad in pads])
+        # All pads on one plane, which is turned to be level: legs may differ.
+        _, along_x, along_y = np.linalg.lstsq(np.stack([np.ones_like(x), x, y], 1), z)[0]
+        level = Rotation.from_rotvec([-along_y, along_x, 0.0])
+        data.qpos[3:7] = level.as_quat(scalar_first=True)
+        mujoco.mj_kinematics(machine.model, data)
+        data.qpos[2] -= min(pad.xpos[2] for pad in pads)
         data.qpos[2] -= weight / (machine.model.nsensor * ground.stiffness)
 
 
