@@ -15,11 +15,9 @@ from fbse_drake.log import Log
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
-from fbse_drake.scenario import Scenario, build_robot, dump_scenario, planned_reference
+from fbse_drake.scenario import Scenario, build_robot, dump_scenario, task_plan
 from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
-from fbse_drake.walking.plan import TaskPlan
-from fbse_drake.walking.reference import Recorded
 from fbse_drake.wiring import release
 
 
@@ -109,13 +107,6 @@ def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]
     return inputs
 
 
-def _plan(scenario: Scenario, robot: Robot) -> TaskPlan | None:
-    """What the motion was planned from; nobody knows it of a recorded one."""
-    if isinstance(scenario.reference, Recorded):
-        return None
-    return planned_reference(scenario, robot).plan
-
-
 def _reading_time(scenario: Scenario) -> float:
     """What a log's reading of accelerometer or foot force is the mean over [s]."""
     return scenario.plant.time_step if scenario.recording.rows == "per_step" else 0.0
@@ -155,7 +146,7 @@ class Replay:
             scenario.estimator,
             robot,
             period=float(log.meta["period"]),
-            plan=_plan(scenario, robot),
+            plan=task_plan(scenario, robot),
             every_sample=True,
             reading=_reading_time(scenario),
             sensors=sensors,

@@ -37,7 +37,8 @@ from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
 from fbse_drake.sensors.sensor import Sensor
-from fbse_drake.walking.reference import Reference, ReferenceConfig, make_reference
+from fbse_drake.walking.plan import TaskPlan
+from fbse_drake.walking.reference import Reference, ReferenceConfig, make_plan, make_reference
 from fbse_drake.walking.walk import Walk
 
 
@@ -426,10 +427,24 @@ def planned_reference(scenario: Scenario, model: Robot) -> Reference:
     Raises:
         InputError: see `make_reference`.
     """
-    ticks = round(scenario.duration / scenario.control.period)
     with located("reference: "):
-        time = np.arange(ticks + 1) * scenario.control.period
-        return make_reference(scenario.reference, model, time)
+        return make_reference(scenario.reference, model, _ticks(scenario))
+
+
+def task_plan(scenario: Scenario, model: Robot) -> TaskPlan | None:
+    """What the scenario's motion is planned from, see `make_plan`; a fraction of the work.
+
+    Raises:
+        InputError: see `make_plan`.
+    """
+    with located("reference: "):
+        return make_plan(scenario.reference, model, _ticks(scenario))
+
+
+def _ticks(scenario: Scenario) -> np.ndarray:
+    """Times of the control [s]."""
+    ticks = round(scenario.duration / scenario.control.period)
+    return np.arange(ticks + 1) * scenario.control.period
 
 
 def load_scenario(

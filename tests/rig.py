@@ -3,6 +3,7 @@ samples of a log."""
 
 import dataclasses
 import shutil
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,8 @@ from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
 from fbse_drake.robot.plant import Robot, make_robot
-from fbse_drake.walking.reference import make_reference
+from fbse_drake.walking.reference import make_plan
+from fbse_drake.wiring import release
 
 TICK = 1e-3
 CLOCK = Clock(TICK, TICK * (1 - 1e-6))
@@ -143,9 +145,8 @@ def diagram(config: Estimator, scenario: Scenario) -> EstimatorDiagram:
     """The estimator as the scenario's station has it."""
     believed = scenario.believed
     robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia)
-    plan = make_reference(
-        scenario.reference, robot, np.arange(round(scenario.duration / TICK) + 1) * TICK
-    ).plan
+    time = np.arange(round(scenario.duration / TICK) + 1) * TICK
+    plan = make_plan(scenario.reference, robot, time)
     estimator = make_estimator(config, robot, period=TICK, plan=plan)
     assert estimator is not None
     return estimator
@@ -156,11 +157,14 @@ class Replay:
 
     def __init__(self, estimator: EstimatorDiagram):
         self.estimator, self.context = estimator, estimator.CreateDefaultContext()
+        # Nothing else frees systems that are written in Python.
+        weakref.finalize(self, release, estimator)
 
     def fork(self) -> "Replay":
         """A copy that goes on from here."""
         copy = Replay.__new__(Replay)
         copy.estimator, copy.context = self.estimator, self.context.Clone()
+        copy.origin = self
         return copy
 
     def run(

@@ -36,7 +36,8 @@ from fbse_drake.effects.sensor import (
 )
 from fbse_drake.estimation import estimate
 from fbse_drake.robot.plant import Ground, PointMass, Robot, make_robot
-from fbse_drake.scenario import RobotConfig, build_robot
+from fbse_drake.scenario import RobotConfig, build_robot, planned_reference
+from fbse_drake.wiring import release
 
 WEIGHT = 87.0 * 9.81
 TICK = 1e-3
@@ -234,7 +235,7 @@ def test_feedforward_of_a_model_bears_its_masses(plain: Robot):
     loaded = dataclasses.replace(
         base, model=dataclasses.replace(base.robot, effects={"mass": BodyMass({"left_shank": 0.4})})
     )
-    first, second = (build_station(each).reference for each in (base, loaded))
+    first, second = (planned_reference(each, build_robot(each.believed)) for each in (base, loaded))
     # At rest: the torque that holds the weight of the mass.
     weight = 0.4 * 9.81 * lift(plain, "left_shank", first.joint_position[0])
     np.testing.assert_allclose(
@@ -317,6 +318,7 @@ def test_simulated_imu_reads_bias_and_turned_axes():
             station.GetOutputPort("measured_imu").Eval(context), expected, atol=1e-12
         )
         assert np.linalg.norm(true[3:]) > 1e-4
+    release(station)
 
 
 def test_misalignment_is_that_of_the_imu_configuration():

@@ -27,6 +27,7 @@ from fbse_drake.scenario import Scenario, SensorsConfig
 from fbse_drake.walking.leg_kinematics import LegKinematics, UnreachableError
 from fbse_drake.walking.reference import make_reference
 from fbse_drake.walking.stand import Squat
+from fbse_drake.wiring import release
 
 WEIGHT = 50.0 * 9.81
 
@@ -167,6 +168,7 @@ def test_wrench_is_that_of_drakes_contacts():
         G = grasp_map(station.robot.pad_positions(side))
         assert expected[5] > 50
         np.testing.assert_allclose(G @ forces[foot].ravel(), expected, rtol=1e-4, atol=1e-3)
+    release(station)
 
 
 def test_corners_are_as_good_as_pads(run, tmp_path: Path):

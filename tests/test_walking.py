@@ -11,7 +11,13 @@ from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Ground, Robot, Stairs, make_robot
 from fbse_drake.walking.leg_kinematics import LegKinematics, UnreachableError
 from fbse_drake.walking.plan import support_margin
-from fbse_drake.walking.reference import Reference, load_shares, make_reference
+from fbse_drake.walking.reference import (
+    JointSines,
+    Reference,
+    load_shares,
+    make_plan,
+    make_reference,
+)
 from fbse_drake.walking.stand import Squat, Sway
 from fbse_drake.walking.walk import Walk
 
@@ -26,6 +32,19 @@ def robot() -> Robot:
 @pytest.fixture(scope="module")
 def walk(robot: Robot) -> Reference:
     return make_reference(Walk(), robot, TIME)
+
+
+def test_a_plan_needs_no_joints(robot: Robot, walk: Reference):
+    plan = make_plan(Walk(), robot, TIME)
+    assert plan is not None
+    assert walk.plan is not None
+    np.testing.assert_array_equal(plan.com.position, walk.plan.com.position)
+    for side in plan.feet:
+        np.testing.assert_array_equal(plan.support(side), walk.plan.support(side))
+        np.testing.assert_array_equal(plan.feet[side].position, walk.plan.feet[side].position)
+    with pytest.raises(InputError, match="zmp_margin"):
+        make_plan(Walk(zmp_inward=0.045), robot, TIME)
+    assert make_plan(JointSines(), robot, TIME) is None
 
 
 def random_angles(samples: int, seed: int = 0) -> np.ndarray:

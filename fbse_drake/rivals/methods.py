@@ -14,7 +14,7 @@ from fbse_drake.estimation import friction_estimates
 from fbse_drake.estimators.estimator import Estimator, library, make_estimator
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import friction_nrmse
-from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.scenario import Scenario, build_robot, task_plan
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
 from fbse_drake.walking.walk import Walk
 from fbse_drake.wiring import release
@@ -72,7 +72,7 @@ def methods(scenario: Scenario) -> tuple[list[Method], dict[str, str]]:
     scenario = measured(scenario)
     robot = build_robot(scenario.believed)
     period = scenario.control.period or scenario.usual_period
-    plan = planned_reference(replace(scenario, duration=2 * period), robot).plan
+    plan = task_plan(replace(scenario, duration=2 * period), robot)
     sensors = scenario.sensors.by_name.values()
     ports = [port for sensor in sensors for port in sensor.ports()]
     found, unfit = [], {}

@@ -170,6 +170,29 @@ class RecordedReference:
             raise InputError(f"reference: a recorded motion is only simulated for {allowed}")
 
 
+def make_plan(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> TaskPlan | None:
+    """What feet and centre of mass of a robot are to do in a motion, without its joints.
+
+    None if nobody knows it (`Recorded`) or if it is not planned in task space (`JointSines`).
+
+    Args:
+        config, robot, time: see `make_reference`.
+
+    Raises:
+        InputError: the ZMP is too near the edge of a foot, or the robot's base is fixed.
+    """
+    if isinstance(config, JointSines | Recorded):
+        return None
+    if not robot.has_floating_base:
+        raise InputError(
+            f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
+        )
+    legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
+    corners = {side: robot.pad_positions(side) for side in legs}
+    gravity = robot.plant.gravity_field().gravity_vector()
+    return config.plan(time, _stance(legs), corners, gravity)
+
+
 def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> Reference:
     """Plans a motion for a robot.
 
@@ -188,14 +211,9 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         )
     if isinstance(config, JointSines):
         return _joint_sines(config, robot, time)
-    if not robot.has_floating_base:
-        raise InputError(
-            f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
-        )
+    plan = make_plan(config, robot, time)
+    assert plan is not None
     legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
-    corners = {side: robot.pad_positions(side) for side in legs}
-    gravity = robot.plant.gravity_field().gravity_vector()
-    plan = config.plan(time, _stance(legs), corners, gravity)
     try:
         joint_motion, base, motions = _inverse_kinematics(
             robot, legs, plan, _posture(config.posture, robot.description)
