@@ -217,9 +217,11 @@ class Log(Mapping[str, np.ndarray]):
             "units": {name: self.unit(name) for name in self.channels},
         }
 
+        arrays: dict[str, Any] = {"meta": np.array(to_json(meta)), **self.channels}
+
         def write(partial: Path) -> None:
             with partial.open("wb") as file:
-                np.savez_compressed(file, meta=np.array(to_json(meta)), **self.channels)
+                np.savez_compressed(file, **arrays)
 
         write_atomically(Path(path), write)
 

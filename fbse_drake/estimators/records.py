@@ -36,7 +36,7 @@ def as_record(vector: np.ndarray, kind: np.dtype) -> np.ndarray:
 def parts(kind: np.dtype) -> dict[str, slice]:
     """Where the fields of a record are in its vector; fields without numbers are left out."""
     found, number = {}, np.dtype(float).itemsize
-    for name, (field, offset) in kind.fields.items():
+    for name, (field, offset, *_) in (kind.fields or {}).items():
         if field.itemsize > 0:
             start = offset // number
             found[name] = slice(start, start + size_of(field))

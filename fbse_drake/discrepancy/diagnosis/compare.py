@@ -475,15 +475,15 @@ class _RowErrors:
                 first -= 1
             while last + 1 < len(bins) and size[last + 1] >= _SIMILAR * max(size):
                 last += 1
-            found.append(
-                self._bin(
-                    phase,
-                    division.phases[phase],
-                    division.variable,
-                    bins[first].low,
-                    bins[last].high,
-                )
+            whole = self._bin(
+                phase,
+                division.phases[phase],
+                division.variable,
+                bins[first].low,
+                bins[last].high,
             )
+            if whole is not None:
+                found.append(whole)
         return found
 
 
