@@ -172,6 +172,7 @@ def picture(rows: pa.Table, y: str, x: str, by: Sequence[str]) -> Figure:
     if others and axes.has_data():
         axes.legend(frameon=False, fontsize=8)
     axes.grid(color="0.9")
+    axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
