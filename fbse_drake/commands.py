@@ -462,16 +462,23 @@ def _table(options: argparse.Namespace) -> bool:
     found, values = tables.groups(rows, by), tables.figures(rows, options.value)
     summaries = list(tables.summary_rows(found, values))
     units, console = units_of(rows.schema), Console(quiet=options.quiet)
-    shown = Table(*by, "runs", "failed", title=options.folder, title_justify="left")
-    for value in values:
-        shown.add_column(f"{value} [{units[value]}]" if units[value] else value)
+    labels = (f"{value} [{units[value]}]" if units[value] else value for value in values)
+    lines = [[*by, "runs", "failed", *labels]]
     for row in summaries:
         same, (count, failed), numbers = row[: len(by)], row[len(by) :][:2], row[len(by) + 2 :]
+        # Few runs have no interval.
         cells = (
-            f"{number(middle)} ({number(low)} to {number(high)})"
+            number(middle) + f" ({number(low)} to {number(high)})" * (not np.isnan(low + high))
             for middle, low, high in zip(*[iter(numbers)] * 3, strict=True)
         )
-        shown.add_row(*map(str, same), str(count), str(failed), *cells)
+        lines.append([*map(str, same), str(count), str(failed), *cells])
+    if len(values) > len(summaries):
+        lines = list(map(list, zip(*lines, strict=True)))
+    shown = Table(title=options.folder, title_justify="left")
+    for title in lines[0]:
+        shown.add_column(title, overflow="fold")
+    for line in lines[1:]:
+        shown.add_row(*line)
     console.print(shown)
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / "table.csv", lambda partial: write_csv(rows, partial))

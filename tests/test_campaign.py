@@ -285,6 +285,28 @@ def test_intervals_hold_the_true_median_and_share_as_often_as_they_say():
     assert np.isnan(Summary.of(pa.array([1.0, 2.0, None])).low)
 
 
+def test_a_table_of_many_values_has_a_row_for_each(
+    tmp_path: Path, scheduler: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Side by side they would not fit; names are not cut."""
+    out = tmp_path / "out"
+    campaign = squares(tmp_path, Grid({"side": [1.0, 2.0]}, seeds=2))
+    run_campaign(campaign, str(out), scheduler=scheduler)
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main(["table", str(out), "--by", "seed", "--value", "square.area"]) == DONE
+    assert "square.area" in capsys.readouterr().out
+    values = [f"a_rather_long_name_of_value_{k}" for k in range(9)]
+    monkeypatch.setattr("fbse_drake.campaign.table.figures", lambda *_: values)
+    monkeypatch.setattr(
+        "fbse_drake.campaign.table.summary_rows", lambda *_: [(0, 2, 0, *[0.5] * 27)]
+    )
+    monkeypatch.setattr("fbse_drake.campaign.rows.units_of", lambda _: dict.fromkeys(values, "1"))
+    assert main(["table", str(out), "--by", "seed"]) == DONE
+    shown = capsys.readouterr().out
+    assert all(value in shown for value in values)
+    assert shown.count("0.500 (0.500 to 0.500)") == len(values)
+
+
 def test_a_table_groups_by_the_design_and_draws(tmp_path: Path, scheduler: str):
     sides = [1.0, 2.0, 3.0]
     campaign = squares(tmp_path, Grid({"side": sides}, seeds=8))
