@@ -17,9 +17,11 @@ from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import polished
 from fbse_drake.discrepancy.diagnosis.rivals import fitted, indistinguishable, rivals
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import library
+from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.effects.sensor import ImuMisalignment, TransmissionElasticity
 
 ELBOW = 2
@@ -189,25 +191,50 @@ class Wrench(TorqueBias):
     """Not in the library: a constant torque by another name."""
 
 
+TWO_LINKS = Machine(
+    "double_pendulum",
+    posture=(0.3, 0.2),
+    amplitude=(0.8, 0.9),
+    rotor_inertia=(0.0, 0.0),
+    torque_noise=(0.6, 0.05),
+)
+
+
 def test_a_rival_that_differs_where_drift_hides_it_is_not_passed_over() -> None:
     """A bias of two joints and one of the first joint alone differ in the second, whose torque
     drifts: few samples there are independent. How many are in the first joint does not matter.
     """
-    machine = Machine(
-        "double_pendulum",
-        posture=(0.3, 0.2),
-        amplitude=(0.8, 0.9),
-        rotor_inertia=(0.0, 0.0),
-        torque_noise=(0.6, 0.05),
-    )
-    course = machine.course(1)
+    course = TWO_LINKS.course(1)
     torque = course.torque + 0.3
-    torque[:, 1] += 0.2 * np.sin(2 * np.pi * course.time / machine.duration)
-    predictor = machine.predictor(machine.log(course, torque))
+    torque[:, 1] += 0.2 * np.sin(2 * np.pi * course.time / TWO_LINKS.duration)
+    predictor = TWO_LINKS.predictor(TWO_LINKS.log(course, torque))
     proposals = Proposals(Fits(Dictionary(predictor, [TorqueBias, Wrench])))
-    fits, first = proposals.fits, (machine.joints[0],)
-    both = proposals.beside(fits.explain([]), TorqueBias, tuple(machine.joints))
+    fits, first = proposals.fits, (TWO_LINKS.joints[0],)
+    both = proposals.beside(fits.explain([]), TorqueBias, tuple(TWO_LINKS.joints))
     alone = proposals.beside(fits.explain([]), Wrench, first)
     assert list(indistinguishable(fits, {0: [alone]}, both)[0]) == [alone]
     of_both = indistinguishable(fits, rivals(proposals, both), both)[0]
     assert (Wrench, first) in [(e.candidates[-1].effect, e.candidates[-1].targets) for e in of_both]
+
+
+def test_what_does_not_fit_better_when_moved_holds_no_other_joint_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    course, (shoulder, elbow) = TWO_LINKS.course(1), TWO_LINKS.joints
+    torque = course.torque + np.array([3.0, 0.3]) * np.tanh(course.velocity / [0.03, 0.1])
+    predictor = TWO_LINKS.predictor(TWO_LINKS.log(course, torque))
+    fits = Fits(Dictionary(predictor, [CoulombFriction]))
+    made, beside = fits.candidate, fits.remainder(fits.explain([]))
+    start = {shoulder: np.array([0.03]), elbow: np.array([0.02])}
+    first, second = (made(CoulombFriction, (j,), x, beside) for j, x in start.items())
+
+    def worse_in_the_shoulder(effect, targets, nonlinear, remainder):
+        there = nonlinear if targets == (elbow,) else np.array([1.0])
+        return made(effect, targets, there, remainder)
+
+    monkeypatch.setattr(fits, "candidate", worse_in_the_shoulder)
+    before = fits.explain([first, second])
+    after = polished(fits, before)
+    assert after.candidates[0] is first
+    assert start[elbow] < after.candidates[1].nonlinear < 0.1
+    assert after.deviance < before.deviance - MARGIN

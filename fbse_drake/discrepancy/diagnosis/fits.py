@@ -17,6 +17,7 @@ from fbse_drake.discrepancy.identification.regression import (
     Signature,
     WhitenedResidual,
     bounded_least_squares,
+    connected,
     leftover,
 )
 from fbse_drake.discrepancy.residual.memory import Memory
@@ -39,6 +40,7 @@ _SLOPE_STEP = 0.02
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
 _MOST_NUMBERS = 30_000_000
+_MOST_POLISHED = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,10 @@ class Fits:
             _MOST_NUMBERS, lambda sets: sets.signature.values.size
         )
         self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
+        # Candidates that were fitted together, made linear about the values that were found.
+        self.polished: Memory[tuple[Candidate, ...]] = Memory(
+            _MOST_POLISHED, lambda members: sum(c.signature.values.size for c in members)
+        )
 
     def doubting(self, explanation: Explanation) -> tuple["Fits", Explanation]:
         """Fits that weigh the residual anew, and an explanation in them: friction laws that it
@@ -362,6 +368,12 @@ class Fits:
         if explanation.fit is None:
             return self.white.y
         return leftover(self.white, self.signatures(explanation), explanation.fit.parameters)
+
+    def apart(self, candidates: Sequence[Candidate]) -> list[list[int]]:
+        """Places of candidates whose fits depend on each other, group by group."""
+        if self.always:
+            return [list(range(len(candidates)))] if candidates else []
+        return connected([c.signature for c in candidates])
 
     def remainder(self, explanation: Explanation) -> Remainder:
         """What further effects could take of what an explanation leaves."""

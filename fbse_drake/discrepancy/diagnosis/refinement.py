@@ -2,10 +2,11 @@
 possible bodies, added to the model."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnosis.explanation import Explanation
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
@@ -28,9 +29,25 @@ _REMEASUREMENTS = 3
 
 
 def polished(fits: Fits, explanation: Explanation) -> Explanation:
-    """An explanation made linear about the values that its fit found."""
+    """An explanation made linear about the values that its fit found, where that is no worse.
+
+    Members that have nothing to do with each other are moved each by themselves: what is worse for
+    some is no reason not to move the others.
+    """
+    moved = list(explanation.candidates)
+    for group in fits.apart(moved):
+        members = tuple(moved[k] for k in group)
+        better = fits.polished.or_made(members, partial(_moved, fits, members))
+        for k, candidate in zip(group, better, strict=True):
+            moved[k] = candidate
+    return fits.explain(moved)
+
+
+def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    """Members made linear about the values that they have together; themselves if that is worse."""
+    explanation = fits.explain(members)
     moved, start = [], 0
-    for candidate in explanation.candidates:
+    for candidate in members:
         size, m = candidate.signature.values.shape[2], len(candidate.nonlinear)
         shift = explanation.fit.parameters[start + size - m : start + size]
         start += size
@@ -40,12 +57,12 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
                 moved.append(fits.about(candidate, values))
             except InputError:
                 # No body has these values.
-                return explanation
+                return members
             continue
         if m == 0:
             moved.append(candidate)
             continue
-        rest = fits.explain([c for c in explanation.candidates if c is not candidate])
+        rest = fits.explain([c for c in members if c is not candidate])
         ranges = np.array(
             [candidate.parameters[name].plausible for name in candidate.nonlinear_names]
         )
@@ -57,8 +74,8 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
         moved.append(
             fits.candidate(candidate.effect, candidate.targets, nonlinear, fits.remainder(rest))
         )
-    result = fits.explain(moved)
-    return result if result.deviance <= explanation.deviance + COMPLEXITY else explanation
+    better = fits.explain(moved)
+    return better.candidates if better.deviance <= explanation.deviance + COMPLEXITY else members
 
 
 def consistent(

@@ -319,7 +319,7 @@ class Regression:
         parameters, parts = np.zeros(sum(sizes)), []
         sse, held_out_sse = self.white.sse.copy(), self.white.sse.copy()
         # Those that share no row have nothing to do with each other.
-        for group in _connected(signatures):
+        for group in connected(signatures):
             members = sorted(group, key=lambda k: self._age[signatures[k]])
             part = self._part(tuple(signatures[k] for k in members))
             at = np.concatenate([places[k] for k in members])
@@ -551,7 +551,7 @@ def leftover(
     return left
 
 
-def _connected(signatures: Sequence[Signature]) -> list[list[int]]:
+def connected(signatures: Sequence[Signature]) -> list[list[int]]:
     """Places of signatures that share rows, directly or through others."""
     groups: list[tuple[set[int], list[int]]] = []
     for k, signature in enumerate(signatures):
