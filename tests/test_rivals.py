@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from conftest import scenario
 from pydrake.multibody.tree import JacobianWrtVariable
-from recorded_arm import ARM, Course, Machine
+from recorded_arm import ARM, PENDULUM, Course, Machine
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.diagnosis.detectability import separation
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
+from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
@@ -238,3 +239,20 @@ def test_what_does_not_fit_better_when_moved_holds_no_other_joint_back(
     assert after.candidates[0] is first
     assert start[elbow] < after.candidates[1].nonlinear < 0.1
     assert after.deviance < before.deviance - MARGIN
+
+
+def test_a_search_whose_first_find_does_not_hold_goes_another_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two names for one constant torque; the one that a search finds first does not pay."""
+
+    def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
+        held = [c for c in explanation.candidates if c.effect is not TorqueBias]
+        return proposals.fits.explain(held)
+
+    monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.diagnose.frugal", frugal)
+    course = PENDULUM.course(1)
+    predictor = PENDULUM.predictor(PENDULUM.log(course, course.torque + 0.3))
+    diagnosis = diagnose(predictor, [TorqueBias, Wrench])
+    assert [finding.effect for finding in diagnosis.chosen] == ["Wrench"]
+    assert diagnosis.chosen[0].parameters["bias"].value == pytest.approx(0.3, rel=0.05)

@@ -1,7 +1,7 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out
 residual."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from fbse_drake.discrepancy.diagnosis.detectability import smallest_detectable
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance, disturbances
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
-from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import frugal
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
@@ -42,6 +42,8 @@ EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
 # there, and leaves no more than this many times the noise.
 _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
+# A search is tried again, so often in all, if less than this share of what it explained pays.
+_HOLDS, _MOST_WAYS = 0.5, 3
 
 
 @dataclass(frozen=True)
@@ -259,9 +261,8 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
     first, partial = Fits(dictionary), None
     path, proposals = [first.explain([])], Proposals(first)
     try:
-        for path, proposals in select(remeasured(first)):  # noqa: B007 - the last one counts.
+        for path, proposals in _held(remeasured(first)):  # noqa: B007 - the last one counts.
             progress("looking for what explains more")
-        path[-1] = frugal(proposals, path[-1])
     except Interrupted as stop:
         partial = str(stop)
     alternatives: dict[int, list[Explanation]] = {}
@@ -282,6 +283,29 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
     return _Search(
         proposals, path, alternatives, first.white.sse, inertia, unexplained, disturbed, partial
     )
+
+
+def _held(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
+    """As `select`; the last path ends with what pays of its last explanation.
+
+    Where that explains little of what the search did, the search began with something that does not
+    hold, and left the right way: another one goes without it.
+    """
+    barred: frozenset[Name] = frozenset()
+    best: tuple[list[Explanation], Proposals] | None = None
+    for _ in range(_MOST_WAYS):
+        for path, proposals in select(fits, barred):
+            yield path, proposals
+        nothing, found, kept = path[0], path[-1], frugal(proposals, path[-1])
+        if best is None or kept.deviance < best[0][-1].deviance - MARGIN:
+            best = [*path[:-1], kept], proposals
+        left = {c.key for c in kept.candidates}
+        lost = [c.key for c in found.candidates if c.key not in left]
+        explained, holds = (nothing.deviance - e.deviance for e in (found, kept))
+        if not lost or holds >= _HOLDS * explained:
+            break
+        barred |= {lost[0]}
+    yield best
 
 
 def _settled_and_frugal(

@@ -11,6 +11,9 @@ from fbse_drake.discrepancy.identification.regression import Fit, Signature
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
+# An effect and its targets.
+Name = tuple[type[Effect], tuple[str, ...]]
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -34,6 +37,11 @@ class Candidate:
     @property
     def name(self) -> str:
         return self.effect.__name__
+
+    @property
+    def key(self) -> Name:
+        """What it is, whatever its values are."""
+        return self.effect, self.targets
 
     @cached_property
     def raw(self) -> Signature:

@@ -1,10 +1,10 @@
 """Proposals: which candidates, alone, would take off enough of what an explanation leaves over."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
@@ -14,7 +14,8 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
-# How often a grid of nonlinear values is narrowed down around its best point, and to how many points.
+# How often a grid of nonlinear values is narrowed down around its best point, and to how many
+# points.
 _NARROWINGS = 2
 _POINTS = 9
 # How often a candidate that is linear only nearby is made linear about the values that fit best.
@@ -35,8 +36,13 @@ LOOKING = "looking for what explains more"
 class Proposals:
     """Candidates that are worth a fit; see the module."""
 
-    def __init__(self, fits: Fits):
-        self.fits = fits
+    def __init__(self, fits: Fits, barred: Set[Name] = frozenset()):
+        """Nothing is looked at yet.
+
+        Args:
+            barred: what is not to be proposed.
+        """
+        self.fits, self._barred = fits, barred
         self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
         self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
@@ -54,11 +60,11 @@ class Proposals:
         if rows is None:
             rows = np.arange(len(beside.scale))
         enough = 0.5 * fits.threshold[1]
-        known = {(c.effect, c.targets) for c in base.candidates}
+        known = {c.key for c in base.candidates} | self._barred
         result = [
             self._settled(candidate, base)
             for candidate in fits.fixed_candidates
-            if (candidate.effect, candidate.targets) not in known
+            if candidate.key not in known
             and np.intersect1d(candidate.signature.rows, rows).size
             and self._gains_enough(candidate, base, wanted)
         ]
@@ -70,7 +76,11 @@ class Proposals:
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
             for group in dictionary.groups:
                 places = [dictionary.joints.index(joint) for joint in group]
-                if taken & set(group) or not np.intersect1d(places, rows).size:
+                if (
+                    taken & set(group)
+                    or (effect, group) in self._barred
+                    or not np.intersect1d(places, rows).size
+                ):
                     continue
                 moments = self._grid_moments(effect, places, beside)
                 gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
@@ -94,7 +104,8 @@ class Proposals:
         return result
 
     def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
-        """A candidate made linear about the values that fit best beside an explanation, if it is linear only nearby."""
+        """A candidate made linear about the values that fit best beside an explanation, if it is
+        linear only nearby."""
         if not candidate.effect.linear_nearby:
             return candidate
 
@@ -110,7 +121,8 @@ class Proposals:
         return self._found.or_made((candidate, base), made)
 
     def plain_friction(self) -> Explanation:
-        """Coulomb and viscous friction and a bias in every joint, fitted together; what identification of inertia begins with."""
+        """Coulomb and viscous friction and a bias in every joint, fitted together; what
+        identification of inertia begins with."""
         explanation = self.fits.explain([])
         for k in range(_SWEEPS):
             for effect in (CoulombViscousFriction, TorqueBias):
@@ -127,7 +139,8 @@ class Proposals:
     def beside(
         self, base: Explanation, effect: type[JointTorqueEffect], targets: tuple[str, ...]
     ) -> Explanation:
-        """An explanation with one more joint torque effect, with the nonlinear values that fit best beside it."""
+        """An explanation with one more joint torque effect, with the nonlinear values that fit best
+        beside it."""
         remainder = self.fits.remainder(base)
         places = [self.fits.dictionary.joints.index(joint) for joint in targets]
         moments = self._grid_moments(effect, places, remainder)
@@ -148,7 +161,7 @@ class Proposals:
     def _grid_moments(
         self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
     ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Inner products of the sets of an effect's first grid, in each of the joints at these places."""
+        """Inner products of the sets of an effect's first grid, in each of some joints."""
         grid, moments = self.fits.grid(effect), []
         for place in places:
             # Found once for what an explanation has in a row.
@@ -179,7 +192,8 @@ class Proposals:
         best: int,
         beside: Remainder,
     ) -> Candidate:
-        """A joint torque effect with the nonlinear values that fit best; found once for what is left in the group's rows."""
+        """A joint torque effect with the nonlinear values that fit best; found once for what is
+        left in the group's rows."""
         places = [self.fits.dictionary.joints.index(joint) for joint in group]
         key = (effect, group, *(part for j in places for part in beside.beside(j).key))
 

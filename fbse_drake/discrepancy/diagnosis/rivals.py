@@ -1,7 +1,9 @@
-"""Rivals: other effects in the place of a member of an explanation, each at the values that fit it best.
+"""Rivals: other effects in the place of a member of an explanation, each at the values that fit it
+best.
 
-Far from zero an effect is not what its slope at zero says: a crooked IMU that is linearised there looks worse than the bias that it
-resembles. So a rival is fitted by itself, nonlinear parameters and all, before it is compared.
+Far from zero an effect is not what its slope at zero says: a crooked IMU that is linearised there
+looks worse than the bias that it resembles. So a rival is fitted by itself, nonlinear parameters
+and all, before it is compared.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,20 +25,25 @@ from fbse_drake.errors import InputError
 _NEAR = 0.25
 # So many rivals of each member are fitted by themselves, and so often at most.
 _FITTED, _ROUNDS = 4, 3
-# Values of a nonlinear parameter that are tried over its plausible range, and how often the best is sought between its neighbours.
+# Values of a nonlinear parameter that are tried over its plausible range, and how often the best is
+# sought between its neighbours.
 _POINTS, _NARROWINGS = 5, 2
 
 
 def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
-    """For each member: explanations with another effect in its place, or the same on another body, which comes last; best first. One
-    for each effect and targets that comes near the member; the best of them fitted by themselves."""
+    """For each member: explanations with another effect in its place, or the same on another body,
+    which comes last; best first.
+
+    One for each effect and targets that comes near the member; the best of them fitted by
+    themselves.
+    """
     fits, result = proposals.fits, {}
     judge = Judge(fits, final)
     for k, member in enumerate(final.candidates):
         fits.dictionary.progress("fitting what looks alike", k / len(final.candidates))
         rest = fits.explain([c for c in final.candidates if c is not member])
-        # What chance may tell apart, however little of the difference counts, and what explains much
-        # of what the member does.
+        # What chance may tell apart, however little of the difference counts, and what explains
+        # much of what the member does.
         share = min(judge.independent_share(rest, final), judge.least_share(member.signature.rows))
         alike = fits.threshold[-1] / share
         near = max(alike, (1.0 - _NEAR) * (rest.deviance - final.deviance))
@@ -51,7 +58,8 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
 
 
 def rival_name(rival: Candidate, member: Candidate) -> str:
-    """What a rival of a member is called: another effect, or the same on another body; empty if it is neither."""
+    """What a rival of a member is called: another effect, or the same on another body; empty if it
+    is neither."""
     if rival.effect is not member.effect:
         return rival.name
     on_bodies = rival.effect.acts_on == "body" and rival.targets != member.targets
@@ -61,9 +69,11 @@ def rival_name(rival: Candidate, member: Candidate) -> str:
 def indistinguishable(
     fits: Fits, of_members: Mapping[int, Sequence[Explanation]], final: Explanation
 ) -> dict[int, list[Explanation]]:
-    """Rivals, by member, that explain as much as the final explanation, as far as samples are independent.
+    """Rivals, by member, that explain as much as the final explanation, as far as samples are
+    independent.
 
-    One with fewer parameters does also if chance may have brought what the final explanation has more.
+    One with fewer parameters does also if chance may have brought what the final explanation has
+    more.
     """
     judge = Judge(fits, final)
 
@@ -103,8 +113,8 @@ def _contains(law: type[Effect], other: type[Effect]) -> bool:
 
 
 def fitted(fits: Fits, explanation: Explanation) -> Explanation:
-    """An explanation at the values that fit it best, found by Gauss-Newton steps, and for its last member by a search over what is
-    nonlinear in it."""
+    """An explanation at the values that fit it best, found by Gauss-Newton steps, and for its last
+    member by a search over what is nonlinear in it."""
     best = _searched(fits, explanation)
     for _ in range(_ROUNDS):
         moved = polished(fits, best)
@@ -115,8 +125,8 @@ def fitted(fits: Fits, explanation: Explanation) -> Explanation:
 
 
 def _searched(fits: Fits, explanation: Explanation) -> Explanation:
-    """With the nonlinear parameters of the last member, one after the other, where they fit best. Those of joint torque effects were
-    searched for already."""
+    """With the nonlinear parameters of the last member, one after the other, where they fit best.
+    Those of joint torque effects were searched for already."""
     best, member = explanation, explanation.candidates[-1]
     if issubclass(member.effect, JointTorqueEffect):
         return explanation

@@ -1,10 +1,11 @@
-"""Selection of effects: which additions to an explanation are significant, and forward selection among them."""
+"""Selection of effects: which additions to an explanation are significant, and forward selection
+among them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
@@ -15,7 +16,8 @@ from fbse_drake.effects.sensor import FootForceGain
 
 # No explanation has more parts than this.
 _MOST_EFFECTS = 16
-# What an effect takes off a row may be wrong by this share; so small a rest is no evidence of another effect.
+# What an effect takes off a row may be wrong by this share; so small a rest is no evidence of
+# another effect.
 _MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
@@ -23,21 +25,26 @@ _IMPLAUSIBLE = 3.0
 _DISBELIEVED = 3.0
 
 
-def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
+def select(
+    fits: Fits, barred: Set[Name] = frozenset()
+) -> Iterator[tuple[list[Explanation], Proposals]]:
     """Explanations by forward selection, from none to the last that improves significantly.
 
     The residual is weighed anew with every addition.
 
+    Args:
+        barred: what is not tried.
+
     Yields:
-        After every addition, before and after what was there already is checked beside it: all explanations so far, and the
-        proposals for the last.
+        After every addition, before and after what was there already is checked beside it: all
+        explanations so far, and the proposals for the last.
     """
-    proposals = Proposals(fits)
+    proposals = Proposals(fits, barred)
     path = [fits.explain([])]
     yield [*path], proposals
     if fits.dictionary.inertia is not None:
         fits, explanation = fits.doubting(_pruned(fits, proposals.plain_friction()))
-        proposals = Proposals(fits)
+        proposals = Proposals(fits, barred)
         path.append(explanation)
         yield [*path], proposals
     revised: Sequence[Candidate] = ()
@@ -54,7 +61,7 @@ def select(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
             break
         weighed, explanation = fits.doubting(chosen)
         if weighed is not fits:
-            fits, proposals = weighed, Proposals(weighed)
+            fits, proposals = weighed, Proposals(weighed, barred)
         path.append(polished(fits, explanation))
         revised = path[-1].candidates
         yield [*path], proposals
@@ -66,9 +73,11 @@ def best_additions(
     rows: np.ndarray | None = None,
     most: float = np.inf,
 ) -> list[Explanation]:
-    """What one more candidate makes of an explanation, for every candidate that improves it significantly, best first.
+    """What one more candidate makes of an explanation, for every candidate that improves it
+    significantly, best first.
 
-    Joints of both legs may be wrong together, and one alone look like something else: `_pairs` are tried too.
+    Joints of both legs may be wrong together, and one alone look like something else: `_pairs` are
+    tried too.
 
     Args:
         rows: only candidates that change one of these; by default all.
@@ -98,7 +107,8 @@ def best_additions(
 
 
 def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Candidates in joints that are no joint torque effects, each with its like on the other legs; with values of their own."""
+    """Candidates in joints that are no joint torque effects, each with its like on the other legs;
+    with values of their own."""
     alike = dict.fromkeys(
         map(fits.dictionary.predictor.robot.description.counterparts, fits.dictionary.joints)
     )
@@ -115,8 +125,9 @@ def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]
 
 
 def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
-    """Could everything be nothing? Without torques only the masses and the gains of the feet say how large forces are: if all of them
-    are free, the smallest robot with the deafest feet explains every log."""
+    """Could everything be nothing? Without torques only the masses and the gains of the feet say
+    how large forces are: if all of them are free, the smallest robot with the deafest feet explains
+    every log."""
     names = fits.dictionary.predictor.robot.description
     gained = {side for c in candidates if c.effect is FootForceGain for side in c.targets}
     torques = any(fits.white.count[: len(names.joint_names)])
@@ -129,7 +140,8 @@ def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
 
 
 def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
-    """Does a candidate bring more than chance to an explanation without it, with values that can be?"""
+    """Does a candidate bring more than chance to an explanation without it, with values that can
+    be?"""
     rows = added.signature.rows
     if issubclass(added.effect, JointTorqueEffect) and not np.any(
         added.effect.shows_within(fits.dictionary.travel[rows], added.nonlinear)
@@ -184,9 +196,11 @@ def _pruned(fits: Fits, explanation: Explanation) -> Explanation:
 
 
 def _spread(fits: Fits, additions: list[Explanation]) -> Explanation:
-    """The best addition, with the same effect on all further joints where nothing else explains more.
+    """The best addition, with the same effect on all further joints where nothing else explains
+    more.
 
-    Joints that share values get values of their own if that explains more; then a simpler effect may do as well.
+    Joints that share values get values of their own if that explains more; then a simpler effect
+    may do as well.
     """
     best = _simplest(additions)
     added, others = best.candidates[-1], best.candidates[:-1]
@@ -225,7 +239,8 @@ def _spread(fits: Fits, additions: list[Explanation]) -> Explanation:
 
 
 def _simplest(additions: list[Explanation]) -> Explanation:
-    """The best addition; among those that are told apart by nobody, the one with the fewest parameters."""
+    """The best addition; among those that are told apart by nobody, the one with the fewest
+    parameters."""
     equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
     return min(equal, key=lambda e: len(e.fit.parameters))
 
