@@ -118,7 +118,8 @@ class PositionLoop(LeafSystem):
         self._period = config.period
         self._kp = names.per_joint(config.kp, key="control.kp")
         self._kd = names.per_joint(config.kd, key="control.kd")
-        self._limit = names.per_joint(config.torque_limit, key="control.torque_limit")
+        limit = names.per_joint(config.torque_limit, key="control.torque_limit")
+        self._limit = np.where(names.has_motor, limit, 0.0)
         self._estimated_state = self.DeclareVectorInputPort("estimated_state", 2 * n)
         self._desired_state = self.DeclareVectorInputPort("desired_state", 2 * n)
         self._friction_estimate = self.DeclareVectorInputPort("friction_estimate", n)

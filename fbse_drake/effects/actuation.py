@@ -22,6 +22,7 @@ class TorqueGain(JointTorqueEffect):
     signature: ClassVar[str] = "Torque in proportion to the command."
     experiment: ClassVar[str] = "Hold each joint under several loads."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "shortfall": Parameter("1", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf)),
     }
@@ -47,6 +48,7 @@ class TorqueBias(JointTorqueEffect):
     signature: ClassVar[str] = "The same torque at all times."
     experiment: ClassVar[str] = "Hold each joint still without load."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "bias": Parameter("Nm", linear=True, plausible=(-20.0, 20.0), bounds=(-np.inf, np.inf)),
     }
@@ -74,6 +76,7 @@ class TorqueDelay(JointTorqueEffect):
     signature: ClassVar[str] = "Torque in proportion to how fast the command changes."
     experiment: ClassVar[str] = "Command torques that change fast."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "delay": Parameter("s", linear=False, plausible=(5e-4, 3e-2), neutral=0.0)
     }
@@ -131,6 +134,7 @@ class TorqueLag(JointTorqueEffect):
     signature: ClassVar[str] = "After each change of the command a torque that fades away."
     experiment: ClassVar[str] = "Command torques that change fast."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "time_constant": Parameter("s", linear=False, plausible=(5e-4, 5e-2), neutral=0.0),
     }
@@ -179,6 +183,7 @@ class TorqueSaturation(JointTorqueEffect):
     )
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "limit": Parameter("Nm", linear=False, plausible=(2.0, 300.0), neutral=np.inf, grid=300),
     }
@@ -205,6 +210,7 @@ class TorqueRollOff(JointTorqueEffect):
     signature: ClassVar[str] = "Torque that grows with the square of the command."
     experiment: ClassVar[str] = "Load each joint up to its rated torque."
     shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         # The command of which half arrives.
         "half": Parameter(
@@ -249,6 +255,7 @@ class DcMotor(JointTorqueEffect):
     experiment: ClassVar[str] = (
         "Move each joint at several constant speeds, and let it swing with the drive switched off."
     )
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         # At the joint: of the motor's own constant, times the gear ratio.
         "kt": Parameter("Nm/A", linear=False, plausible=(1e-2, 20.0), neutral=0.0),

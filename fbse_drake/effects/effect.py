@@ -118,6 +118,8 @@ class Effect(ABC):
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "joint"
     # Other effects can say the same together; then the diagnosis does not try it.
     composite: ClassVar[bool] = False
+    # It is of a motor, its drive or its gear: a joint without any has none of it.
+    needs_motor: ClassVar[bool] = False
     # Its linear parameters enter linearly only about some values: a search makes it linear about
     # those that fit.
     linear_nearby: ClassVar[bool] = False

@@ -287,6 +287,7 @@ class LoadDependentFriction(JointTorqueEffect):
         "Torque against the motion that is large in stance and small in swing."
     )
     experiment: ClassVar[str] = "Move each joint to and fro with and without load."
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "coefficient": Parameter("1", linear=True, plausible=(0.0, 0.5), bounds=(0.0, 1.0)),
         "transition": _TRANSITION,

@@ -568,6 +568,7 @@ class TransmissionElasticity(SensorEffect):
     experiment: ClassVar[str] = (
         "Stand on one leg and shift the weight, or squat: large torques with little motion."
     )
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "compliance": Parameter("rad/Nm", linear=True, plausible=(1e-5, 1e-4)),
         "time_constant": Parameter(

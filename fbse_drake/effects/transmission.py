@@ -29,6 +29,7 @@ class TorqueRipple(JointTorqueEffect):
     )
     signature: ClassVar[str] = "A wave over the joint angle, the same in both directions of motion."
     experiment: ClassVar[str] = "Move each joint slowly through a large angle."
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "sine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
         "cosine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
@@ -167,6 +168,7 @@ class Backlash(JointTorqueEffect):
         "No torque reaches the link for some milliseconds after the command changes sign."
     )
     experiment: ClassVar[str] = "Swing each joint so that its torque changes sign often."
+    needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "gap": Parameter("rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0),
         "rotor_inertia": Parameter(

@@ -106,6 +106,8 @@ class RobotDescription:
     legs: dict[str, Leg] = field(default_factory=dict)
     # Further joints: of arms, of a torso, of a machine that has no legs.
     joints: list[str] = field(default_factory=list)
+    # Those of all these joints that no motor moves: their torques are zero, whatever a log says.
+    passive: list[str] = field(default_factory=list)
     # Angles near which the legs stand [rad], by joint or by what it is called in `leg_joints`: they
     # say which way knees bend. By default the middle of the joints' ranges.
     stance: dict[str, float] = field(default_factory=dict)
@@ -128,6 +130,11 @@ class RobotDescription:
             raise InputError(f"joints: {twice[0]} is named twice")
         if not self.joint_names:
             raise InputError("expected legs, joints or both, found neither")
+        for joint in self.passive:
+            if joint not in self.joint_names:
+                raise InputError(
+                    f"passive: unknown joint {joint} (allowed: {', '.join(self.joint_names)})"
+                )
 
     @cached_property
     def joint_names(self) -> list[str]:
@@ -140,6 +147,11 @@ class RobotDescription:
         """What each joint is called in a scenario beside its name: a joint of a leg as in
         `leg_joints`."""
         return [*(role for _ in self.legs for role in self.leg_joints), *self.joints]
+
+    @cached_property
+    def has_motor(self) -> np.ndarray:
+        """Which joints a motor moves, (n,) bool."""
+        return np.array([joint not in self.passive for joint in self.joint_names])
 
     @property
     def sides(self) -> list[str]:

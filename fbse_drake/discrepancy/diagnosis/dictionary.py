@@ -114,6 +114,11 @@ class Dictionary:
         wider = [group for group in wider if len({self.unit[joint] for joint in group}) == 1]
         return [*((joint,) for joint in self.joints), *dict.fromkeys(wider)]
 
+    def groups_of(self, effect: type[JointTorqueEffect]) -> list[tuple[str, ...]]:
+        """Those of the groups all of whose joints can have an effect."""
+        allowed = set(self._targets(effect))
+        return [group for group in self.groups if allowed.issuperset(group)]
+
     @cached_property
     def fixed(self) -> list[FixedColumns]:
         """All candidates that are no joint torque effects: one for each target that moves the
@@ -147,8 +152,13 @@ class Dictionary:
         if effect.acts_on == "body":
             suspected = effect.suspected_bodies(self.predictor.robot)
             return [body for body in suspected if body not in self._untrusted]
+        driven = self.predictor.is_driven
         return {
-            "joint": self.joints,
+            "joint": [
+                joint
+                for joint, is_driven in zip(self.joints, driven, strict=True)
+                if is_driven or not effect.needs_motor
+            ],
             "foot": self.predictor.robot.description.sides,
             "robot": ["robot"],
         }[effect.acts_on]

@@ -165,7 +165,7 @@ class Fits:
         tests = len(self.fixed_candidates)
         for effect in self.dictionary.joint_effects:
             sets = self.dictionary.points(effect).shape[1]
-            tests += len(self.dictionary.groups) * max(1, sets // 4)
+            tests += len(self.dictionary.groups_of(effect)) * max(1, sets // 4)
         return tests
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:

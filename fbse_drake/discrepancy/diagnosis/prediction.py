@@ -285,6 +285,11 @@ class Predictor:
         )
         return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
 
+    @cached_property
+    def is_driven(self) -> np.ndarray:
+        """Which joints get any torque, (n,) bool: the others show nothing of a motor."""
+        return self.motion.signals.torque_command.any(axis=0)
+
     def joint_columns(
         self,
         effect: type[JointTorqueEffect],
@@ -301,7 +306,8 @@ class Predictor:
             noisier: with the sensors' noise once more.
 
         Returns:
-            Shape (p, B, T), or (p, G, B, T).
+            Shape (p, B, T), or (p, G, B, T); zero where the effect needs a motor and none is known
+            to drive the joint.
         """
         # What remembers must see every step.
         step = 1 if effect.has_memory else self._joined_steps
@@ -312,8 +318,9 @@ class Predictor:
                 for name in ("velocity", "position", "command", "load")
             }
         )
+        acts = self.is_driven[joints].astype(float) if effect.needs_motor else 1.0
         if nonlinear.ndim == 2:
-            return self._averages(basis_over_time(effect, motion, nonlinear), step)
+            return acts * self._averages(basis_over_time(effect, motion, nonlinear), step)
         sets = max(1, _CHUNK // motion.velocity.size)
         parts = [
             self._averages(
@@ -321,7 +328,7 @@ class Predictor:
             )
             for start in range(0, nonlinear.shape[1], sets)
         ]
-        return np.concatenate(parts, axis=1)
+        return acts * np.concatenate(parts, axis=1)
 
     def _averages(self, columns: np.ndarray, step: int) -> np.ndarray:
         """Averages over blocks of columns (..., M, T) that were evaluated once for so many steps,

@@ -74,7 +74,7 @@ class Proposals:
         for k, effect in enumerate(dictionary.joint_effects):
             dictionary.progress(LOOKING, 0.3 * k / len(dictionary.joint_effects))
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
-            for group in dictionary.groups:
+            for group in dictionary.groups_of(effect):
                 places = [dictionary.joints.index(joint) for joint in group]
                 if (
                     taken & set(group)

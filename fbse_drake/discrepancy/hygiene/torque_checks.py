@@ -64,7 +64,8 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
     if CHANNEL not in evidence.log:
         return
     torques, found = JointTorques(evidence), _Found()
-    tested = [k for k in range(len(evidence.joints)) if _is_visible(evidence, torques, k)]
+    motors = np.flatnonzero(evidence.robot.description.has_motor).tolist()
+    tested = [k for k in motors if _is_visible(evidence, torques, k)]
     for k in tested:
         _test(evidence, torques, k, found)
     yield from _findings(evidence, found)
@@ -178,7 +179,10 @@ def _off(scale: float) -> bool:
 
 def _findings(evidence: Evidence, found: _Found) -> Iterable[HygieneFinding]:
     units = evidence.units[CHANNEL]
-    text = "{where} moves but its torque does not ({size}); the channel is dead"
+    text = (
+        "{where} moves but its torque does not ({size}); the channel is dead, or nothing drives "
+        "the joint (then it is `passive` in the robot's description)"
+    )
     yield from remarks("dead_torque", "untrustworthy", CHANNEL, found.dead, units, text)
     if found.lost:
         # A torque of one sign is not told from its reverse.

@@ -186,6 +186,7 @@ def read_signals(
     q = on_grid(log["joint/position"])
     measured = "joint/velocity" in log and recording.velocity == "measured"
     torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
+    torque = np.where(robot.description.has_motor, torque, 0.0)
     signals = SensorSignals(
         joint_position=q,
         joint_velocity=on_grid(log["joint/velocity"]) if measured else rate(q),
@@ -790,7 +791,7 @@ class RecordedMotion:
             names.per_joint(getattr(recording, key), key=f"recording.{key}", default=0.0)
             for key in ("torque_noise", "torque_noise_share")
         )
-        return noise**2 + (share * torque) ** 2
+        return np.where(names.has_motor, noise**2 + (share * torque) ** 2, 0.0)
 
     @cached_property
     def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
