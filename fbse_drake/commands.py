@@ -316,7 +316,9 @@ def _printed(table: ReportTable, title: str) -> Table:
     """A table of a report for the terminal; names and texts as they are."""
     shown = Table(*table.header, title=title, title_justify="left")
     for row in table.rows:
-        shown.add_row(*(Text(str(cell)) for cell in row))
+        shown.add_row(
+            *(Text(number(cell) if isinstance(cell, float) else str(cell)) for cell in row)
+        )
     return shown
 
 

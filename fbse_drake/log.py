@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 1
 
 _REQUIRED = ("time", "joint/position")
+# Keys of `LogMeta` with numbers that are calculated with.
+_NUMBERS = ("period", "pads", "segments")
 # Not even a recording with gaps lacks more rows for each that it has.
 _MOST_GAPS = 100
 
@@ -81,9 +83,13 @@ class LogMeta:
         for side, places in self.pads.items():
             if any(len(place) != 3 for place in places):
                 raise InputError(f"pads.{side}: expected places of three coordinates")
+        segments = []
         for number, segment in enumerate(self.segments):
             span = {key: segment.get(key) for key in ("start", "end")}
-            schema.build(dict[str, float], span, file=f"segments[{number}]")
+            segments.append(
+                segment | schema.build(dict[str, float], span, file=f"segments[{number}]")
+            )
+        object.__setattr__(self, "segments", segments)
 
 
 @dataclass(frozen=True)
@@ -126,7 +132,10 @@ class Log(Mapping[str, np.ndarray]):
         for key in ("joints", "period"):
             if key not in self.meta:
                 raise InputError(f"meta has no {key}")
-        schema.build(LogMeta, self.meta, file="meta", further_keys=True)
+        said = schema.build(LogMeta, self.meta, file="meta", further_keys=True)
+        # Numbers that are written as texts, as YAML has 1e6, are numbers from here on.
+        numbers = {key: getattr(said, key) for key in _NUMBERS if key in self.meta}
+        object.__setattr__(self, "meta", self.meta | numbers)
         if self.time.ndim != 1:
             raise InputError(f"channel time: expected one row, found {self.time.ndim} dimensions")
         n, samples = len(self.meta["joints"]), len(self.time)

@@ -255,6 +255,20 @@ def test_what_was_not_measured_is_not_written(tmp_path: Path):
     assert set(read_log(tmp_path / "log.mcap")) == set(channels)
 
 
+def test_numbers_of_a_log_may_be_written_as_texts(tmp_path: Path):
+    channels = {"time": np.array([0.0, 0.1]), "joint/position": np.zeros((2, 1))}
+    channels["foot/left/pad_force"] = np.array([[[0.0, 0.0, 2.0]]] * 2)
+    texts = {"period": "1e-1", "pads": {"left": [["0.1", "0", "0"]]}}
+    texts["segments"] = [{"file": "a", "start": "0", "end": "0.1"}]
+    log = Log(channels, {"joints": ["slide"], "sides": ["left"]} | texts)
+    assert log.meta["period"] == 0.1
+    assert log.meta["segments"] == [{"file": "a", "start": 0.0, "end": 0.1}]
+    write_mcap(log, tmp_path / "log.mcap")
+    topic = "/foot/left/wrench"
+    wrenches = [m.wrench for name, _, m in with_mcap(tmp_path / "log.mcap") if name == topic]
+    np.testing.assert_allclose(vector(wrenches[0].torque), [0, -0.2, 0])
+
+
 def test_logs_that_cannot_be_messages_get_one_line(tmp_path: Path, log: Log):
     with pytest.raises(InputError, match=r"channel foot/left/pad_force: meta has no pads for it"):
         write_mcap(

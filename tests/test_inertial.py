@@ -2,6 +2,7 @@
 forms of a planar two-link arm."""
 
 import dataclasses
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -34,7 +35,10 @@ from fbse_drake.effects.inertia import (
     inertial_parameters,
     pseudo_inertia,
 )
+from fbse_drake.progress import Interrupted
+from fbse_drake.report.identification import write_identification_report
 from fbse_drake.report.identification_figures import combinations, errors_by_joint
+from fbse_drake.report.sentences import Inputs
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, build_robot
 
@@ -241,6 +245,10 @@ def test_pictures_show_what_the_tables_say(identified: Identification) -> None:
         )
         assert before[0] == pytest.approx(100 * identified.before[name].relative)
         assert axes.lines[1].get_label() == "identified"
+    # Of no torque nothing is a share.
+    silent = dataclasses.replace(identified.after["train"], relative=np.inf)
+    drawn = errors_by_joint(dataclasses.replace(identified, after={"train": silent}))
+    assert np.isfinite(drawn.axes[0].get_xlim()).all()
 
 
 def test_bodies_at_the_edge_of_what_is_physical(folder: Path) -> None:
@@ -458,6 +466,32 @@ def test_a_study_ends_with_one_change_of_inertia(folder: Path) -> None:
     ]
     assert len(changes) == 1
     assert result.steps[-1].held_out_rmse < 0.01 * result.steps[0].held_out_rmse
+
+
+def test_a_study_that_is_stopped_at_inertia_keeps_what_it_knows(folder: Path) -> None:
+    def stop_at_inertia(what: str, share: float | None = None) -> None:  # noqa: ARG001
+        if what == "predicting what each parameter would do":
+            raise Interrupted("the time limit was reached")
+
+    effects = [library()["CoulombViscousFriction"]]
+    result = study(scenario(folder), recording(), effects, rollouts=False, progress=stop_at_inertia)
+    assert result.partial
+    assert result.stopped_because == "the time limit was reached"
+    assert result.steps[-1].held_out_rmse < 0.1 * result.steps[0].held_out_rmse
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_the_report_says_no_digits_that_nobody_knows(
+    identified: Identification, tmp_path: Path
+) -> None:
+    """What the log does not show stays with the model, to within rounding, which is not printed."""
+    inputs = Inputs("arm", "arm.yaml", ("log.npz",), str(tmp_path))
+    write_identification_report(tmp_path / "report.html", identified, inputs)
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", (tmp_path / "report.html").read_text())
+    shares = [cell for cell in cells if re.fullmatch(r"\d.* %", cell)]
+    assert len(shares) == 6 + 20
+    assert all(re.fullmatch(r"[\d.]{1,6} %", share) for share in shares)
+    assert [cell for cell in cells if re.search(r"0\.0{7}", cell)] == []
 
 
 def test_torques_that_were_filtered_by_who_recorded_them(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """The report of identified inertial parameters."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 from fbse_drake.discrepancy.diagnosis.identify import Identification, identifiability_text
@@ -22,35 +24,49 @@ from fbse_drake.report.sentences import Inputs, parameters_text
 from fbse_drake.scenario import dump_scenario
 
 BASE_HEADER = ("combination", "unit", "model", "identified", "95 % interval", "known to")
-ERROR_HEADER = ("log", "error of the model", "identified")
+ERROR_HEADER = ("log", "joint", "model as given [%]", "identified [%]")
 _BASE_TEXT = (
-    "What this log tells apart. `known to` is the standard deviation as a share of what a body of "
+    "What this log tells apart. “Known to” is the standard deviation as a share of what a body of "
     "this size has, if what is left over were white noise; intervals respect that it is not."
 )
 _BODIES_TEXT = (
     "One of the many sets of values that have these combinations: the one nearest to the model "
     "that some distribution of mass has. First moments and rotational inertia are about the "
-    "origin of the body's frame. Where `known to` is near 100 % the value is that of the model."
+    "origin of the body's frame. Where “known to” is near 100 % the value is that of the model."
 )
 
 _COMBINATIONS_CAPTION = (
     "As the model has them, and as identified with 95 % intervals. Where an interval does not "
     "reach the model's mark, the log contradicts the model."
 )
-_ERRORS_CAPTION = "What is left of the torque, by log; `train` is the one that was fitted."
+_ERRORS_CAPTION = "What is left of the torque, by log; “train” is the one that was fitted."
 
 
 def base_row(base: BaseParameter) -> tuple[str, ...]:
     """A combination under `BASE_HEADER`."""
-    low, high = base.interval
-    share = f"{100 * base.uncertainty:.2g} %"
+    return _row(base.text, base.unit, base.model, base.value, base.interval, base.uncertainty)
+
+
+def _row(
+    name: str,
+    unit: str,
+    model: float,
+    value: float,
+    interval: tuple[float, float],
+    uncertainty: float,
+) -> tuple[str, ...]:
+    """What is known of a parameter or of a combination, under `BASE_HEADER`."""
+    low, high = interval
+    # Three digits of what is not known of it; what is less is rounding.
+    digits = 3 - math.ceil(math.log10(high - low)) if high > low else 15
+    model, value, low, high = (round(x, digits) + 0.0 for x in (model, value, low, high))
     return (
-        base.text,
-        base.unit,
-        number(base.model),
-        number(base.value),
+        name,
+        unit.replace(" ", "\N{NO-BREAK SPACE}"),
+        number(model),
+        number(value),
         f"{number(low)} to {number(high)}",
-        share,
+        f"{number(100 * uncertainty, 2)} %",
     )
 
 
@@ -65,16 +81,15 @@ def errors_table(result: Identification) -> Table:
     rows = []
     for name, after in result.after.items():
         before = result.before[name]
-        rows.append((name, f"{100 * before.relative:.2f} %", f"{100 * after.relative:.2f} %"))
+        rows.append((name, "all joints", 100 * before.relative, 100 * after.relative))
         for joint, share in after.relative_by_joint.items():
-            rows.append(
-                (
-                    f"{name}: {joint}",
-                    f"{100 * before.relative_by_joint[joint]:.2f} %",
-                    f"{100 * share:.2f} %",
-                )
-            )
+            rows.append((name, joint, 100 * before.relative_by_joint[joint], 100 * share))
     return Table(ERROR_HEADER, tuple(rows))
+
+
+def _headed(table: Table) -> Table:
+    """The table as it stands in a report, its header in capitals."""
+    return replace(table, header=tuple(name[:1].upper() + name[1:] for name in table.header))
 
 
 def identification_outcome(result: Identification) -> str:
@@ -97,22 +112,13 @@ def write_identification_report(path: str | Path, result: Identification, inputs
     bodies = []
     for k, body in enumerate(inertia.bodies):
         for j, parameter in enumerate(PARAMETERS):
-            model, value, width = (
-                inertia.model[k, j],
-                inertia.model[k, j] + inertia.change[k, j],
-                inertia.half_width[k, j],
-            )
-            between, share = (
-                f"{number(value - width)} to {number(value + width)}",
-                f"{100 * inertia.uncertainty[k, j]:.2g} %",
-            )
-            unit = InertialParameters.parameters[parameter].unit
-            bodies.append(
-                (f"{body} {parameter}", unit, number(model), number(value), between, share)
-            )
+            unit, model = InertialParameters.parameters[parameter].unit, inertia.model[k, j]
+            value, width = model + inertia.change[k, j], inertia.half_width[k, j]
+            between, share = (value - width, value + width), inertia.uncertainty[k, j]
+            bodies.append(_row(f"{body} {parameter}", unit, model, value, between, share))
     plain = [f for f in result.findings if f.effect != InertialParameters.__name__]
     friction = Table(
-        ("effect", "in", "values"),
+        ("Effect", "In", "Values"),
         tuple((spaced(f.effect), targets_text(f.targets), parameters_text(f)) for f in plain),
     )
     sections = (
@@ -120,7 +126,11 @@ def write_identification_report(path: str | Path, result: Identification, inputs
         Section(
             "Combinations",
             _BASE_TEXT,
-            (Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters)),),
+            (
+                _headed(
+                    Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters))
+                ),
+            ),
             (FigureBlock("Combinations", _COMBINATIONS_CAPTION, combinations(result)),)
             if inertia.base_parameters
             else (),
@@ -129,10 +139,23 @@ def write_identification_report(path: str | Path, result: Identification, inputs
         Section(
             "Errors",
             "|residual| / |torque|, 2-norms.",
-            (errors_table(result),),
+            (_headed(errors_table(result)),),
             (FigureBlock("Errors by joint", _ERRORS_CAPTION, errors_by_joint(result)),),
         ),
-        Section("Bodies", _BODIES_TEXT, (Table(("parameter", *BASE_HEADER[1:]), tuple(bodies)),)),
+        Section(
+            "Bodies",
+            _BODIES_TEXT,
+            (
+                _headed(
+                    Table(
+                        ("parameter", *BASE_HEADER[1:]),
+                        tuple(bodies),
+                        "All parameters of all bodies.",
+                        folded=True,
+                    )
+                ),
+            ),
+        ),
         Section(
             "Scenario",
             details=(Details("With all this in its model", dump_scenario(result.scenario, name)),),

@@ -69,7 +69,8 @@ def errors_by_joint(result: Identification) -> Figure:
 
 
 def _draw_errors(axes: Axes, before: Sequence[float], after: Sequence[float]) -> None:
-    """Shares of the torque, a line for each; a joint without torques has none."""
+    """Shares of the torque, a line for each; a joint without torques, of which no share is finite,
+    has none."""
     decorate(axes)
     first, last = 100 * np.array([before, after])
     places = np.arange(len(first))
@@ -90,5 +91,6 @@ def _draw_errors(axes: Axes, before: Sequence[float], after: Sequence[float]) ->
                 fontsize=8,
             )
     # Room for the numbers.
-    axes.set_xlim(0.0, 1.35 * np.nanmax([first, last], initial=1e-3))
+    shown = np.isfinite([first, last])
+    axes.set_xlim(0.0, 1.35 * np.max([first, last], initial=1e-3, where=shown))
     axes.set_xlabel("|residual| / |torque| [%]", fontsize=9)

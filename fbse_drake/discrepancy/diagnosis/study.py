@@ -170,11 +170,15 @@ def study(
         errors = diagnosis.held_out_after, diagnosis.train_after
         believed = Predictor(completed, log)
         if len(diagnoses) == 1 and scenario.identify.inertia and interrupted is None:
-            plain = identify(scenario, log, progress=progress)
-            rival = Predictor(plain.scenario, log)
-            if is_better(rival, believed):
-                found, completed, believed = list(plain.findings), plain.scenario, rival
-                errors = plain.held_out_rmse, plain.train_rmse
+            try:
+                plain = identify(scenario, log, progress=progress)
+            except Interrupted as stop:
+                interrupted = str(stop)
+            else:
+                rival = Predictor(plain.scenario, log)
+                if is_better(rival, believed):
+                    found, completed, believed = list(plain.findings), plain.scenario, rival
+                    errors = plain.held_out_rmse, plain.train_rmse
         # What a search promises, with laws made linear, a model need not keep.
         if len(diagnoses) > 1 and not is_better(believed, predictor):
             break
