@@ -112,12 +112,15 @@ def from_json(text: str | bytes) -> Any:
     """Parses JSON. NaN and Infinity, which our older files have, become None as null does.
 
     Raises:
-        ValueError: it is not JSON.
+        ValueError: it is not JSON, or has halves of characters, which no file can hold.
     """
     try:
-        return json.loads(text, parse_constant=lambda _: None, parse_float=_finite)
+        tree = json.loads(text, parse_constant=lambda _: None, parse_float=_finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    if (b"\\ud" if isinstance(text, bytes) else "\\ud") in text.lower():
+        json.dumps(tree, ensure_ascii=False).encode()
+    return tree
 
 
 def origin(logs: Sequence[Path] = (), scenario: Path | None = None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import difflib
 import math
+import re
 import textwrap
 import types
 import typing
@@ -125,12 +126,15 @@ def _check_size(text: str, file: str) -> None:
 
 
 def _check_types(value: Any, file: str, key: str) -> None:
+    if isinstance(value, str) and re.search(r"[\ud800-\udfff]", value):
+        raise InputError(f"{file}: {key}: half of a character, which no file can hold: {value!a}")
     if isinstance(value, dict):
         for name, item in value.items():
             if not isinstance(name, str):
                 raise InputError(
                     f'{file}: {key}: expected a text as key, found {name}; write "{name}"'
                 )
+            _check_types(name, file, key)
             _check_types(item, file, f"{key}.{name}" if key else name)
     elif isinstance(value, list):
         for i, item in enumerate(value):

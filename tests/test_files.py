@@ -40,7 +40,23 @@ def test_older_files_are_read_as_if_they_were_strict():
     assert from_json('{"a": NaN, "b": -Infinity, "c": 1e999}') == {"a": None, "b": None, "c": None}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, '{"a": 1}}', b"\xff\xfe", "9" * 5000])
+def test_escaped_characters_are_read_whole():
+    assert from_json(r'{"a": "\ud83d\uDE00"}') == {"a": "\N{GRINNING FACE}"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[" * 100_000,
+        '{"a": 1}}',
+        b"\xff\xfe",
+        "9" * 5000,
+        r'["\uD83d"]',
+        rb'{"\ude00": 1}',
+    ],
+)
 def test_what_is_no_json_gets_one_line(text: str | bytes, tmp_path: Path):
     path = tmp_path / "x.json"
     path.write_bytes(text.encode() if isinstance(text, str) else text)

@@ -166,6 +166,8 @@ def bomb(begin: str, end: str) -> str:
         ("- 1", r"mine\.yaml: expected a mapping of keys to values, found a list"),
         ("mine: {a: [}", r"mine\.yaml:1: not valid YAML"),
         ("mine: {title: 2020-01-01}", r"mine\.title: .* found the date 2020-01-01"),
+        (r'"mine\ud83d": {}', r"half of a character, which no file can hold: 'mine\\ud83d'"),
+        (r'mine: {ground: "\udc00"}', r"mine\.yaml: mine\.ground: half of a character"),
         ("mine: {duration: 2020-13-45}", r"mine\.yaml: not valid YAML: month must be in"),
         ("mine: {seed: " + "9" * 5000 + "}", r"mine\.yaml: not valid YAML: Exceeds the limit"),
         ("mine: {seed: 1" + "0" * 30 + "}", r"seed: expected a number of size at most 1e\+15"),
