@@ -1,5 +1,6 @@
 """A joint that no motor moves: its torque is known to be zero, and what it lacks is found."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.exercises.hidden import make_exercise
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.effects.actuation import TorqueGain
 from fbse_drake.effects.effect import Effect, library
@@ -110,3 +112,16 @@ def test_a_joint_that_is_not_there_is_refused(tmp_path: Path) -> None:
         InputError, match=r"passive: unknown joint wrist \(allowed: shoulder, elbow"
     ):
         load_description(tmp_path / "robot.yaml")
+
+
+def test_nothing_of_a_motor_is_hidden_in_it(description: str) -> None:
+    scenario, _ = run(description)
+    scenario = replace(scenario, duration=0.2)
+    hidden = [
+        effect
+        for seed in range(6)
+        for effect in make_exercise(scenario, "hanging", seed, what="library").answer.effects
+    ]
+    assert any(library()[effect.effect].needs_motor for effect in hidden)
+    for effect in hidden:
+        assert not (library()[effect.effect].needs_motor and "elbow" in effect.targets)

@@ -360,7 +360,7 @@ def _hidden_effect(
             )
         )
     recipe = _recipe(effect)
-    if len(targets) == len(robot.joint_names):
+    if len(targets) == len(_joints(effect, robot)):
         values = [recipe.values(draw, size * draw.uniform(0.5, 1.0)) for draw in draws]
     else:
         values = [recipe.values(draws[0], size)] * len(targets)
@@ -399,15 +399,22 @@ def _targets(
         return (str(random.choice(names.sides)),)
     if effect.acts_on == "body":
         return (str(random.choice(effect.suspected_bodies(robot))),)
+    joints = _joints(effect, robot)
     chance, joint = (
         random.random(),
-        str(random.choice([joint for joint in robot.joint_names if joint not in taken])),
+        str(random.choice([joint for joint in joints if joint not in taken])),
     )
-    if alone or chance < 0.5 or len(robot.joint_names) == 1:
+    if alone or chance < 0.5 or len(joints) == 1:
         return (joint,)
     if _recipe(effect).everywhere and chance < 0.75:
-        return tuple(robot.joint_names)
+        return tuple(joints)
     return names.counterparts(joint)
+
+
+def _joints(effect: type[Effect], robot: Robot) -> list[str]:
+    """Joints that can have an effect."""
+    passive = robot.description.passive if effect.needs_motor else []
+    return [joint for joint in robot.joint_names if joint not in passive]
 
 
 def make_exercise(
