@@ -118,7 +118,8 @@ def from_json(text: str | bytes) -> Any:
         tree = json.loads(text, parse_constant=lambda _: None, parse_float=_finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    if (b"\\ud" if isinstance(text, bytes) else "\\ud") in text.lower():
+    raw = text.encode() if isinstance(text, str) else text
+    if b"\\ud" in raw.lower():
         json.dumps(tree, ensure_ascii=False).encode()
     return tree
 
