@@ -106,6 +106,20 @@ def test_noise_of_a_mean_is_that_of_many_logs():
     assert whole[0].noise_floor < 0.85 * NOISE / np.sqrt(BLOCKS)
 
 
+def test_in_the_error_as_a_whole_what_lasts_counts_more():
+    """Noise of differences cancels from one average to the next."""
+    quiet = made_residual()
+    quiet = dataclasses.replace(quiet, value=np.zeros_like(quiet.value))
+    alternating = 3 * NOISE * (-1.0) ** np.arange(len(quiet.time))
+    lasting, short = (with_error(quiet, "left_knee_pitch", e) for e in (3 * NOISE, alternating))
+    single = [
+        next(c.rmse for c in compared(of).channels if c.row.name == "left_knee_pitch")
+        for of in (lasting, short)
+    ]
+    assert single[0] == pytest.approx(single[1])
+    assert compared(lasting).rmse > 1.2 * compared(short).rmse
+
+
 def test_dry_friction_follows_the_speed():
     residual = made_residual()
     knee = JOINTS.index("left_knee_pitch")

@@ -88,8 +88,9 @@ _METHOD = (
 )
 
 _RATIOS = (
-    "Root mean square of what the equation of motion leaves over, in multiples of the sensors' "
-    "noise: about 1 is noise alone."
+    "Root mean square of what the equation of motion leaves over in single averages, in multiples "
+    "of the sensors' noise in them: about 1 is noise alone. In the error as a whole, as in the "
+    "summary, what lasts counts more, for noise cancels from one average to the next."
 )
 
 _BY_PHASE = (
