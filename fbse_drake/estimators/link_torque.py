@@ -20,6 +20,9 @@ from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
 _NOT_FINITE = float(Status.NOT_FINITE)
+# A wrench is beyond its sensors' noise above this quantile of chi^2 with six degrees of freedom (one
+# in 3000).
+_GATE = 25.1
 
 
 @njit(cache=True)
@@ -75,6 +78,22 @@ def _watch_forces(
                 share += bend * bend / (6.0 * measured * excess * variance[i])
         mean_log = LOG_OF_SIX if measured == 6 else LOG_OF_THREE
         posterior.force_noise[foot] = learned_noise(excess, share, mean_log, elapsed)
+
+
+@njit(cache=True)
+def _is_loaded(wrench: np.ndarray, variance: np.ndarray) -> bool:
+    """Does a foot show more than its sensors' noise, as load or otherwise?
+
+    One that touches the ground may be held sideways before it carries anything.
+
+    Args:
+        wrench, variance: of a foot, and of the noise in it, (6,).
+    """
+    distance = 0.0
+    for i in range(6):
+        if variance[i] > 0.0:
+            distance += wrench[i] ** 2 / variance[i]
+    return wrench[5] > math.sqrt(variance[5]) or distance > _GATE
 
 
 @njit(cache=True)
@@ -160,7 +179,7 @@ def _estimate_link_torque(
         link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
         for foot in range(feet):
             variance = posterior.force_noise[foot] * known.wrench_variance[foot]
-            if wrench[foot, 5] > math.sqrt(variance[5]):
+            if _is_loaded(wrench[foot], variance):
                 for k in range(6):
                     lever = past.lever[then, foot, k, i]
                     link_torque -= wrench[foot, k] * lever
@@ -223,7 +242,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
     believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
-    A foot that shows less load than its sensors' noise counts as unloaded.
+    A foot that shows no more than its sensors' noise counts as unloaded.
     """
 
     def __init__(
