@@ -41,14 +41,15 @@ def _watch(
     read: np.ndarray,
     usable: np.ndarray,
     elapsed: np.ndarray,
+    period: float,
 ) -> np.ndarray:
     x, result = record[()], np.empty(len(shown))
     for k in range(len(shown)):
         if usable[k]:
-            watch_force_delay(x, vector(shown[k]), vector(read[k]), 0.02, elapsed[k], TICK)
+            watch_force_delay(x, vector(shown[k]), vector(read[k]), 0.02, elapsed[k], period)
         else:
             forget_force_delay(x)
-        result[k] = x.delay / TICK
+        result[k] = x.delay / period
     return result
 
 
@@ -57,6 +58,7 @@ def found(
     forces: np.ndarray,
     gaps: tuple[int, ...] = (),
     elapsed: float | np.ndarray = TICK,
+    period: float = TICK,
 ) -> np.ndarray:
     """The delay after every tick, by noisy IMU and joints and by forces, (N, 3) each [ticks]."""
     generator = np.random.default_rng(0)
@@ -64,7 +66,8 @@ def found(
     read = forces + 0.02 * generator.standard_normal(forces.shape)
     usable = ~np.isin(np.arange(len(truth)), gaps)
     ticks = np.broadcast_to(elapsed, len(truth)).copy()
-    return _watch(np.zeros((), force_delay_type(CLOCK)), shown, read, usable, ticks)
+    record = np.zeros((), force_delay_type(Clock.every(period)))
+    return _watch(record, shown, read, usable, ticks, period)
 
 
 @pytest.mark.parametrize("late", [0, 1, 5, 9])
@@ -79,6 +82,17 @@ def test_a_delay_is_found_and_forgotten(late: int):
     ticks = found(truth, forces, gaps=(700, 1300, 1301))
     assert np.all(np.abs(ticks[1000:2000] - late) <= 1)
     assert np.all(ticks[3050:] == 0)
+
+
+@pytest.mark.parametrize(("period", "late"), [(5e-4, 7), (2e-3, 4)])
+def test_a_delay_is_found_at_other_rates(period: float, late: int):
+    """Slower clocks have fewer delays than there is room for."""
+    truth = specific_force(period * np.arange(round(6.0 / period)))
+    forces, end = truth.copy(), round(3.0 / period)
+    forces[late:end] = truth[: end - late]
+    ticks = found(truth, forces, elapsed=period, period=period)
+    assert np.all(np.abs(ticks[round(1.5 / period) : end] - late) <= 1)
+    assert np.all(ticks[round(4.5 / period) :] == 0)
 
 
 def test_a_delay_that_begins_is_no_shorter_one_first():

@@ -41,7 +41,8 @@ def force_delay_type(clock: Clock) -> np.dtype:
     `square` and of its product `cross` with the forces, (room,), and of the forces,
     `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `likelihood`
     (2, room) of each delay, as the logarithm of its ratio to the largest, by the latest forces and
-    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of` the clock are used.
+    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of` the
+    clock are used.
     """
     room = room_for_delays(clock)
     shapes = {"shown": (room, 3), "read": (room, 3), "total": (room, 3)}
@@ -161,7 +162,7 @@ def watch_force_delay(
     variance = max(noise**2, mismatch.min() / (3.0 * x.count), off[0].min() / 3.0)
     # Of the smoothed readings so many are as good as one.
     alike = 1.0 + 2.0 * _SMOOTHING / period
-    likelihood, now = x.likelihood, round(x.delay / period)
+    likelihood, now = x.likelihood[:, :delays], round(x.delay / period)
     for way in range(2):
         likelihood[way] -= off[way] / (2.0 * variance * alike)
         likelihood[way] = np.maximum(_LEAST_LIKELY, likelihood[way] - likelihood[way].max())
