@@ -526,9 +526,10 @@ def _estimate_friction(
             # ... and their mean what the model is wrong by, beyond the noise.
             agreement = keep * last.agreement[joint] + (1.0 - keep) * likely * innovation
             posterior.agreement[joint] = agreement
-            if count * agreement * agreement > AGREEMENT * S:
-                unexplained = column[0] / S * agreement / T
-                P[size - 1, size - 1] += unexplained**2 * (1.0 - keep)
+            excess = count * agreement * agreement - AGREEMENT * S
+            if excess > 0.0:
+                unexplained = (column[0] / (S * T)) ** 2 * excess / count
+                P[size - 1, size - 1] += unexplained * (1.0 - keep)
         else:
             # A joint that is not measured is left to its model.
             P[size - 1, size - 1] += x[m] ** 2
