@@ -746,15 +746,16 @@ def test_friction_is_as_wrong_as_it_says(biased: tuple[Log, dict[str, np.ndarray
 @pytest.mark.parametrize(
     ("changes", "largest"),
     [
-        (("reference.single_support=0.4", "reference.double_support=0.3"), 0.15),
-        (("robot.effects.slope=!GroundSlope {y: 0.0349}",), 0.17),
+        (("reference.single_support=0.4", "reference.double_support=0.3"), 0.09),
+        (("robot.effects.slope=!GroundSlope {y: 0.0349}",), 0.12),
     ],
     ids=["fast", "slope"],
 )
 def test_feet_that_roll_are_not_believed_to_rest(
     run: Run, changes: tuple[str, ...], largest: float
 ):
-    """Fast steps, and a slope that nobody knows. Measured 0.10, 0.14; the observer 0.27, 0.30."""
+    """Fast steps, and a slope that nobody knows. Measured, the worst of ten seeds: 0.07, 0.09; the
+    observer 0.27, 0.30."""
     log = run("paper_walk_fbse", "duration=3", *changes)
     walk = scenario("paper_walk_fbse", "duration=3", *changes)
     error = nrmse(log, log)

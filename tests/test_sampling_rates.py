@@ -29,16 +29,16 @@ def decimated(log: Log, every: int) -> Log:
     return Log(kept, log.meta | {"period": every * log.meta["period"]})
 
 
-# Measured: 0.08, 0.10, 0.23, 0.29, 0.52; 0.7, 0.8, 1.0, 1.4, 1.8 mm/s; 0.01, 0.01, 0.02, 0.02, 0.04
-# deg.
+# Measured, the worst of five seeds: 0.07, 0.09, 0.25, 0.33, 0.49; 0.7, 0.8, 1.0, 1.7, 2.0 mm/s;
+# 0.01, 0.01, 0.03, 0.05, 0.07 deg.
 @pytest.mark.parametrize(
     ("every", "friction", "velocity", "tilt"),
     [
-        (1, 0.11, 1.0e-3, 0.02),
-        (2, 0.13, 1.2e-3, 0.02),
-        (5, 0.26, 1.5e-3, 0.03),
-        (10, 0.45, 2.0e-3, 0.04),
-        (20, 0.60, 2.5e-3, 0.06),
+        (1, 0.09, 1.0e-3, 0.02),
+        (2, 0.12, 1.2e-3, 0.02),
+        (5, 0.32, 1.5e-3, 0.04),
+        (10, 0.42, 2.2e-3, 0.07),
+        (20, 0.62, 2.6e-3, 0.10),
     ],
 )
 def test_errors_grow_gently(run: Run, every: int, friction: float, velocity: float, tilt: float):
@@ -56,7 +56,7 @@ def test_errors_grow_gently(run: Run, every: int, friction: float, velocity: flo
     assert np.rad2deg(max(rms(turned[later, 1 + i]) for i in range(2))) < tilt
     # The standard deviation grows with the error.
     std = log["estimate/joint/friction_torque_std"][later]
-    assert np.mean(np.abs(error) < 2.58 * std) > 0.93
+    assert np.mean(np.abs(error) < 2.58 * std) > 0.96
 
 
 def test_two_kilohertz():
