@@ -20,8 +20,8 @@ from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
 
 _NOT_FINITE = float(Status.NOT_FINITE)
-# A wrench is beyond its sensors' noise above this quantile of chi^2 with six degrees of freedom (one
-# in 3000).
+# A wrench is beyond its sensors' noise above this quantile of chi^2 with six degrees of freedom
+# (one in 3000).
 _GATE = 25.1
 
 
