@@ -301,6 +301,9 @@ def test_every_filter_is_named_by_what_it_measures():
 def test_joints_belong_to_legs_by_name_or_by_place():
     log = made_log()
     assert joint_sides(log) == ["left", "left", "right", "right"]
+    legs = {"left": JOINTS[:2], "right": JOINTS[2:]}
+    one_foot = dataclasses.replace(log, meta=log.meta | {"legs": legs, "sides": ["left"]})
+    assert joint_sides(one_foot) == ["left", "left", None, None]
     renamed = dataclasses.replace(log, meta=log.meta | {"joints": ["LH", "LK", "RH", "RK"]})
     assert joint_sides(renamed) == ["left", "left", "right", "right"]
     assert (

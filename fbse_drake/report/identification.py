@@ -58,14 +58,13 @@ def _row(
     """What is known of a parameter or of a combination, under `BASE_HEADER`."""
     low, high = interval
     # Three digits of what is not known of it; what is less is rounding.
-    digits = 3 - math.ceil(math.log10(high - low)) if high > low else 15
-    model, value, low, high = (round(x, digits) + 0.0 for x in (model, value, low, high))
+    digits = max(0, 3 - math.ceil(math.log10(high - low))) if 0.0 < high - low < math.inf else 6
+    known = [f"{round(x, digits) + 0.0:.{digits}f}" for x in (model, value, low, high)]
     return (
         name,
         unit.replace(" ", "\N{NO-BREAK SPACE}"),
-        number(model),
-        number(value),
-        f"{number(low)} to {number(high)}",
+        *known[:2],
+        " to ".join(known[2:]),
         f"{number(100 * uncertainty, 2)} %",
     )
 

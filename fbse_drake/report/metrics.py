@@ -141,11 +141,13 @@ def joint_sides(log: Log) -> list[str | None]:
     """Whose leg each joint belongs to: as the log says, else by its name (`left_knee_pitch`), or by
     its place.
 
-    Legs follow one another in the order of the sides, with equally many joints.
+    Legs follow one another in the order of the sides, with equally many joints. A recording of
+    which only some feet are left names legs that are none of its sides.
     """
     if "legs" in log.meta:
+        legs = {side: joints for side, joints in log.meta["legs"].items() if side in log.sides}
         return [
-            next((side for side, joints in log.meta["legs"].items() if joint in joints), None)
+            next((side for side, joints in legs.items() if joint in joints), None)
             for joint in log.joints
         ]
     named = [
