@@ -24,7 +24,7 @@ from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable
 from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_significant
 from fbse_drake.discrepancy.diagnosis.study import study, study_json
 from fbse_drake.discrepancy.identification.regression import Signature
-from fbse_drake.discrepancy.residual.rollout import rollout
+from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
@@ -271,13 +271,37 @@ def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
     assert after.mean_torque_command < 0.1 * before.mean_torque_command
 
 
-def test_a_single_draw_of_the_noise_does_not_decide_about_a_model() -> None:
-    walk = load_scenario("paper_walk", overrides=["duration=0.6", "seed=3"])
-    log = simulate(replace(walk, seed=9)).log
-    walks = [simulate(replace(walk, seed=seed)).log["joint/position"] for seed in (4, 5, 6)]
-    errors = sorted(float(np.sqrt(np.mean((walk - log["joint/position"]) ** 2))) for walk in walks)
-    assert errors[0] < errors[1] < errors[2]
-    assert rollout(replace(walk, model=walk.robot), log).mean_position == pytest.approx(errors[1])
+@pytest.mark.parametrize(
+    ("errors", "failing", "median", "drawn"),
+    [
+        ([1.0, 1.05, 9.0], (), 1.05, 2),
+        ([1.05, 1.0, 9.0], (), 1.05, 2),
+        ([1.0, 2.0, 1.3], (), 1.3, 3),
+        ([9.0, 1.0, 1.3], (), 1.3, 3),
+        ([1.0, 1.0, 9.0], (1,), 9.0, 3),
+        ([1.0, 1.0, 9.0], (0, 1), 1.0, 3),
+    ],
+)
+def test_a_single_draw_of_the_noise_does_not_decide_about_a_model(
+    monkeypatch: pytest.MonkeyPatch,
+    errors: list[float],
+    failing: tuple[int, ...],
+    median: float,
+    drawn: int,
+) -> None:
+    walk, seeds = load_scenario("paper_walk", overrides=["seed=3"]), []
+
+    def simulated(scenario: Scenario, *_: object) -> RolloutError:
+        seeds.append(scenario.seed)
+        k = len(seeds) - 1
+        failure = "it fell" if k in failing else None
+        return RolloutError({"knee": errors[k]}, {}, {}, 1.0, failure)
+
+    monkeypatch.setattr("fbse_drake.discrepancy.residual.rollout._simulated_error", simulated)
+    channels = {"time": np.arange(2.0), "joint/position": np.zeros((2, 1))}
+    log = Log(channels, {"joints": ["knee"], "period": 1.0})
+    assert rollout(walk, log).mean_position == pytest.approx(median)
+    assert seeds == [4, 5, 6][:drawn]
 
 
 @pytest.mark.parametrize(

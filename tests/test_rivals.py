@@ -241,10 +241,9 @@ def test_what_does_not_fit_better_when_moved_holds_no_other_joint_back(
     assert after.deviance < before.deviance - MARGIN
 
 
-def test_a_search_whose_first_find_does_not_hold_goes_another_way(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Two names for one constant torque; the one that a search finds first does not pay."""
+@pytest.fixture
+def pushed(monkeypatch: pytest.MonkeyPatch) -> Predictor:
+    """A constant torque, which has two names; the one that a search finds first does not pay."""
 
     def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
         held = [c for c in explanation.candidates if c.effect is not TorqueBias]
@@ -252,7 +251,22 @@ def test_a_search_whose_first_find_does_not_hold_goes_another_way(
 
     monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.diagnose.frugal", frugal)
     course = PENDULUM.course(1)
-    predictor = PENDULUM.predictor(PENDULUM.log(course, course.torque + 0.3))
-    diagnosis = diagnose(predictor, [TorqueBias, Wrench])
+    return PENDULUM.predictor(PENDULUM.log(course, course.torque + 0.3))
+
+
+def test_a_search_whose_first_find_does_not_hold_goes_another_way(pushed: Predictor) -> None:
+    diagnosis = diagnose(pushed, [TorqueBias, Wrench])
     assert [finding.effect for finding in diagnosis.chosen] == ["Wrench"]
     assert diagnosis.chosen[0].parameters["bias"].value == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_rival_that_does_not_pay_takes_no_place(
+    pushed: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def settled(proposals: Proposals, final: Explanation) -> tuple[Explanation, dict]:
+        rest = proposals.fits.explain([])
+        return proposals.beside(rest, TorqueBias, final.candidates[0].targets), {}
+
+    monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.diagnose.settled", settled)
+    diagnosis = diagnose(pushed, [TorqueBias, Wrench])
+    assert [finding.effect for finding in diagnosis.chosen] == ["Wrench"]

@@ -313,14 +313,16 @@ def _settled_and_frugal(
 ) -> tuple[Explanation, dict[int, list[Explanation]]]:
     """A frugal explanation whose members no rival beats, and their rivals.
 
-    What took another's place has to pay as well.
+    What took another's place has to pay as well; where it does not, and nothing is left in that
+    place, the other stays.
     """
     final, found = settled(proposals, explanation)
-    if final is not explanation:
-        smaller = frugal(proposals, final)
-        if smaller is not final:
-            return smaller, rivals(proposals, smaller)
-    return final, found
+    if final is explanation:
+        return final, found
+    smaller = frugal(proposals, final)
+    if smaller.deviance > explanation.deviance + MARGIN:
+        smaller = explanation
+    return smaller, found if smaller is final else rivals(proposals, smaller)
 
 
 def _steps(path: Sequence[Explanation], before: float) -> tuple[SelectionStep, ...]:
