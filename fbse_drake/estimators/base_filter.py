@@ -68,7 +68,8 @@ from fbse_drake.wiring import weakly
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
 # its orientation.
-# (numpy integers: of a Python integer the value is part of the types that a function is compiled for.)
+# (numpy integers: of a Python integer the value is part of the types that a function is compiled
+# for.)
 _ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = np.arange(0, 18, 3)
 # What a standing foot tells.
 _FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
@@ -83,9 +84,10 @@ _UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
 _GATE = 18.5
 # Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
 _MEMORY = 0.1
-# They stay within so many standard deviations of what was known of them so long ago [s]: they hardly
-# walk, and a sensor that drifts faster is at fault. What a filter finds out moves its estimate by a
-# variance as large as what it takes from its own; and at least by so many random walks.
+# They stay within so many standard deviations of what was known of them so long ago [s]: they
+# hardly walk, and a sensor that drifts faster is at fault. What a filter finds out moves its
+# estimate by a variance as large as what it takes from its own; and at least by so many random
+# walks.
 _LEASH, _LEASH_TIME, _LEAST_WALKS = 2.0, 1.0, 20.0
 # Beyond so many standard deviations of what forces are wrong by, they contradict the accelerometer.
 _CONTRADICTION = 3.0
@@ -96,8 +98,8 @@ _FOOT_RATE_ERROR = 0.05
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
 _AT_REST, _WALKING_SPEED = 0.1, 0.03
-# How long it takes to learn what a standing foot does [s], and the least that it is taken to do, as a
-# share of the variance believed.
+# How long it takes to learn what a standing foot does [s], and the least that it is taken to do, as
+# a share of the variance believed.
 _RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = 1.0, 0.01
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
@@ -956,8 +958,8 @@ class InvariantBaseFilter(RecursiveEstimator):
 
     Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
     (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the
-    IMU and the feet that contradict the rest. World axes unless said. Yaw and place are those of the
-    start, as far as standing feet hold them. Fields of the posterior:
+    IMU and the feet that contradict the rest. World axes unless said. Yaw and place are those of
+    the start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB

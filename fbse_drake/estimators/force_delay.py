@@ -13,8 +13,8 @@ from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract, vector
 
-# The longest delay that is looked for, and for how long it counts what gain and bias the forces had,
-# and how noisy they were [s].
+# The longest delay that is looked for, and for how long it counts what gain and bias the forces
+# had, and how noisy they were [s].
 _LONGEST, _MEMORY = 0.01, 0.3
 # Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
 # the size of what they remember, and one for every rate would take half a minute each to compile.
@@ -41,8 +41,8 @@ def force_delay_type(clock: Clock) -> np.dtype:
     `square` and of its product `cross` with the forces, (room,), and of the forces,
     `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `likelihood`
     (2, room) of each delay, as the logarithm of its ratio to the largest, by the latest forces and
-    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of` the
-    clock are used.
+    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of`
+    the clock are used.
     """
     room = room_for_delays(clock)
     shapes = {"shown": (room, 3), "read": (room, 3), "total": (room, 3)}
