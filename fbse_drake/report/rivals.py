@@ -62,11 +62,11 @@ def loop_table(comparison: Comparison) -> Table:
         rows.append((who, *values, *shares, str(comparison.falls(who))))
     header = (
         "Fed back",
-        "tracking [mrad]",
+        "Tracking [mrad]",
         "CoM deviation [mm]",
-        "tracking recovered [%]",
+        "Tracking recovered [%]",
         "CoM recovered [%]",
-        "falls",
+        "Falls",
     )
     caption = (
         "The centre of mass deviates from that of the same walk without friction. Of what feeding "
@@ -87,7 +87,7 @@ def needs_table(comparison: Comparison) -> Table:
         cost = (number(tick), number(tick / ours))
         needs = (estimator.knows, estimator.measures)
         rows.append((name, *needs, settings or "-", tuning, *cost))
-    header = ("Method", "knows", "measures beside joints", "tuned", "score", "tick [us]", "of FBSE")
+    header = ("Method", "Knows", "Measures beside joints", "Tuned", "Score", "Tick [us]", "Of FBSE")
     caption = (
         "Each method with settings to tune had as many trials on another walk; score is the NRMSE "
         "there, as given and tuned. Ticks are medians, all measured in the same runs."
@@ -107,7 +107,7 @@ def joint_table(comparison: Comparison) -> Table:
         for name in comparison.names
         for phase in PHASES
     ]
-    header = ("Friction NRMSE", "leg in", *(joint.replace("_", " ") for joint in joints))
+    header = ("Friction NRMSE", "Leg in", *(joint.replace("_", " ") for joint in joints))
     return Table(header, tuple(rows), "Means over the seeds, by joint.", folded=True)
 
 
