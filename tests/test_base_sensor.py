@@ -86,7 +86,7 @@ def test_the_links_momenta_are_those_of_drake():
 
 
 def test_what_does_not_fit_gets_one_line():
-    arm, walk = scenario("bsc_arm"), scenario("paper_walk")
+    arm, walk = scenario("bsc_arm"), scenario("paper_walk", "duration=0.1")
     without = dataclasses.replace(arm.sensors, more={})
     with pytest.raises(InputError, match=r"!BaseSensor needs a sensor under the base \(as in"):
         dataclasses.replace(arm, sensors=without)

@@ -153,7 +153,7 @@ def test_a_push_moves_the_centre_of_mass_as_newton_says(run: Run):
 
 def test_a_push_on_no_body_gets_one_line():
     push = "robot.pushes.a={body: tail, force: [1, 0, 0], start: 0, duration: 1}"
-    pushed = load_scenario("squat", overrides=[push])
+    pushed = load_scenario("squat", overrides=["duration=0.1", push])
     with pytest.raises(InputError, match=r"pushes\.a\.body: tail: the model has no body"):
         build_station(pushed)
 
