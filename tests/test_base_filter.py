@@ -442,6 +442,22 @@ def leaning(x: np.ndarray) -> np.ndarray:
     return wrong
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bias_that_is_learned_at_once_is_no_fault_of_the_gyro(seed: int):
+    """A foot that comes to rest tells the bias within a tick; the readings do not step."""
+    rig, random = Filter(), np.random.default_rng(seed)
+    bias, floating = np.array([0.05, -0.05, 0.05]), np.zeros(2)
+    for k in range(200):
+        readings = BASE.measurements(
+            angular_velocity=bias + 1e-3 * random.normal(size=3),
+            specific_force=-GRAVITY + 1e-2 * random.normal(size=3),
+            support=floating if k < 10 else np.ones(2),
+        )
+        x = rig.tick(measurements=readings)
+        assert x["check"]["doubt"][0] == 0
+    np.testing.assert_allclose(x["gyro_bias_B"], bias, atol=5e-3)
+
+
 def test_a_tilt_that_all_feet_contradict_is_given_up():
     rig, x = settled()
     wrong = leaning(x)

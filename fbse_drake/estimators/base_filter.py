@@ -779,7 +779,8 @@ def _estimate_base(
         relative = scale(1.0 / elapsed, subtract(away, vector(last.away)))
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
-        cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w, elapsed)
+        # The gyro's own reading: a bias that is learned within a tick is no step of it.
+        cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w_raw, elapsed)
         if trust.max() == 0:
             shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
             noise, period = sensors.acceleration_noise, known.period
