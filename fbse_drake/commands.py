@@ -314,7 +314,9 @@ def _conclude(given: _Given, result: AnalysisResult) -> None:
 
 def _printed(table: ReportTable, title: str) -> Table:
     """A table of a report for the terminal; names and texts as they are."""
-    shown = Table(*table.header, title=title, title_justify="left")
+    shown = Table(title=title, title_justify="left")
+    for head in table.header:
+        shown.add_column(head, overflow="fold")
     for row in table.rows:
         shown.add_row(
             *(Text(number(cell) if isinstance(cell, float) else str(cell)) for cell in row)
