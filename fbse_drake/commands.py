@@ -312,11 +312,17 @@ def _conclude(given: _Given, result: AnalysisResult) -> None:
     console.print(f"Report: {given.out / 'report.html'}", soft_wrap=True)
 
 
+def _folding(title: str, header: Sequence[str]) -> Table:
+    """An empty table in which names that are too long go on in the next line."""
+    shown = Table(title=title, title_justify="left")
+    for head in header:
+        shown.add_column(head, overflow="fold")
+    return shown
+
+
 def _printed(table: ReportTable, title: str) -> Table:
     """A table of a report for the terminal; names and texts as they are."""
-    shown = Table(title=title, title_justify="left")
-    for head in table.header:
-        shown.add_column(head, overflow="fold")
+    shown = _folding(title, table.header)
     for row in table.rows:
         shown.add_row(
             *(Text(number(cell) if isinstance(cell, float) else str(cell)) for cell in row)
@@ -478,9 +484,7 @@ def _table(options: argparse.Namespace) -> bool:
         lines.append([*map(str, same), str(count), str(failed), *cells])
     if len(values) > len(summaries):
         lines = list(map(list, zip(*lines, strict=True)))
-    shown = Table(title=options.folder, title_justify="left")
-    for title in lines[0]:
-        shown.add_column(title, overflow="fold")
+    shown = _folding(options.folder, lines[0])
     for line in lines[1:]:
         shown.add_row(*line)
     console.print(shown)

@@ -63,7 +63,9 @@ class Recorded:
     gain: str = ""
 
 
-ReferenceConfig = Walk | Trot | Squat | Sway | JointSines | Recorded
+# Motions that are planned in task space.
+_TaskMotion = Walk | Trot | Squat | Sway
+ReferenceConfig = _TaskMotion | JointSines | Recorded
 
 
 @dataclass(frozen=True)
@@ -183,14 +185,7 @@ def make_plan(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> TaskPl
     """
     if isinstance(config, JointSines | Recorded):
         return None
-    if not robot.has_floating_base:
-        raise InputError(
-            f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
-        )
-    legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
-    corners = {side: robot.pad_positions(side) for side in legs}
-    gravity = robot.plant.gravity_field().gravity_vector()
-    return config.plan(time, _stance(legs), corners, gravity)
+    return _plan(config, robot, _legs(config, robot), time)
 
 
 def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> Reference:
@@ -211,9 +206,8 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         )
     if isinstance(config, JointSines):
         return _joint_sines(config, robot, time)
-    plan = make_plan(config, robot, time)
-    assert plan is not None
-    legs = {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
+    legs = _legs(config, robot)
+    plan = _plan(config, robot, legs, time)
     try:
         joint_motion, base, motions = _inverse_kinematics(
             robot, legs, plan, _posture(config.posture, robot.description)
@@ -234,6 +228,25 @@ def make_reference(config: ReferenceConfig, robot: Robot, time: np.ndarray) -> R
         base,
         plan,
     )
+
+
+def _legs(config: _TaskMotion, robot: Robot) -> dict[str, LegKinematics]:
+    if not robot.has_floating_base:
+        raise InputError(
+            f"a robot with a fixed base cannot follow {type(config).__name__}; use JointSines"
+        )
+    return {side: LegKinematics.from_robot(robot, side) for side in robot.description.sides}
+
+
+def _plan(
+    config: _TaskMotion,
+    robot: Robot,
+    legs: Mapping[str, LegKinematics],
+    time: np.ndarray,
+) -> TaskPlan:
+    corners = {side: robot.pad_positions(side) for side in legs}
+    gravity = robot.plant.gravity_field().gravity_vector()
+    return config.plan(time, _stance(legs), corners, gravity)
 
 
 def _stance(legs: Mapping[str, LegKinematics]) -> dict[str, np.ndarray]:
