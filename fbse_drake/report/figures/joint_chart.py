@@ -12,8 +12,7 @@ from fbse_drake.report.metrics import ended_step, joint_position_channel, joint_
 from fbse_drake.report.style import ESTIMATE, INK, TRUTH
 
 _CAPTION = (
-    "What is known of a joint; the band is twice the estimate's standard deviation. "
-    f"{HOW_TO_ZOOM}"
+    f"What is known of a joint; the band is twice the estimate's standard deviation. {HOW_TO_ZOOM}"
 )
 
 
