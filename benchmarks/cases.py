@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 import fbse_drake
-from fbse_drake.effects.effect import library
+from fbse_drake.discrepancy.exercises.hidden import HiddenEffect
 
 C = TypeVar("C")
 
@@ -109,14 +109,12 @@ class Result:
         }
         limits = [stated] if self.chosen else [stated, own]
 
-        def exceeds(hidden: dict[str, Any], target: str) -> bool:
-            return all(
-                _strength(hidden, target) > _limit(sizes, hidden, target) for sizes in limits
-            )
+        def shows(hidden: HiddenEffect, target: str) -> bool:
+            known = (sizes.get(hidden.effect, {}).get(target) for sizes in limits)
+            return all(hidden.exceeds(target, size) for size in known)
 
-        return all(
-            any(exceeds(hidden, target) for target in hidden["targets"]) for hidden in self.hidden
-        )
+        effects = [HiddenEffect(**effect) for effect in self.hidden]
+        return all(any(shows(hidden, target) for target in hidden.targets) for hidden in effects)
 
     def is_wrong(self, allowed: Iterable[str] = ()) -> bool:
         """Does it name effects with confidence that are not there?"""
@@ -139,33 +137,6 @@ class Result:
         return (
             f"{self.name}: {hidden} -> {self.diagnosis['verdict']}: {chosen}; unexplained: {left}"
         )
-
-
-def _strength(hidden: dict[str, Any], target: str) -> float:
-    """How large a hidden effect is on a target, so that more is easier to find: its first
-    parameter, or the length of a vector."""
-    name, parameter = next(iter(library()[hidden["effect"]].parameters.items()))
-    if parameter.neutral == np.inf:
-        return -hidden["parameters"][name][target]
-    if not parameter.linear:
-        return hidden["parameters"][name][target]
-    parameters = library()[hidden["effect"]].parameters
-    return float(
-        np.linalg.norm(
-            [
-                hidden["parameters"].get(n, {}).get(target, 0.0)
-                for n, p in parameters.items()
-                if p.linear and p.unit == parameter.unit
-            ]
-        )
-    )
-
-
-def _limit(stated: dict[str, dict[str, float]], hidden: dict[str, Any], target: str) -> float:
-    """The smallest strength that can be found."""
-    parameter = next(iter(library()[hidden["effect"]].parameters.values()))
-    limit = stated.get(hidden["effect"], {}).get(target, np.inf)
-    return -limit if parameter.neutral == np.inf and np.isfinite(limit) else limit
 
 
 def share(values: Iterable[bool]) -> tuple[str, str]:

@@ -384,6 +384,31 @@ def test_what_a_later_round_finds_counts():
     assert score(two, rounds[:1]).found == {"TorqueBias": False, "BodyMass": True}
 
 
+@pytest.mark.parametrize(
+    ("shown", "is_visible"),
+    [({JOINT: 1.9}, True), ({JOINT: 2.1, "left_hip_yaw": 0.1}, False), ({JOINT: None}, False)],
+)
+def test_who_misses_what_a_log_cannot_show_is_right(shown: dict, is_visible: bool):
+    """By what the diagnosis itself states of the joint that has it."""
+    status = {"TorqueBias": {"smallest_detectable_by_target": shown}}
+    nothing = diagnosis(verdict="nothing_missing") | {"effects": status}
+    result = score(answer("TorqueBias", JOINT, bias=-2.0), [nothing])
+    assert result.visible == {"TorqueBias": is_visible}
+    assert result.verdict is not is_visible
+    assert not result.first
+    assert ("too small to show in this log" in result.text) is not is_visible
+
+
+def test_a_low_limit_and_a_long_vector_are_large_effects():
+    limit = answer("TorqueSaturation", JOINT, limit=20.0).effects[0]
+    assert limit.exceeds(JOINT, 30.0)
+    assert not limit.exceeds(JOINT, 10.0)
+    assert not limit.exceeds(JOINT, np.inf)
+    slope = answer("GroundSlope", "robot", x=0.003, y=0.004).effects[0]
+    assert slope.exceeds("robot", 0.0049)
+    assert not slope.exceeds("robot", 0.0051)
+
+
 def test_decoy():
     decoy = Answer("decoy", "small", 1.0, ())
     assert score(decoy, [diagnosis(verdict="nothing_missing")]).verdict

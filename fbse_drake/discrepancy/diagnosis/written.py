@@ -44,6 +44,14 @@ class WrittenFinding:
 
 
 @dataclass(frozen=True)
+class WrittenStatus:
+    """What a diagnosis says of an effect of the library."""
+
+    # Null where no size would have shown.
+    smallest_detectable_by_target: dict[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class WrittenStructure:
     """A row with something that no effect explains."""
 
@@ -56,6 +64,7 @@ class WrittenDiagnosis:
 
     ranking: list[WrittenFinding]
     verdict: Verdict | None = None
+    effects: dict[str, WrittenStatus] = field(default_factory=dict)
     unexplained: list[WrittenStructure] = field(default_factory=list)
 
 

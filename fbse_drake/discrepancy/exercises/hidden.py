@@ -237,6 +237,25 @@ class HiddenEffect:
             self.targets, {name: list(values.values()) for name, values in self.parameters.items()}
         )
 
+    def exceeds(self, target: str, size: float | None) -> bool:
+        """Is it larger on a target than with this size of its first parameter?
+
+        Of a vector the length counts; a limit is the larger an effect the lower it is.
+
+        Args:
+            size: in the parameter's unit; None for more than any.
+        """
+        if size is None or not np.isfinite(size):
+            return False
+        known = self.kind.parameters
+        first, parameter = next(iter(known.items()))
+        if not parameter.linear:
+            value = self.parameters[first][target]
+            return value < size if parameter.neutral == np.inf else value > size
+        alike = [name for name in self.parameters if known[name].unit == parameter.unit]
+        vector = [self.parameters[name][target] for name in alike if known[name].linear]
+        return float(np.linalg.norm(vector)) > size
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -551,10 +570,12 @@ class Score:
     """How good a diagnosis of an exercise is."""
 
     # Does the verdict fit? `effect_found` for effects of the library, `unknown_effect` for a
-    # stranger; a decoy has nothing missing.
+    # stranger; a decoy has nothing missing, nor has a log that cannot show what is hidden.
     verdict: bool
-    # By hidden effect of the library: was it found, or an effect that is declared to say the same;
-    # and on exactly its targets?
+    # By hidden effect of the library: is it larger than the smallest size that the diagnosis says
+    # would have shown; was it found, or an effect that is declared to say the same; and on exactly
+    # its targets?
+    visible: dict[str, bool]
     found: dict[str, bool]
     confusable: dict[str, bool]
     targets: dict[str, bool]
@@ -573,9 +594,9 @@ class Score:
     def text(self) -> str:
         """As `Verdict: right; Coulomb friction found.`"""
         parts = [f"Verdict: {'right' if self.verdict else 'wrong'}"]
-        parts += [
-            f"{spaced(name)} {'found' if hit else 'not found'}" for name, hit in self.found.items()
-        ]
+        for name, hit in self.found.items():
+            said = "" if hit or self.visible[name] else ", and too small to show in this log"
+            parts.append(f"{spaced(name)} {'found' if hit else 'not found'}{said}")
         return f"{'; '.join(parts)}."
 
 
@@ -627,8 +648,14 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
         {effect.effect: effect for effect in answer.effects} if answer.kind == "library" else {}
     )
 
-    found, confusable, targets, covered = {}, {}, {}, {}
+    statuses = diagnoses[0].get("effects", {})
+    visible, found, confusable, targets, covered = {}, {}, {}, {}, {}
     for name, effect in hidden.items():
+        # What a diagnosis says nothing of is not excused.
+        shown = statuses.get(name, {}).get("smallest_detectable_by_target", {})
+        visible[name] = name not in statuses or any(
+            effect.exceeds(target, shown.get(target)) for target in effect.targets
+        )
         named = [finding for finding in [*chosen, *small] if finding["effect"] == name]
         found[name] = bool(named)
         confusable[name] = not named and any(
@@ -652,15 +679,18 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
                     for value, target in truth.items()
                 }
     wrong = [f["effect"] for f in chosen if not {f["effect"], *f["confusable_with"]} & set(hidden)]
+    names_nothing = diagnoses[0]["verdict"] in ("nothing_missing", "not_visible")
     verdict = {
-        "library": diagnoses[0]["verdict"] == "effect_found",
-        "decoy": diagnoses[0]["verdict"] in ("nothing_missing", "not_visible"),
+        "library": diagnoses[0]["verdict"] == "effect_found"
+        or (names_nothing and not any(visible.values())),
+        "decoy": names_nothing,
         "stranger": diagnoses[-1]["verdict"] == "unknown_effect",
     }[answer.kind]
     # Rows of joints are called like the joints, others have a slash in their names.
     unexplained = {row["row"] for row in diagnoses[-1]["unexplained"] if "/" not in row["row"]}
     return Score(
         verdict,
+        visible,
         found,
         confusable,
         targets,
