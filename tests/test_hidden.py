@@ -397,6 +397,8 @@ def test_who_misses_what_a_log_cannot_show_is_right(shown: dict, is_visible: boo
     assert result.verdict is not is_visible
     assert not result.first
     assert ("too small to show in this log" in result.text) is not is_visible
+    found = diagnosis(("TorqueBias", (JOINT,), {})) | {"effects": status}
+    assert score(answer("TorqueBias", JOINT, bias=-2.0), [found]).visible == {"TorqueBias": True}
 
 
 def test_a_low_limit_and_a_long_vector_are_large_effects():

@@ -572,9 +572,9 @@ class Score:
     # Does the verdict fit? `effect_found` for effects of the library, `unknown_effect` for a
     # stranger; a decoy has nothing missing, nor has a log that cannot show what is hidden.
     verdict: bool
-    # By hidden effect of the library: is it larger than the smallest size that the diagnosis says
-    # would have shown; was it found, or an effect that is declared to say the same; and on exactly
-    # its targets?
+    # By hidden effect of the library: is it found, or larger than the smallest size that the
+    # diagnosis says would have shown; was it found, or an effect that is declared to say the same;
+    # and on exactly its targets?
     visible: dict[str, bool]
     found: dict[str, bool]
     confusable: dict[str, bool]
@@ -651,13 +651,15 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
     statuses = diagnoses[0].get("effects", {})
     visible, found, confusable, targets, covered = {}, {}, {}, {}, {}
     for name, effect in hidden.items():
-        # What a diagnosis says nothing of is not excused.
-        shown = statuses.get(name, {}).get("smallest_detectable_by_target", {})
-        visible[name] = name not in statuses or any(
-            effect.exceeds(target, shown.get(target)) for target in effect.targets
-        )
         named = [finding for finding in [*chosen, *small] if finding["effect"] == name]
         found[name] = bool(named)
+        # What a diagnosis says nothing of is not excused.
+        shown = statuses.get(name, {}).get("smallest_detectable_by_target", {})
+        visible[name] = (
+            found[name]
+            or not shown
+            or any(effect.exceeds(target, shown.get(target)) for target in effect.targets)
+        )
         confusable[name] = not named and any(
             name in finding["confusable_with"] for finding in chosen
         )
