@@ -226,6 +226,34 @@ def test_what_the_library_does_not_know_is_called_unknown() -> None:
     diagnosis = diagnose(Predictor(scenario(), strange), effects())
     assert diagnosis.verdict == "unknown_effect"
     assert [structure.row for structure in diagnosis.unexplained] == ["left_knee_pitch"]
+    # No guess explains any of it.
+    assert not diagnosis.ranking
+
+
+def test_how_far_a_single_guess_goes_is_told_where_nothing_can_be_named() -> None:
+    """Viscous friction beside something larger that the library does not know: it takes less than
+    it leaves, so it is no name for that, but it is listed with what it takes."""
+    log = log_with("")
+    velocity = log["joint/velocity"]
+    joint = log.joints.index("left_knee_pitch")
+    command = log["joint/torque_command"].copy()
+    strange = 4.0 * np.sin(25 * log.time) * np.sin(40 * log["joint/position"][:, joint])
+    command[:, joint] += strange + 1.0 * velocity[:, joint]
+    disguised = replace(log, channels=log.channels | {"joint/torque_command": command})
+    diagnosis = diagnose(Predictor(scenario(), disguised), effects())
+    assert diagnosis.verdict == "unknown_effect"
+    assert not diagnosis.chosen
+    viscous = next(f for f in diagnosis.ranking if f.effect == "ViscousFriction")
+    low, high = viscous.parameters["viscous"].interval
+    assert low < 1.0 < high
+    errors = [finding.held_out_after for finding in diagnosis.ranking]
+    assert all(error > 0.7 * viscous.held_out_before for error in errors)
+    assert errors[0] == min(errors) < viscous.held_out_before
+    # It can be added by name, and by name only.
+    content = diagnosis_json(diagnosis)
+    assert [f.targets for f in read_findings(content, "ViscousFriction")] == [("left_knee_pitch",)]
+    with pytest.raises(InputError, match="no effect to add"):
+        read_findings(content)
 
 
 def test_two_effects_at_once_are_both_found() -> None:

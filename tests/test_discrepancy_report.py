@@ -193,7 +193,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             [
                 "Nothing is missing",
                 "1 of 4 effects would not show in this log.",
-                "no effect makes it smaller on held-out data",
+                "no effect explains enough of it on held-out data",
             ],
         ),
         (
@@ -483,7 +483,7 @@ def test_a_search_that_ended_early_rules_nothing_out(
     diagnosis = dataclasses.replace(UNKNOWN, **stopped)
     reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
     text = page_text(tmp_path / "report.html")
-    for claim in ("no effect makes it smaller", "Nothing else in the library", "of your own"):
+    for claim in ("no effect explains enough", "Nothing else in the library", "of your own"):
         assert (claim in text) != interrupted
     assert ("with more time" in text) == interrupted
 

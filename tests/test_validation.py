@@ -22,7 +22,13 @@ from fbse_drake.discrepancy.diagnosis.validation import batch_length, root_of_ra
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.files import write_text
-from fbse_drake.report.sentences import diagnosis_outcome, study_outcome
+from fbse_drake.report.sentences import (
+    Inputs,
+    diagnosis_outcome,
+    steps_after_diagnosis,
+    steps_after_study,
+    study_outcome,
+)
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, dump_scenario
 
 NOISE, KNEE = 0.05, "left_knee_pitch"
@@ -139,6 +145,23 @@ def test_a_study_is_headed_by_what_was_set_aside(
     outcome = study_outcome(result)
     assert outcome.startswith("Not confirmed: on the rest of the log") == (course == "rises")
     assert f"which was set aside, the error {course}: from " in outcome
+    # What its own test refuses is neither stated nor proposed.
+    refuted, inputs = course == "rises", Inputs("legs", "legs.yaml", ("log.npz",), "out")
+    assert ("What was fitted suggests that the model lacks Coulomb friction" in outcome) == refuted
+    assert ("The model lacked Coulomb friction" in outcome) != refuted
+    assert ("before it is used" in steps_after_study(result, inputs)[0].text) == refuted
+    diagnosis = dataclasses.replace(result.diagnoses[0], set_aside=result.set_aside)
+    assert ("suggests that the model lacks" in diagnosis_outcome(diagnosis)) == refuted
+    command = steps_after_diagnosis(diagnosis, inputs)[0].command
+    assert command.startswith("fbse diagnose" if refuted else "fbse add")
+    # What a study found, but did not add.
+    nothing = dataclasses.replace(
+        result, steps=result.steps[:1], diagnoses=(diagnosis,), set_aside={}
+    )
+    assert study_outcome(nothing).startswith("Nothing was added: Coulomb friction in left knee")
+    assert not any(
+        "fbse add" in (step.command or "") for step in steps_after_study(nothing, inputs)
+    )
 
 
 @pytest.mark.parametrize("command", ["diagnose", "study"])

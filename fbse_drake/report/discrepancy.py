@@ -348,7 +348,11 @@ def _why(
             "Error on held-out data of all the channels that an effect moves, taken together, "
             "without it and with it, everything else being equal; as everywhere in this report in "
             "multiples of the sensors' noise (root mean squares). The broken line is that noise. "
-            "An alternative stands in the place of what was chosen."
+            + (
+                "An alternative stands in the place of what was chosen."
+                if chosen
+                else "Each effect is tried by itself."
+            )
         )
         names = [
             f"{finding_name(f)}{when}"
@@ -368,11 +372,15 @@ def _why(
     if valued:
         caption = "With their 95 % intervals, which respect what is left of correlation in time."
         blocks.append(FigureBlock("Fitted values", caption, figures.parameters(valued)))
-    text = (
-        ""
-        if chosen
-        else "No effect of the library makes the error smaller on data that it was not fitted to."
-    )
+    text = ""
+    if not chosen:
+        text = (
+            "No effect is named: those below explain something by themselves, but not enough of "
+            "it, or not in a way that can be."
+            if others
+            else "No effect of the library makes the error smaller on data that it was not fitted "
+            "to."
+        )
     return [Section("Why it fails", text, tuple(tables), tuple(blocks))] if tables or blocks else []
 
 

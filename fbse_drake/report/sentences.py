@@ -31,6 +31,10 @@ _COURSES = {
 # Effects that are called after somebody.
 _NAMES = ("Coulomb", "Stribeck", "IMU")
 
+_NOTHING = Step(
+    "Nothing. A motion that loads and moves the joints more would show smaller effects."
+)
+
 _KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of the soles"}
 
 
@@ -181,6 +185,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
             name for finding in diagnosis.chosen for name in finding.confusable_with
         )
         doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
+        if not is_confirmed(diagnosis.set_aside):
+            return f"{_suggested(found)}{doubt}."
         return f"The model lacks {found}{doubt}."
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
@@ -197,8 +203,16 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} "
             "effects would not show in it."
         )
-    known = f" The model also lacks {found}." if found else ""
+    known = ""
+    if found:
+        confirmed = is_confirmed(diagnosis.set_aside)
+        known = f" The model also lacks {found}." if confirmed else f" {_suggested(found)}."
     return f"{_unexplained(diagnosis)}{known}"
+
+
+def _suggested(found: str) -> str:
+    """What data that was set aside does not confirm, without a full stop."""
+    return f"What was fitted suggests that the model lacks {found}"
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
@@ -221,9 +235,13 @@ def study_outcome(study: Study) -> str:
 
 
 def _study_result(study: Study) -> str:
+    ended = study.diagnoses[-1]
     if not study.found:
-        return diagnosis_outcome(study.diagnoses[-1])
-    result = f"The model lacked {listed_effects(study.found)}."
+        refused = ended.chosen and ended.partial is None
+        return _not_added(ended) if refused else diagnosis_outcome(ended)
+    found = listed_effects(study.found)
+    confirmed = is_confirmed(study.set_aside)
+    result = f"The model lacked {found}." if confirmed else f"{_suggested(found)}."
     if study.set_aside:
         result = _headline(result, study.set_aside)
     else:
@@ -234,8 +252,20 @@ def _study_result(study: Study) -> str:
             f"{number(first.held_out_rmse)} to {number(last.held_out_rmse)} times the "
             "sensors' noise; no data was set aside to test that."
         )
-    if study.diagnoses[-1].verdict == "unknown_effect":
-        result += f" {_unexplained(study.diagnoses[-1])}"
+    if ended.verdict == "unknown_effect":
+        result += f" {_unexplained(ended)}"
+    return result
+
+
+def _not_added(diagnosis: Diagnosis) -> str:
+    """Of what a study found and did not add."""
+    result = (
+        f"Nothing was added: {listed_effects(diagnosis.chosen)} would not lower the held-out error "
+        f"({number(diagnosis.held_out_before)} times the sensors' noise, with it "
+        f"{number(diagnosis.held_out_after)})."
+    )
+    if diagnosis.verdict == "unknown_effect":
+        result += f" {_unexplained(diagnosis)}"
     return result
 
 
@@ -256,7 +286,9 @@ def how_sure(
             "data that it was fitted to). Noise alone brings a finding once in a thousand logs."
         )
     nothing = (
-        "nothing was found by then" if partial else "no effect makes it smaller on held-out data"
+        "nothing was found by then"
+        if partial
+        else "no effect explains enough of it on held-out data"
     )
     return f"The error of all channels is {number(before)} times the sensors' noise, and {nothing}."
 
@@ -272,25 +304,27 @@ def steps_after_compare(comparison: Comparison, inputs: Inputs) -> tuple[Step, .
 def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, ...]:
     """What to do after a diagnosis, the most important first."""
     steps = []
-    if diagnosis.chosen:
+    if diagnosis.chosen and is_confirmed(diagnosis.set_aside):
         completed = f"{inputs.name}_completed.yaml"
         command = f"fbse add {inputs.scenario} {inputs.out} --out {completed}"
         steps.append(Step("Add it to the model:", command))
-    steps += _experiments_next(diagnosis, diagnosis.chosen)
-    nothing = Step(
-        "Nothing. A motion that loads and moves the joints more would show smaller effects."
-    )
-    return tuple(steps) or (nothing,)
+    elif diagnosis.chosen:
+        command = f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)} --test ANOTHER_LOG"
+        steps.append(Step("See whether another log confirms it, before it is added:", command))
+    return (*steps, *_experiments_next(diagnosis, diagnosis.chosen)) or (_NOTHING,)
 
 
 def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
     """What to do after a study, the most important first."""
     last = study.diagnoses[-1]
     if not study.found:
-        return steps_after_diagnosis(last, inputs)
+        # What was found and not added is not to be added by hand either.
+        return tuple(_experiments_next(last, ())) or (_NOTHING,)
     command = f"fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
-    test = Step("Try the completed model on a log that it has not seen:", command)
-    return (test, *_experiments_next(last, study.found))
+    text = "Try the completed model on a log that it has not seen"
+    if not is_confirmed(study.set_aside):
+        text += ", before it is used for anything: this log does not confirm it"
+    return (Step(f"{text}:", command), *_experiments_next(last, study.found))
 
 
 def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[Step]:

@@ -24,7 +24,7 @@ from fbse_drake.discrepancy.diagnosis.rivals import (
     rivals,
     settled,
 )
-from fbse_drake.discrepancy.diagnosis.selection import select
+from fbse_drake.discrepancy.diagnosis.selection import select, single_guesses
 from fbse_drake.discrepancy.diagnosis.significance import Significance
 from fbse_drake.discrepancy.diagnosis.spread import Spread, spreads, spreads_json
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
@@ -117,7 +117,8 @@ class Diagnosis:
     """Which effects are missing, and how sure that is."""
 
     verdict: Verdict
-    # Chosen effects, those that explain most first, then alternatives, best first.
+    # Chosen effects, those that explain most first, then alternatives, best first; where nothing
+    # can be named of what is there, what each effect explains by itself.
     ranking: tuple[Finding, ...]
     effects: dict[str, EffectStatus]
     # What no effect of the library explains: by row, as far as it is large enough to matter.
@@ -198,8 +199,12 @@ def diagnose(
     shares = {c: significance.share(final, c) for c in final.candidates}
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
+    guesses: list[Explanation] = []
     try:
         if partial is None:
+            if unexplained and not final.candidates:
+                left = np.array([structure.index for structure in unexplained])
+                guesses = single_guesses(proposals, left)
             if dictionary.inertia is not None:
                 alternatives = rivals(proposals, final)
             equal = indistinguishable(fits, alternatives, final)
@@ -224,6 +229,7 @@ def diagnose(
         verdict,
         (
             *(_sized(f, tolerance) for f in _ranking(fits, path[-1], alternatives, equal, shares)),
+            *_ranked(fits, guesses, ()),
             *inertia_findings(white, before, path[0], inertia),
         ),
         statuses,
@@ -380,17 +386,28 @@ def _ranking(
         names = tuple(dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ())))
         finding = finding_of(white, rest, final, member, names, chosen=True)
         findings.append(replace(finding, share=shares[member], spread=spread.get(member, {})))
-    seen = {(f.effect, f.targets) for f in findings}
     others = sorted(
         (e for of_member in alternatives.values() for e in of_member), key=lambda e: e.deviance
     )
-    for explanation in others:
+    return [*findings, *_ranked(fits, others, findings)]
+
+
+def _ranked(
+    fits: Fits, explanations: Sequence[Explanation], findings: Sequence[Finding]
+) -> list[Finding]:
+    """What the last members of explanations bring, each effect and targets once.
+
+    Args:
+        findings: what is told already.
+    """
+    seen, result = {(f.effect, f.targets) for f in findings}, []
+    for explanation in explanations:
         member = explanation.candidates[-1]
         if (member.name, member.targets) not in seen:
             seen.add((member.name, member.targets))
             rest = fits.explain(explanation.candidates[:-1])
-            findings.append(finding_of(white, rest, explanation, member, (), chosen=False))
-    return findings
+            result.append(finding_of(fits.white, rest, explanation, member, (), chosen=False))
+    return result
 
 
 def finding_of(

@@ -23,6 +23,8 @@ _EXPANSIONS = 3
 # What takes off less than this share of a deviance does not reach it at other values of its
 # nonlinear parameters either.
 _CATCHES_UP = 0.4
+# What takes off this share of the sum of squares that is required is worth a fit.
+_ENOUGH = 0.5
 # So many numbers are kept in columns of candidates.
 _MOST_NUMBERS = 15_000_000
 # How often friction of all joints is fitted in turn.
@@ -46,8 +48,17 @@ class Proposals:
         self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
         self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
+    @property
+    def unbarred(self) -> "Proposals":
+        """The same with nothing barred."""
+        return Proposals(self.fits) if self._barred else self
+
     def promising(
-        self, base: Explanation, rows: np.ndarray | None, wanted: float = 0.0
+        self,
+        base: Explanation,
+        rows: np.ndarray | None,
+        wanted: float = 0.0,
+        share: float = _ENOUGH,
     ) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over.
 
@@ -55,18 +66,19 @@ class Proposals:
             rows: only those that change one of these; None for all.
             wanted: drop of the deviance; what is far from it, with values of its grid or linear
                 about no effect at all, is left out.
+            share: so much of what is required is enough.
         """
         fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
         if rows is None:
             rows = np.arange(len(beside.scale))
-        enough = 0.5 * fits.threshold[1]
+        enough = share * fits.threshold[1]
         known = {c.key for c in base.candidates} | self._barred
         result = [
             self._settled(candidate, base)
             for candidate in fits.fixed_candidates
             if candidate.key not in known
             and np.intersect1d(candidate.signature.rows, rows).size
-            and self._gains_enough(candidate, base, wanted)
+            and self._gains_enough(candidate, base, wanted, share)
         ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
             group: [] for group in dictionary.groups
@@ -148,13 +160,15 @@ class Proposals:
         best = self._best_on(effect, targets, int(gain.argmax()), remainder)
         return self.fits.explain([*base.candidates, best])
 
-    def _gains_enough(self, candidate: Candidate, base: Explanation, wanted: float) -> bool:
+    def _gains_enough(
+        self, candidate: Candidate, base: Explanation, wanted: float, share: float
+    ) -> bool:
         """Is a candidate that is no joint torque effect worth a fit?"""
         beside, s = self.fits.remainder(base), candidate.signature
         moments = [beside.moments(s, k) for k in range(len(s.rows))]
         gain = fixed_gain(*_weighted(moments, beside.scale[s.rows]))
         alone = (fixed_gain(*of_row) for of_row in moments)
-        return gain > 0.5 * self.fits.required(candidate) and self._may_reach(
+        return gain > share * self.fits.required(candidate) and self._may_reach(
             wanted, base, s.rows, alone
         )
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence, Set
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
-from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
 from fbse_drake.effects.effect import Effect
@@ -104,6 +104,25 @@ def best_additions(
         ):
             found.append(wider)
     return sorted(found, key=lambda e: e.deviance)
+
+
+def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
+    """What each candidate explains alone where nothing can be named, best first: how far a guess
+    goes. Those that explain nothing of held-out data are left out.
+
+    Args:
+        rows: what counts is explained there.
+    """
+    proposals = proposals.unbarred
+    fits = proposals.fits
+
+    def left(explanation: Explanation) -> float:
+        return float(fits.white.deviance_by_row(explanation.held_out_sse)[rows].sum())
+
+    base = fits.explain([])
+    tried = proposals.promising(base, rows, share=0.0)
+    found = sorted((fits.explain([candidate]) for candidate in tried), key=left)
+    return [e for e in found if left(e) < left(base) - COMPLEXITY * len(e.fit.parameters)]
 
 
 def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
