@@ -12,7 +12,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
-from fbse_drake.discrepancy.residual.noise import noise_power
+from fbse_drake.discrepancy.residual.noise import channel_noise, noise_power
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.log import Log
@@ -149,3 +149,25 @@ def test_slow_effects_jumps_and_gaps_are_no_noise() -> None:
     # As many degrees of freedom as it says.
     assert alone.ratio.var() == pytest.approx(2 / alone.freedom[0], rel=0.3)
     assert beside.ratio.mean() < 1.35
+
+
+@pytest.mark.parametrize("ringing", [1, 2])
+def test_a_joint_that_rings_is_said_to_and_is_no_noise(ringing: int) -> None:
+    """A velocity that alternates from sample to sample, in one joint or in both, does not make the
+    rows noisier; white noise beside it is measured in the joint that does not ring."""
+    scenario, log = run()
+    log = noisy(log, 3, torque=1.0, velocity=2.0)
+    assert channel_noise(log, "joint/velocity") == pytest.approx(2 * VELOCITY_NOISE, rel=0.1)
+    velocity = log["joint/velocity"].copy()
+    velocity[::2, :ringing] += 0.3
+    rung = replace(log, channels=log.channels | {"joint/velocity": velocity})
+    level = channel_noise(rung, "joint/velocity")
+    assert np.isnan(level) if ringing == 2 else level == pytest.approx(2e-3, rel=0.1)
+    said = {
+        name: [f for f in inspect(Predictor(scenario, one).motion).findings if f.kind == "ringing"]
+        for name, one in (("clean", log), ("rung", rung))
+    }
+    assert not said["clean"]
+    assert len(said["rung"]) == 1
+    assert said["rung"][0].size == pytest.approx(0.15, rel=0.02)
+    assert len(said["rung"][0].where) == ringing

@@ -303,6 +303,10 @@ def _held(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
         for path, proposals in select(fits, barred):
             yield path, proposals
         nothing, found, kept = path[0], path[-1], frugal(proposals, path[-1])
+        if len(kept.candidates) < len(found.candidates):
+            # What is doubtful of a law is no noise without it.
+            fits, kept = proposals.fits.doubting(kept)
+            proposals = proposals if fits is proposals.fits else Proposals(fits, barred)
         if best is None or kept.deviance < best[0][-1].deviance - MARGIN:
             best = [*path[:-1], kept], proposals
         left = {c.key for c in kept.candidates}

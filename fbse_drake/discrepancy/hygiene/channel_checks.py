@@ -41,6 +41,9 @@ SPECTRUM = 512
 _EMPTY = 0.05
 # Share of a channel's variance that may lie above the corner of what filtered it.
 _EDGE = 1e-6
+# Correlation of a velocity's changes from sample to sample below which it alternates (white noise
+# has -1/2, and -3/4 if differentiated twice), in more than half of windows of so many samples.
+_ALTERNATES, _RINGING = -0.9, 50
 # Order of the differences by which noise is told from motion.
 _DIFFERENCE = 6
 # Noise is taken from stretches of so many samples, and from this share of them that are quietest.
@@ -236,6 +239,33 @@ def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
         yield from remarks("filtered", "note", name, lowest, "Hz", text)
 
 
+def check_ringing(evidence: Evidence) -> Iterable[HygieneFinding]:
+    """Velocities that change their course with every sample: a loop on its edge of stability."""
+    name = "joint/velocity"
+    if name not in evidence.channels:
+        return
+    values, parts = evidence.channels[name]
+    changes = np.diff(values, axis=0)
+    count = len(changes) // _RINGING
+    if count == 0:
+        return
+    windows = changes[: count * _RINGING].reshape(count, _RINGING, -1)
+    power = (windows**2).sum(axis=1)
+    products = (windows[:, 1:] * windows[:, :-1]).sum(axis=1)
+    alternates = products < _ALTERNATES * power
+    sizes = 0.5 * np.sqrt(np.median(power / _RINGING, axis=0))
+    found = {
+        part: float(sizes[k])
+        for k, part in enumerate(parts)
+        if alternates[:, k].mean() > 0.5 and sizes[k] > evidence.quantum[name][k]
+    }
+    text = (
+        "{where} goes to and fro from sample to sample, by {size} each way: its loop rings at half "
+        "the rate of the log, which blurs laws of friction"
+    )
+    yield from remarks("ringing", "warning", name, found, evidence.units[name], text)
+
+
 def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
     """White noise of the sensors, for `sensors:` and `recording:` of a scenario: from differences
     of high order, which motion hardly has.
@@ -320,5 +350,6 @@ CHECKS = (
     check_slow_channels,
     check_steps,
     check_filtered,
+    check_ringing,
     check_noise,
 )

@@ -18,8 +18,8 @@ _ORDER, _WINDOW = 4, 20
 # Impacts and trembling joints are no noise: this quantile of windows, and of a channel's
 # components, counts. It is as good as the mean of that share of the windows.
 _QUIET, _EFFICIENCY = 0.25, 0.54
-# Orders at which a channel's noise is measured; of what is not white, the lower shows this factor
-# more.
+# Orders at which a channel's noise is measured, which agree within this factor if it is white:
+# of motion the lower shows more, of a joint that rings from sample to sample the higher.
 _ORDERS, _WHITE = (3, 6), 1.1
 # Smallest factor of a row's noise that is worth a word, and probability of saying so of any by
 # chance.
@@ -141,7 +141,7 @@ def channel_noise(log: Log, name: str) -> float:
     low, high = (
         np.sqrt(noise_power(values, known, np.ones(values.shape), order).ratio) for order in _ORDERS
     )
-    white = low < _WHITE * high
+    white = (low < _WHITE * high) & (high < _WHITE * low)
     return float(np.quantile(high[white], _QUIET)) if white.any() else np.nan
 
 
