@@ -19,8 +19,6 @@ from fbse_drake.discrepancy.residual.residual import rms
 
 # Of the intervals.
 LEVEL = 0.95
-# Fewer batches say nothing of how much an error scatters.
-_FEWEST_BATCHES = 4
 
 Course = Literal["falls", "rises", "unclear"]
 
@@ -128,13 +126,13 @@ def root_of_ratio(above: np.ndarray, below: np.ndarray, batch: int) -> Measured:
     if not len(under):
         return Measured(np.nan, (np.nan, np.nan))
     ratio, count = float(over.sum() / under.sum()), len(under)
-    spread = np.inf
-    if count >= _FEWEST_BATCHES and ratio > 0:
+    # Of the logarithm, which is nearly normal where a ratio of sums of squares is not; half of it,
+    # for the root. One batch says nothing of how much the error scatters.
+    half = np.inf
+    if count > 1 and ratio > 0:
         scatter = float(((over - ratio * under) ** 2).sum()) * count / (count - 1)
         spread = np.sqrt(scatter) / float(over.sum())
-    # Of the logarithm, which is nearly normal where a ratio of sums of squares is not; half of it,
-    # for the root.
-    half = 0.5 * float(student.ppf((1 + LEVEL) / 2, count - 1)) * spread if count > 1 else np.inf
+        half = 0.5 * float(student.ppf((1 + LEVEL) / 2, count - 1)) * spread
     root = float(np.sqrt(ratio))
     return Measured(root, (root * float(np.exp(-half)), root * float(np.exp(half))))
 
