@@ -19,10 +19,10 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
 
-# A file's tests share its runs, so they stay on one worker.
+# A file's tests share its runs, so they stay on one worker. Each has a core: threads of the linear algebra would wait for each other.
 test: $(INSTALLED)
 	$(MAKE) --jobs 2 lint kernels
-	MPLBACKEND=Agg $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
+	MPLBACKEND=Agg OMP_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # Files that call every dependency, in some minutes; most of it is compiled.
 minimum:

@@ -1,8 +1,10 @@
 """Runs that several tests look at, made once per session."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from functools import lru_cache
+from hashlib import sha256
 
 import pytest
 
@@ -17,15 +19,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def run() -> Callable[..., Log]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Log]:
     """Simulates a shipped scenario: run("squat", "duration=2", noise=False).
 
-    The last logs are kept; one has some 3 MiB for each second.
+    Logs are files, so that the workers of a session share them; each keeps its last ones in memory
+    as well, some 3 MiB for each second.
     """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
 
-    @lru_cache(maxsize=12)
+    @lru_cache(maxsize=4)
     def simulated(name: str, *overrides: str, noise: bool = True) -> Log:
-        return simulate(scenario(name, *overrides, noise=noise), name=name).log
+        key = sha256(repr((name, overrides, noise)).encode()).hexdigest()
+        path = folder / f"run_{key}.npz"
+        if not path.exists():
+            simulate(scenario(name, *overrides, noise=noise), name=name).log.save(path)
+        return Log.load(path)
 
     return simulated
 

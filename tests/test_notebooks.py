@@ -1,4 +1,5 @@
-"""The notebooks: they run from top to bottom, and what is stored in them is fit to be read."""
+"""The notebooks: they run from top to bottom, some on shorter logs than a reader's, and what is
+stored in them is fit to be read."""
 
 import os
 import sys
@@ -45,6 +46,17 @@ def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
         pytest.fail(str(error), pytrace=False)
 
 
+def shortened(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """The same on shorter logs: the notebook says itself which texts of its code stand for which."""
+    shorter = notebook.metadata.get("fbse", {}).get("shorter", {})
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for long, short in shorter.items():
+        assert any(long in cell.source for cell in code), long
+        for cell in code:
+            cell.source = cell.source.replace(long, short)
+    return notebook
+
+
 def errors(notebook: nbformat.NotebookNode) -> list[str]:
     outputs = [
         output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
@@ -66,7 +78,7 @@ def test_runs(path, tmp_path):
         pytest.skip("FBSE_DATA_DIR does not name the folder of the recordings that it shows")
     for module in needs.get("needs_modules", []):
         pytest.importorskip(module)
-    run(notebook, path.parent, tmp_path)
+    run(shortened(notebook), path.parent, tmp_path)
     assert errors(notebook) == []
 
 

@@ -18,7 +18,7 @@ from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract
 _LONGEST, _MEMORY = 0.01, 0.3
 # Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
 # the size of what they remember, and one for every rate would take half a minute each to compile.
-_USUAL_PERIOD = 0.001
+_FASTEST_USUAL_PERIOD = 0.0005
 # How much of that time it takes to know the noise.
 _LEAST = 0.5
 # By how much of itself a tick may be longer or shorter for its velocities' difference to be an
@@ -57,8 +57,8 @@ def delays_of(clock: Clock) -> int:
 
 
 def room_for_delays(clock: Clock) -> int:
-    """How many ticks are remembered: the delays of the clock, and no fewer than at 1 ms."""
-    return max(_delays(clock.period), _delays(_USUAL_PERIOD))
+    """How many ticks are remembered: the delays of the clock, and no fewer than at 0.5 ms."""
+    return max(_delays(clock.period), _delays(_FASTEST_USUAL_PERIOD))
 
 
 @njit(cache=True)
