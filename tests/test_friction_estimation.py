@@ -316,7 +316,7 @@ def test_no_friction_no_estimate(run: Run):
 
     Measured, the worst of five seeds: 0.07 Nm, 0.43 Nm by the observer; means of 0.04 Nm, 0.03 Nm.
     """
-    log = part(run("paper_walk", "duration=3", "robot.effects=null"), 2.0)
+    log = run("paper_walk", "duration=2", "robot.effects=null")
     assert np.all(log["truth/joint/friction_torque"] == 0)
     for config, largest in ((Fbse(), 0.12), (DisturbanceObserver(), 0.8)):
         result = estimated(log, WALK, config)

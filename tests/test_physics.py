@@ -337,7 +337,7 @@ def test_a_sampled_position_loop_damps_by_its_closed_form(step: float):
 _FOLLOWED = [
     ("hrp2_walk_fbse", "duration=2", RISING_LAW),
     ("paper_walk_integral", "duration=1.5", FALLING_LAW),
-    ("strider_walk", "duration=2", RISING_LAW),
+    ("strider_walk", "duration=3", RISING_LAW),
     ("leg_swing_gantry", "duration=3", FALLING_LAW),
     ("squat", "duration=2", FALLING_LAW),
     ("sway", "duration=2", FALLING_LAW),
