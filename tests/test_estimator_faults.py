@@ -253,7 +253,8 @@ def test_nothing_to_start_from(walk: Log, name: str):
 def test_healthy_sensors_are_trusted(run: Run):
     """No false alarm, neither in a walk with noise nor without: a sensor that is exact may rest at
     zero."""
-    noisy, exact = run("paper_walk_fbse", "duration=3"), run("paper_walk", "duration=3", noise=False)
+    noisy = run("paper_walk_fbse", "duration=3")
+    exact = run("paper_walk", "duration=3", noise=False)
     channel = "estimate/sensors/status"
     assert (noisy[channel] == 0).all()
     for log, config in ((noisy, FixedFriction()), (exact, FixedFriction()), (exact, Fbse())):

@@ -47,7 +47,7 @@ def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
 
 
 def shortened(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """The same on shorter logs: the notebook says itself which texts of its code stand for which."""
+    """The same on shorter logs: the notebook itself says by what to replace which of its texts."""
     shorter = notebook.metadata.get("fbse", {}).get("shorter", {})
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     for long, short in shorter.items():

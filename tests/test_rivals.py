@@ -142,7 +142,7 @@ def test_play_with_the_encoder_on_the_link_is_backlash(arm: Course) -> None:
 @pytest.fixture(scope="module")
 def crooked(run) -> Predictor:
     """A walk whose IMU is mounted askew by 2 deg."""
-    log, believed = run("paper_walk", "duration=2.6"), scenario("paper_walk", "duration=2.6")
+    log, believed = run("paper_walk", "duration=3"), scenario("paper_walk", "duration=3")
     R = Rotation.from_rotvec([0.02, -0.028, 0.0]).as_matrix()
     turned = {name: log[name] @ R for name in ("imu/linear_acceleration", "imu/angular_velocity")}
     return Predictor(
