@@ -121,6 +121,18 @@ def test_compare_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], t
     assert ">nan<" not in text
 
 
+def test_of_phases_that_are_too_short_the_whole_log_is_drawn(walk: tuple[Predictor, Comparison]):
+    predictor, comparison = walk
+    unknown = dict.fromkeys(("stance", "swing"), (np.nan, np.nan))
+    channels = [dataclasses.replace(channel, by_phase=unknown) for channel in comparison.channels]
+    short = dataclasses.replace(comparison, channels=tuple(channels))
+    posture = predictor.motion.blocks.joint_position[0]
+    drawn = figures.robot_errors(predictor.robot, short, posture)
+    for axes in drawn.axes[1:-1]:  # Robot and colours are beside them.
+        assert [label.get_text() for label in axes.get_xticklabels()] == ["whole\nlog"]
+        assert all(text.get_text() != "-" for text in axes.texts)
+
+
 def test_study_report_holds_all_it_shows(walk: tuple[Predictor, Comparison], tmp_path: Path):
     rolled = RolloutError({"left_knee_pitch": 0.012}, {}, {"left_knee_pitch": 3.0}, 3.0, None)
     better = dataclasses.replace(rolled, position={"left_knee_pitch": 0.002})

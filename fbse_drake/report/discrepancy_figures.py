@@ -52,6 +52,9 @@ _PANELS = 3
 # joined.
 _MOST_JOINTS = 6
 _GAP = 3.0
+# In the drawing of a robot, joints nearer than this stand side by side, so far apart; room for a
+# trunk [m].
+_NEAR, _BESIDE, _TRUNK = 0.09, 0.105, 0.45
 # Intervals are drawn up to this many times the largest value.
 _WIDEST = 4.0
 VERDICT_COLORS = {
@@ -110,16 +113,25 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
         plant.SetFloatingBaseBodyPoseInWorldFrame(context, robot.base, RigidTransform())
     robot.set_joint_positions(context, posture)
 
+    def place(frame: Frame) -> np.ndarray:
+        return frame.CalcPoseInWorld(context).translation()
+
     def seen(frame: Frame) -> np.ndarray:
         # From behind: its left is on the left.
-        _, y, z = frame.CalcPoseInWorld(context).translation()
+        _, y, z = place(frame)
         return np.array([-y, z])
 
-    size = 0.05
-    base = seen(robot.base.body_frame())
-    for leg in robot.description.legs.values():
-        places = [seen(plant.GetJointByName(joint).frame_on_child()) for joint in leg.joints]
-        line = np.array([base, *places, seen(plant.GetFrameByName(leg.sole))])
+    legs = robot.description.legs.values()
+    # Pairs of legs are drawn one above the other, those in front on top.
+    hips = [place(plant.GetJointByName(leg.joints[0]).frame_on_child())[0] for leg in legs]
+    lowest = min(place(plant.GetFrameByName(leg.sole))[2] for leg in legs)
+    pairs = sorted(hips)[::2]
+    for leg, hip in zip(legs, hips, strict=True):
+        up = np.array([0.0, (_TRUNK - lowest) * sum(hip > pair + _NEAR for pair in pairs)])
+        base = up + seen(robot.base.body_frame())
+        _draw_base(axes, robot, base)
+        places = [up + seen(plant.GetJointByName(joint).frame_on_child()) for joint in leg.joints]
+        line = np.array([base, *places, up + seen(plant.GetFrameByName(leg.sole))])
         axes.plot(*line.T, color=PLANNED, linewidth=5, solid_capstyle="round", alpha=0.35, zorder=1)
         axes.plot(
             [line[-1, 0] - 0.05, line[-1, 0] + 0.05],
@@ -130,16 +142,16 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
             zorder=1,
         )
         outwards = -1.0 if places[0][0] < base[0] else 1.0
-        # Joints with one centre stand side by side, the first one outermost.
+        # Joints that are near each other stand side by side, the first one outermost.
         shared: list[list[int]] = []
-        for k, place in enumerate(places):
-            if shared and np.linalg.norm(place - places[shared[-1][0]]) < size:
+        for k, joint in enumerate(places):
+            if shared and np.linalg.norm(joint - places[shared[-1][0]]) < _NEAR:
                 shared[-1].append(k)
             else:
                 shared.append([k])
         for group in shared:
             for order, k in enumerate(reversed(group)):
-                spot = places[k] + [outwards * 2.1 * size * order, 0.0]
+                spot = places[group[-1]] + [outwards * _BESIDE * order, 0.0]
                 ratio = ratios[leg.joints[k]]
                 axes.plot(
                     *spot,
@@ -170,6 +182,18 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
                     bbox=plain,
                     zorder=3,
                 )
+    axes.set_aspect("equal")
+    axes.margins(0.09, 0.04)
+    axes.set_axis_off()
+    axes.set_title(
+        "seen from behind" + (", front legs on top" if len(pairs) > 1 else ""),
+        loc="left",
+        fontsize=9,
+        color=PLANNED,
+    )
+
+
+def _draw_base(axes: Axes, robot: Robot, base: np.ndarray) -> None:
     corner = base - [0.11, 0.0]
     axes.add_patch(
         FancyBboxPatch(
@@ -190,10 +214,6 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
         fontsize=8,
         color=PLANNED,
     )
-    axes.set_aspect("equal")
-    axes.margins(0.09, 0.04)
-    axes.set_axis_off()
-    axes.set_title("seen from behind", loc="left", fontsize=9, color=PLANNED)
 
 
 def _ink(ratio: float) -> str:
@@ -202,27 +222,21 @@ def _ink(ratio: float) -> str:
 
 
 def _draw_phases(axes: Axes, channels: Sequence[Channel]) -> None:
-    """Ratio of error to noise by channel and phase."""
-    phases = list(
-        dict.fromkeys(
-            phase
-            for c in channels
-            for phase, (error, _) in c.by_phase.items()
-            if not np.isnan(error)
-        )
+    """Ratio of error to noise by channel and phase; of a short log, whose phases are not long
+    enough to tell, over the whole of it."""
+    found = (c.by_phase.items() for c in channels)
+    phases = dict.fromkeys(
+        phase for parts in found for phase, (error, _) in parts if not np.isnan(error)
     )
-    ratios = np.array(
-        [
-            [_ratio(*channel.by_phase.get(phase, (np.nan, np.nan))) for phase in phases]
-            for channel in channels
-        ]
-    )
+    parts = [c.by_phase if phases else {"whole log": (c.rmse, c.noise_floor)} for c in channels]
+    names = list(phases) or ["whole log"]
+    ratios = np.array([[_ratio(*of.get(name, (np.nan, np.nan))) for name in names] for of in parts])
     axes.imshow(ratios, cmap=_RATIO_COLORS, norm=_RATIO_NORM, aspect="auto")
     for (row, column), ratio in np.ndenumerate(ratios):
         text = "-" if np.isnan(ratio) else number(float(ratio), 2)
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=_ink(ratio))
     axes.set_xticks(
-        range(len(phases)), [words(phase).replace(" ", "\n") for phase in phases], fontsize=8
+        range(len(names)), [words(name).replace(" ", "\n") for name in names], fontsize=8
     )
     axes.set_yticks(
         range(len(channels)), [words(channel.row.name) for channel in channels], fontsize=8
