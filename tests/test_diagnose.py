@@ -256,6 +256,25 @@ def test_how_far_a_single_guess_goes_is_told_where_nothing_can_be_named() -> Non
         read_findings(content)
 
 
+def test_small_friction_beside_a_large_bias_is_found() -> None:
+    """A bias has the shape that it has: what it leaves is no misfit, however little that is of what
+    it takes."""
+    biased, rubbing = (
+        library()[name].from_values(["left_knee_pitch"], values)
+        for name, values in (
+            ("TorqueBias", {"bias": [10.0]}),
+            ("CoulombFriction", {"coulomb": [1.2], "transition": [0.01]}),
+        )
+    )
+    log = injected(injected(log_with(""), biased), rubbing)
+    few = [library()[name] for name in ("TorqueBias", "CoulombFriction", "ViscousFriction")]
+    found = {f.effect: f for f in diagnose(Predictor(scenario(), log), few).chosen}
+    assert set(found) == {"TorqueBias", "CoulombFriction"}
+    low, high = found["CoulombFriction"].parameters["coulomb"].interval
+    assert low < 1.2 < high
+    assert high - low < 0.4
+
+
 def test_two_effects_at_once_are_both_found() -> None:
     log = log_with("!TorqueGain {shortfall: {left_knee_pitch: 0.04}}")
     viscous = library()["ViscousFriction"].from_values(["right_hip_pitch"], {"viscous": [1.5]})
@@ -509,14 +528,14 @@ def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
         interval=lambda: offset + 2 * deviation * np.array([[-1.0, 1.0]]),
     )
     fits = SimpleNamespace(
-        white=SimpleNamespace(sse=np.array([1e4])),
         required=lambda _: 20.0,
+        explain=lambda _: base,
         dictionary=SimpleNamespace(
             per_step=True, predictor=SimpleNamespace(is_possible=lambda *_: True)
         ),
     )
     base, wider = (
-        SimpleNamespace(deviance=d, sse=np.array([d]), fit=fit, start=lambda _: 0)
+        SimpleNamespace(deviance=d, sse=np.array([d]), fit=fit, start=lambda _: 0, candidates=())
         for d in (1e4, 1e2)
     )
     assert is_significant(fits, base, wider, candidate) is can_be

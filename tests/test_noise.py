@@ -171,3 +171,9 @@ def test_a_joint_that_rings_is_said_to_and_is_no_noise(ringing: int) -> None:
     assert len(said["rung"]) == 1
     assert said["rung"][0].size == pytest.approx(0.15, rel=0.02)
     assert len(said["rung"][0].where) == ringing
+    assert said["rung"][0].severity == "warning"
+    # Nothing is fitted to a joint that rings more than it moves.
+    velocity[::2, 0] += 8.0
+    loud = replace(log, channels=log.channels | {"joint/velocity": velocity})
+    hygiene = inspect(Predictor(scenario, loud).motion)
+    assert hygiene.untrusted_joints() == [log.joints[0]]

@@ -16,8 +16,8 @@ from fbse_drake.effects.sensor import FootForceGain
 
 # No explanation has more parts than this.
 _MOST_EFFECTS = 16
-# What an effect takes off a row may be wrong by this share; so small a rest is no evidence of
-# another effect.
+# What an effect takes off a row may be wrong by this share, if its shape is not known but fitted
+# (nonlinear parameters); so small a rest is no evidence of another effect.
 _MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
@@ -168,12 +168,14 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         return False
     if base.deviance - wider.deviance < fits.required(added):
         return False
-    taken, gained = (
-        float(np.maximum(a[rows] - b[rows], 0.0).sum())
-        for a, b in ((fits.white.sse, base.sse), (base.sse, wider.sse))
-    )
-    if fits.dictionary.per_step and gained < _MISFIT * taken:
-        return False
+    if fits.dictionary.per_step:
+        exact = fits.explain([c for c in base.candidates if not c.nonlinear_names])
+        taken, gained = (
+            float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
+            for a, b in ((exact, base), (base, wider))
+        )
+        if gained < _MISFIT * taken:
+            return False
     start = wider.start(added)
     names = added.linear_names if added.has_linear else added.nonlinear_names
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear

@@ -254,16 +254,19 @@ def check_ringing(evidence: Evidence) -> Iterable[HygieneFinding]:
     products = (windows[:, 1:] * windows[:, :-1]).sum(axis=1)
     alternates = products < _ALTERNATES * power
     sizes = 0.5 * np.sqrt(np.median(power / _RINGING, axis=0))
-    found = {
-        part: float(sizes[k])
-        for k, part in enumerate(parts)
-        if alternates[:, k].mean() > 0.5 and sizes[k] > evidence.quantum[name][k]
-    }
+    moves = (0.5 * (values[1:] + values[:-1])).std(axis=0)
+    rings = (alternates.mean(axis=0) > 0.5) & (sizes > evidence.quantum[name])
     text = (
         "{where} goes to and fro from sample to sample, by {size} each way: its loop rings at half "
-        "the rate of the log, which blurs laws of friction"
+        "the rate of the log, "
     )
-    yield from remarks("ringing", "warning", name, found, evidence.units[name], text)
+    for severity, there, consequence in (
+        ("untrustworthy", rings & (sizes > moves), "more than it moves otherwise"),
+        ("warning", rings & (sizes <= moves), "which blurs laws of friction"),
+    ):
+        found = {parts[k]: float(sizes[k]) for k in np.flatnonzero(there)}
+        units = evidence.units[name]
+        yield from remarks("ringing", severity, name, found, units, text + consequence)
 
 
 def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:

@@ -24,6 +24,7 @@ _WHOLE_LOG = (
     "clock_offset",
     "dead_torque",
     "not_a_torque",
+    "ringing",
     "swapped_joints",
     "torque_scale",
     "torque_sign",
