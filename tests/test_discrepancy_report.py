@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.identification.structure import Structure
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
+from fbse_drake.report.discrepancy_tables import findings_table
 
 INPUTS = reports.Inputs("a_walk", "paper_walk", ("walk.npz",), "out/a_walk")
 KNEES = ("left_knee_pitch", "right_knee_pitch")
@@ -507,6 +508,31 @@ def test_effects_in_one_place_are_named_together():
         "The model lacks Coulomb friction and torque bias in left and right knee pitch and body "
         "mass in trunk;"
     )
+
+
+def test_one_effect_in_several_places_is_one_row_of_the_table():
+    """The most important rows are not crowded out by the joints of an arm."""
+
+    def found(effect: str, target: str, after: float, *values: float) -> Finding:
+        parameters = {
+            f"p{k}": Estimate(value, (value - 0.1, value + 0.1), "Nm")
+            for k, value in enumerate(values)
+        }
+        return Finding(effect, (target,), 9.0, after, parameters, (), True)
+
+    joints = [f"joint_{k}" for k in range(6)]
+    findings = [found("CoulombFriction", joint, 1.0 + k, 2.0 + k) for k, joint in enumerate(joints)]
+    findings.append(found("TorqueBias", "joint_0", 3.0, 0.5))
+    findings += [found("InertialParameters", f"link_{k}", 5.0, *range(k, 10 + k)) for k in range(3)]
+    findings.append(dataclasses.replace(findings[0], chosen=False))
+    friction, bias, inertia, rival = findings_table(findings).rows
+    assert friction[:4] == ("Coulomb friction", "6 joints", "9.00", "1.00 to 6.00")
+    assert friction[4].startswith("joint 0: p0 2 Nm (1.9 to 2.1); joint 1: p0 3 Nm")
+    assert bias[:2] == ("Torque bias", "joint 0")
+    assert bias[4] == "p0 0.5 Nm (0.4 to 0.6)"
+    assert inertia[1] == "link 0, link 1, link 2"
+    assert inertia[4].endswith("p9 9.00 to 11.0 Nm")
+    assert rival[0] == "(Coulomb friction)"
 
 
 def test_detectability_is_relative_to_what_is_plausible():

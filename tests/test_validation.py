@@ -18,7 +18,12 @@ from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.identify import identify
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import study, train_and_rest
-from fbse_drake.discrepancy.diagnosis.validation import batch_length, root_of_ratio, validated
+from fbse_drake.discrepancy.diagnosis.validation import (
+    Measured,
+    batch_length,
+    root_of_ratio,
+    validated,
+)
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.files import write_text
@@ -163,6 +168,29 @@ def test_a_study_is_headed_by_what_was_set_aside(
     assert not any(
         "fbse add" in (step.command or "") for step in steps_after_study(nothing, inputs)
     )
+
+
+def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall(
+    swing: tuple[Scenario, Log],
+):
+    """A squat of four seconds leaves less than a second to test on."""
+    scenario, log = swing
+    rubbed = rubbing(log, 2.0, 2.0)
+    right = believing(scenario, CoulombFriction({KNEE: 2.0}))
+    long, short = (
+        validated(*(Predictor(one, part) for one in (scenario, right)))
+        for part in (rubbed, rubbed.part(slice(0, 60)))
+    )
+    assert long.course == "falls"
+    assert short.course == "unclear"
+    assert short.change.interval == (0.0, np.inf)
+    assert short.change.value < 0.5
+    assert not long.refutes
+    assert not short.refutes
+    worse = validated(*(Predictor(one, rubbed.part(slice(0, 60))) for one in (right, scenario)))
+    assert worse.refutes
+    # So does one long enough to say that the error falls, and which does not.
+    assert dataclasses.replace(long, change=Measured(0.9, (0.7, 1.2))).refutes
 
 
 @pytest.mark.parametrize("command", ["diagnose", "study"])

@@ -52,7 +52,7 @@ from fbse_drake.report.sentences import (
     compare_outcome,
     diagnosis_outcome,
     how_sure,
-    is_confirmed,
+    is_refuted,
     kinds_of_failures,
     set_aside_rows,
     statuses_of,
@@ -183,7 +183,7 @@ def write_diagnosis_report(
     passed = (
         diagnosis.partial is None
         and diagnosis.verdict in _PASSED
-        and is_confirmed(diagnosis.set_aside)
+        and not is_refuted(diagnosis.set_aside)
     )
     write_report(
         path,
@@ -247,7 +247,7 @@ def write_study_report(
     passed = (
         not study.partial
         and study.diagnoses[-1].verdict in _PASSED
-        and is_confirmed(study.set_aside)
+        and not is_refuted(study.set_aside)
     )
     write_report(
         path,

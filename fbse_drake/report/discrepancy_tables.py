@@ -30,6 +30,8 @@ from fbse_drake.robot.plant import Robot
 
 # Tables show this many failures, others are folded away.
 _FAILURES = 8
+# A row of a table of findings tells of so many values one by one, and of more their range.
+_MOST_VALUES = 18
 
 _SPREAD_HEADER = ("Effect", "In", "Parameter", "By recording (95 % interval)", "Between", "Agree")
 
@@ -41,19 +43,56 @@ def failures_table(comparison: Comparison) -> Table:
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
-    """Findings with their values; what was not chosen stands in brackets."""
+    """Findings with their values; what was not chosen stands in brackets.
+
+    One effect that was found in several places is one row, with the values of each, or, where
+    these are many, with their range.
+    """
     header = ("effect", "in", "held-out error before", "after", "values (95 % interval)")
-    rows = (
-        (
-            spaced(finding.effect) if finding.chosen else f"({spaced(finding.effect)})",
-            targets_text(finding.targets),
-            number(finding.held_out_before),
-            number(finding.held_out_after),
-            parameters_text(finding),
-        )
-        for finding in findings[:_FAILURES]
+    groups: dict[object, list[Finding]] = {}
+    for k, finding in enumerate(findings):
+        groups.setdefault(finding.effect if finding.chosen else k, []).append(finding)
+    shown = list(groups.values())[:_FAILURES]
+    return Table(header, tuple(_findings_row(group) for group in shown))
+
+
+def _findings_row(group: Sequence[Finding]) -> tuple[str, ...]:
+    """Of findings of one effect."""
+    effect = group[0].effect
+    targets = by_effect(group)[effect]
+    values = [parameters_text(finding) for finding in group]
+    if sum(len(finding.parameters) for finding in group) > _MOST_VALUES:
+        values = _spans_of_values(group)
+    elif len(group) > 1:
+        places = (targets_text(finding.targets, effect) for finding in group)
+        values = [f"{place}: {text}" for place, text in zip(places, values, strict=True) if text]
+    return (
+        spaced(effect) if group[0].chosen else f"({spaced(effect)})",
+        targets_text(targets, effect),
+        *(
+            _span([getattr(finding, name) for finding in group])
+            for name in ("held_out_before", "held_out_after")
+        ),
+        "; ".join(values),
     )
-    return Table(header, tuple(rows))
+
+
+def _spans_of_values(group: Sequence[Finding]) -> list[str]:
+    """As `mass -0.196 to 11.3 kg`, for each parameter."""
+    by_name: dict[str, list[Estimate]] = {}
+    for finding in group:
+        for name, estimate in finding.parameters.items():
+            by_name.setdefault(name, []).append(estimate)
+    return [
+        f"{words(name)} {_span([e.value for e in estimates])} {estimates[0].unit}"
+        for name, estimates in by_name.items()
+    ]
+
+
+def _span(values: Sequence[float]) -> str:
+    """As `1.62`, or `1.62 to 3.71`."""
+    least, most = number(min(values)), number(max(values))
+    return least if least == most else f"{least} to {most}"
 
 
 def steps_table(study: Study, *, tested: bool) -> Table:

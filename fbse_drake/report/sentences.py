@@ -86,10 +86,9 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
 def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
     """A result with what it is worth on data that was set aside; if that is nothing, it comes
     first."""
-    refuted = {name: one for name, one in set_aside.items() if one.course != "falls"}
-    confirmed = {name: one for name, one in set_aside.items() if one.course == "falls"}
-    before = [f"Not confirmed: {_course(name, one)}." for name, one in refuted.items()]
-    after = [f"{as_sentence(_course(name, one))}" for name, one in confirmed.items()]
+    told = [(one.refutes, _course(name, one)) for name, one in set_aside.items()]
+    before = [f"Not confirmed: {text}." for refutes, text in told if refutes]
+    after = [as_sentence(text) for refutes, text in told if not refutes]
     return " ".join([*before, result, *after])
 
 
@@ -98,7 +97,7 @@ def _course(log: str, validation: Validation) -> str:
     1.03) times the sensors' noise`."""
     before, after = validation.before, validation.after
     text = (
-        f"on {_set_aside_name(log)}, which was set aside, {_COURSES[validation.course]}: "
+        f"on {_set_aside_name(log)}, which was set aside, {_said_course(validation)}: "
         f"from {number(before.value)} to {number(after.value)} ({_between(after, 1.0)}) "
         "times the sensors' noise"
     )
@@ -109,6 +108,12 @@ def _course(log: str, validation: Validation) -> str:
             f"({_between(shares[1], 100.0)}) of the torque"
         )
     return text
+
+
+def _said_course(validation: Validation) -> str:
+    if validation.course == "unclear" and not validation.refutes:
+        return "the error falls, as far as so short a part can tell"
+    return _COURSES[validation.course]
 
 
 def _between(measured: Measured, factor: float) -> str:
@@ -133,9 +138,9 @@ def set_aside_rows(set_aside: Mapping[str, Validation]) -> list[tuple[str, str]]
     return [("On data set aside", " ".join([*texts, "Intervals are 95 %, by batch means."]))]
 
 
-def is_confirmed(set_aside: Mapping[str, Validation]) -> bool:
-    """Is the model better on all data that was set aside?"""
-    return all(one.course == "falls" for one in set_aside.values())
+def is_refuted(set_aside: Mapping[str, Validation]) -> bool:
+    """Does any data that was set aside speak against the model?"""
+    return any(one.refutes for one in set_aside.values())
 
 
 def _disturbed(disturbance: Disturbance) -> str:
@@ -185,7 +190,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
             name for finding in diagnosis.chosen for name in finding.confusable_with
         )
         doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
-        if not is_confirmed(diagnosis.set_aside):
+        if is_refuted(diagnosis.set_aside):
             return f"{_suggested(found)}{doubt}."
         return f"The model lacks {found}{doubt}."
     statuses = applicable(diagnosis.effects)
@@ -205,8 +210,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
         )
     known = ""
     if found:
-        confirmed = is_confirmed(diagnosis.set_aside)
-        known = f" The model also lacks {found}." if confirmed else f" {_suggested(found)}."
+        refuted = is_refuted(diagnosis.set_aside)
+        known = f" {_suggested(found)}." if refuted else f" The model also lacks {found}."
     return f"{_unexplained(diagnosis)}{known}"
 
 
@@ -240,8 +245,8 @@ def _study_result(study: Study) -> str:
         refused = ended.chosen and ended.partial is None
         return _not_added(ended) if refused else diagnosis_outcome(ended)
     found = listed_effects(study.found)
-    confirmed = is_confirmed(study.set_aside)
-    result = f"The model lacked {found}." if confirmed else f"{_suggested(found)}."
+    refuted = is_refuted(study.set_aside)
+    result = f"{_suggested(found)}." if refuted else f"The model lacked {found}."
     if study.set_aside:
         result = _headline(result, study.set_aside)
     else:
@@ -304,7 +309,7 @@ def steps_after_compare(comparison: Comparison, inputs: Inputs) -> tuple[Step, .
 def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, ...]:
     """What to do after a diagnosis, the most important first."""
     steps = []
-    if diagnosis.chosen and is_confirmed(diagnosis.set_aside):
+    if diagnosis.chosen and not is_refuted(diagnosis.set_aside):
         completed = f"{inputs.name}_completed.yaml"
         command = f"fbse add {inputs.scenario} {inputs.out} --out {completed}"
         steps.append(Step("Add it to the model:", command))
@@ -322,7 +327,7 @@ def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
         return tuple(_experiments_next(last, ())) or (_NOTHING,)
     command = f"fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
     text = "Try the completed model on a log that it has not seen"
-    if not is_confirmed(study.set_aside):
+    if is_refuted(study.set_aside):
         text += ", before it is used for anything: this log does not confirm it"
     return (Step(f"{text}:", command), *_experiments_next(last, study.found))
 

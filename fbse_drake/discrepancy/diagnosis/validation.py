@@ -54,6 +54,13 @@ class Validation:
             return "rises"
         return "falls" if self.change.interval[1] < 1.0 else "unclear"
 
+    @property
+    def refutes(self) -> bool:
+        """Does the log speak against the completed model? One that is too short for an interval
+        does so only if the error does not fall there."""
+        tested = np.isfinite(self.change.interval[1])
+        return self.course != "falls" and bool(tested or not self.change.value < 1.0)
+
 
 @dataclass(frozen=True)
 class ModelError:
