@@ -173,13 +173,13 @@ def test_a_study_is_headed_by_what_was_set_aside(
 def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall(
     swing: tuple[Scenario, Log],
 ):
-    """A squat of four seconds leaves less than a second to test on."""
+    """Less than half a second is a single batch."""
     scenario, log = swing
     rubbed = rubbing(log, 2.0, 2.0)
     right = believing(scenario, CoulombFriction({KNEE: 2.0}))
     long, short = (
         validated(*(Predictor(one, part) for one in (scenario, right)))
-        for part in (rubbed, rubbed.part(slice(0, 60)))
+        for part in (rubbed, rubbed.part(slice(0, 40)))
     )
     assert long.course == "falls"
     assert short.course == "unclear"
@@ -187,7 +187,7 @@ def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall(
     assert short.change.value < 0.5
     assert not long.refutes
     assert not short.refutes
-    worse = validated(*(Predictor(one, rubbed.part(slice(0, 60))) for one in (right, scenario)))
+    worse = validated(*(Predictor(one, rubbed.part(slice(0, 40))) for one in (right, scenario)))
     assert worse.refutes
     # So does one long enough to say that the error falls, and which does not.
     assert dataclasses.replace(long, change=Measured(0.9, (0.7, 1.2))).refutes
