@@ -30,6 +30,12 @@ _SMOOTHING = 0.005
 _EXPLAINED = 0.9
 # The logarithm of how likely a delay is at least (one in a thousand), for it may begin at any time.
 _LEAST_LIKELY = -math.log(1000.0)
+# How much likelier than any other a delay must be by what is counted to be one that shows, as the
+# logarithm of the ratio, and for how long it counts what has shown [s].
+_SHOWN, _USUAL_TIME = 3.0, 2.0
+# What speaks for another delay than the usual one is forgotten so fast [s]; when no more than this
+# is left of it, as such a logarithm, the usual one is taken again.
+_FORGOTTEN, _NOTHING_LEFT = 0.1, 1.0
 
 
 def force_delay_type(clock: Clock) -> np.dtype:
@@ -41,12 +47,13 @@ def force_delay_type(clock: Clock) -> np.dtype:
     `square` and of its product `cross` with the forces, (room,), and of the forces,
     `push_total` (3,) and `push_square` [m^2/s^4]; `count`, over how many ticks; `likelihood`
     (2, room) of each delay, as the logarithm of its ratio to the largest, by the latest forces and
-    by the earliest acceleration; and the `delay` [s]. Of `room_for_delays` the first `delays_of`
-    the clock are used.
+    by the earliest acceleration; `usual` (room,), for how long each delay has shown [s]; and the
+    `delay` [s]. Of `room_for_delays` the first `delays_of` the clock are used.
     """
     room = room_for_delays(clock)
     shapes = {"shown": (room, 3), "read": (room, 3), "total": (room, 3)}
-    shapes |= {"square": (room,), "cross": (room,), "likelihood": (2, room)}
+    shapes |= {"square": (room,), "cross": (room,), "usual": (room,)}
+    shapes |= {"likelihood": (2, room)}
     numbers = ("push_square", "filled", "count", "delay")
     return record_type(**shapes, smooth=(2, 3), push_total=(3,), **dict.fromkeys(numbers, ()))
 
@@ -101,6 +108,9 @@ def watch_force_delay(
 ) -> None:
     """One tick: the delay is that of the sensors by which the forces are explained best.
 
+    A delay that comes, as with a fault of the sensors, may go again, while nothing happens that
+    shows it: another one than the usual must show again and again.
+
     What explains them is a gain times how the centre of mass accelerated, and a constant: a gain or
     a bias that is wrong, or the robot's mass, does not count. Where forces hardly change all delays
     are alike, and it stays what it is. So it does on a clock that is not even.
@@ -116,8 +126,7 @@ def watch_force_delay(
         forget_force_delay(x)
         return
     if x.filled == 0:
-        x.likelihood[:] = _LEAST_LIKELY
-        x.likelihood[:, round(x.delay / period)] = 0.0
+        _begin_with(x.likelihood, round(x.delay / period))
     # Accelerations are differences of velocities, whose noise averages out fast.
     blend = 1.0 - math.exp(-elapsed / _SMOOTHING) if x.filled > 0 else 1.0
     for i in range(3):
@@ -170,9 +179,44 @@ def watch_force_delay(
     # Noise that begins reaches the delays one after the other, in the one way in the opposite order
     # as in the other.
     is_likelier = (likelihood[:, best] > likelihood[:, now]).all()
+    usual = _usual_delay(x.usual[:delays], mismatch / (2.0 * variance * alike), elapsed, now)
     if is_likelier and mismatch[best] < (1.0 - _EXPLAINED) * push_square:
         # At the longest delay the true one may be longer, and nobody knows it.
         x.delay = best * period if best < last else 0.0
+        if usual >= 0 and abs(best - usual) > 1:
+            _begin_with(likelihood, best)
+    elif usual >= 0 and abs(now - usual) > 1:
+        lead = likelihood[:, now] - likelihood[:, usual]
+        likelihood[:, usual] += (1.0 - math.exp(-elapsed / _FORGOTTEN)) * lead
+        if lead.max() < _NOTHING_LEFT:
+            x.delay = usual * period
+            _begin_with(likelihood, usual)
+
+
+@njit(cache=True)
+def _begin_with(likelihood: np.ndarray, delay: int) -> None:
+    """Of a delay that has just been taken all others are as unlikely as they may be."""
+    likelihood[:] = _LEAST_LIKELY
+    likelihood[:, delay] = 0.0
+
+
+@njit(cache=True)
+def _usual_delay(shown: np.ndarray, unlikely: np.ndarray, elapsed: float, now: int) -> int:
+    """The delay that has shown for the longest time, -1 if none has.
+
+    Args:
+        shown: for how long each has [s]; filled.
+        unlikely: of each delay by what is counted, minus the logarithm of its likelihood.
+    """
+    shown *= math.exp(-elapsed / _USUAL_TIME)
+    shows = True
+    for other in range(len(unlikely)):
+        if abs(other - now) > 1 and unlikely[other] - unlikely[now] < _SHOWN:
+            shows = False
+    if shows:
+        shown[now] += elapsed
+    usual = np.argmax(shown)
+    return usual if shown[usual] > 0.0 else -1
 
 
 @njit(cache=True)
