@@ -93,7 +93,8 @@ def test_meshcat_is_recorded(tmp_path: Path):
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_a_fall_ends_the_run_and_keeps_the_log(tmp_path: Path, capsys: pytest.CaptureFixture):
-    assert main(["simulate", "paper_walk_pd", "--out", str(tmp_path), "--quiet"]) == FAILED
+    options = ["--set", "duration=4.5", "--out", str(tmp_path), "--quiet"]
+    assert main(["simulate", "paper_walk_pd", *options]) == FAILED
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert "fell: the base is" in message
@@ -172,7 +173,8 @@ def test_an_interrupted_run_keeps_what_was_recorded(
         return fall_reason(*arguments)
 
     monkeypatch.setattr(import_module("fbse_drake.simulation"), "fall_reason", interrupted)
-    assert main(["simulate", "squat", "--out", str(tmp_path), "--quiet"]) == FAILED
+    options = ["--set", "duration=1", "--out", str(tmp_path), "--quiet"]
+    assert main(["simulate", "squat", *options]) == FAILED
     message = capsys.readouterr().err
     assert "interrupted" in message
     assert message.count("\n") == 1
