@@ -319,20 +319,25 @@ def test_a_heavier_model_moves_by_the_plan_that_the_robot_had() -> None:
 
 
 @pytest.mark.parametrize(
-    ("errors", "failing", "median", "drawn"),
+    ("errors", "failing", "beside", "median", "drawn"),
     [
-        ([1.0, 1.05, 9.0], (), 1.05, 2),
-        ([1.05, 1.0, 9.0], (), 1.05, 2),
-        ([1.0, 2.0, 1.3], (), 1.3, 3),
-        ([9.0, 1.0, 1.3], (), 1.3, 3),
-        ([1.0, 1.0, 9.0], (1,), 9.0, 3),
-        ([1.0, 1.0, 9.0], (0, 1), 1.0, 3),
+        ([1.0, 1.05, 9.0], (), None, 1.05, 2),
+        ([1.05, 1.0, 9.0], (), None, 1.05, 2),
+        ([1.0, 2.0, 1.3], (), None, 1.3, 3),
+        ([9.0, 1.0, 1.3], (), None, 1.3, 3),
+        ([1.0, 1.0, 9.0], (1,), None, 9.0, 3),
+        ([1.0, 1.0, 9.0], (0, 1), None, 1.0, 3),
+        # Beside a model that is far worse they agree, unless one is nearly as bad or falls.
+        ([1.0, 2.0, 1.3], (), 20.0, 2.0, 2),
+        ([1.0, 4.0, 1.3], (), 20.0, 1.3, 3),
+        ([1.0, 2.0, 1.3], (1,), 20.0, 1.3, 3),
     ],
 )
 def test_a_single_draw_of_the_noise_does_not_decide_about_a_model(
     monkeypatch: pytest.MonkeyPatch,
     errors: list[float],
     failing: tuple[int, ...],
+    beside: float | None,
     median: float,
     drawn: int,
 ) -> None:
@@ -347,7 +352,8 @@ def test_a_single_draw_of_the_noise_does_not_decide_about_a_model(
     monkeypatch.setattr("fbse_drake.discrepancy.residual.rollout._simulated_error", simulated)
     channels = {"time": np.arange(2.0), "joint/position": np.zeros((2, 1))}
     log = Log(channels, {"joints": ["knee"], "period": 1.0})
-    assert rollout(walk, log).mean_position == pytest.approx(median)
+    other = None if beside is None else RolloutError({"knee": beside}, {}, {}, 1.0, None)
+    assert rollout(walk, log, beside=other).mean_position == pytest.approx(median)
     assert seeds == [4, 5, 6][:drawn]
 
 

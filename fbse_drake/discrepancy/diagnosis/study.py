@@ -135,7 +135,7 @@ def study(
             played = partial(
                 rollout, scenario, planned_with=planned_with, progress=progress, jobs=jobs
             )
-            rolled = played(log)
+            rolled = played(log, beside=steps[0].rollout if steps else None)
             if isinstance(scenario.reference, Recorded):
                 candidates = ((name, played(other)) for name, other in (tests or {}).items())
                 test_rolled = {name: error for name, error in candidates if error is not None}

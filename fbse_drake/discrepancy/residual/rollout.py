@@ -30,8 +30,9 @@ from fbse_drake.wiring import release
 # through so many samples.
 _STARTING_SAMPLES = 10
 # A walk is simulated with two draws of the sensors' noise, and with a third if their errors differ
-# by more than this share: now and then noise alone lets a foot land or a joint slip otherwise, and
-# the rest of the walk is another. The median of three lies between any two of them.
+# by more than this share of the smaller, or of what they are compared with: now and then noise
+# alone lets a foot land or a joint slip otherwise, and the rest of the walk is another. The median
+# of three lies between any two of them.
 _AGREEMENT = 0.1
 # How often runs in other processes are looked at [s].
 _LOOK_PERIOD = 0.2
@@ -77,6 +78,7 @@ def rollout(
     log: Log,
     *,
     planned_with: RobotConfig | None = None,
+    beside: RolloutError | None = None,
     progress: Progress = silent,
     jobs: int = 1,
 ) -> RolloutError | None:
@@ -91,6 +93,8 @@ def rollout(
     its errors add up, and what is not stable in itself falls.
 
     Args:
+        beside: error of another model, which this one is to be compared with: what is small beside
+            that need not agree more closely.
         progress: is told what is being done.
         jobs: how many simulations run side by side, each in a process of its own.
         planned_with: the model that reference and feed-forward were planned with, and that the
@@ -118,16 +122,21 @@ def rollout(
         if jobs > 1
         else [_simulated_error(one, log, progress) for one in (first, second)]
     )
-    if not _agree(*draws):
+    if not _agree(*draws, 0.0 if beside is None else beside.mean_position):
         draws.append(_simulated_error(third, log, progress))
     # Of two that agree, the worse.
     return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[1]
 
 
-def _agree(error: RolloutError, other: RolloutError) -> bool:
-    """May either stand for the median of these and any third?"""
+def _agree(error: RolloutError, other: RolloutError, beside: float) -> bool:
+    """May either stand for the median of these and any third?
+
+    Args:
+        beside: error [rad] of another model, which they are compared with.
+    """
     small, large = sorted([error.mean_position, other.mean_position])
-    return error.failure is None and other.failure is None and large <= (1 + _AGREEMENT) * small
+    close = large - small <= _AGREEMENT * max(small, beside)
+    return error.failure is None and other.failure is None and close
 
 
 def _side_by_side(
