@@ -21,6 +21,7 @@ from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, To
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
 from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.estimators.fixed_friction import FixedFriction
+from fbse_drake.report.sentences import diagnosis_outcome
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, RobotConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
@@ -186,6 +187,8 @@ def test_what_is_too_small_to_matter_is_said_to_be_so(folder: Path):
         assert finding.share == pytest.approx(0.05 / force, rel=0.3)
         assert diagnosis.verdict == ("effect_found" if matters else "nothing_missing")
         assert len(diagnosis.chosen) == matters
+        said = "Nothing that matters is missing", "too small to matter: torque bias in slide"
+        assert all((text in diagnosis_outcome(diagnosis)) is not matters for text in said)
 
 
 @pytest.mark.parametrize("shortfall", [0.0, 0.1])

@@ -199,9 +199,15 @@ def _verdict(diagnosis: Diagnosis) -> str:
         unseen = (
             f"; {hidden} of {len(statuses)} effects would not show in this log" if hidden else ""
         )
+        left = number(diagnosis.held_out_before)
+        if diagnosis.too_small:
+            return (
+                f"Nothing that matters is missing: the model leaves over {left} times the sensors' "
+                f"noise; too small to matter: {listed_effects(diagnosis.too_small)}{unseen}."
+            )
         return (
-            "Nothing is missing: what the model leaves over is the sensors' noise "
-            f"({number(diagnosis.held_out_before)} times it){unseen}."
+            f"Nothing is missing: what the model leaves over is the sensors' noise ({left} times "
+            f"it){unseen}."
         )
     if diagnosis.verdict == "not_visible":
         return (
