@@ -44,6 +44,8 @@ _EDGE = 1e-6
 # Correlation of a velocity's changes from sample to sample below which it alternates (white noise
 # has -1/2, and -3/4 if differentiated twice), in more than half of windows of so many samples.
 _ALTERNATES, _RINGING = -0.9, 50
+# Ringing that is so many times the motion drowns it: a tenth of the ringing is as large as that.
+_DROWNS = 10.0
 # Order of the differences by which noise is told from motion.
 _DIFFERENCE = 6
 # Noise is taken from stretches of so many samples, and from this share of them that are quietest.
@@ -261,8 +263,8 @@ def check_ringing(evidence: Evidence) -> Iterable[HygieneFinding]:
         "the rate of the log, "
     )
     for severity, there, consequence in (
-        ("untrustworthy", rings & (sizes > moves), "more than it moves otherwise"),
-        ("warning", rings & (sizes <= moves), "which blurs laws of friction"),
+        ("untrustworthy", rings & (sizes > _DROWNS * moves), "which drowns how it moves otherwise"),
+        ("warning", rings & (sizes <= _DROWNS * moves), "which blurs laws of friction"),
     ):
         found = {parts[k]: float(sizes[k]) for k in np.flatnonzero(there)}
         units = evidence.units[name]
