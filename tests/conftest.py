@@ -1,8 +1,10 @@
 """Runs that several tests look at, made once per session."""
 
+import ctypes
 import dataclasses
+import gc
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from hashlib import sha256
 
@@ -16,6 +18,21 @@ from fbse_drake.scenario import RecordingConfig, SensorsConfig
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Notebooks come first: one that starts last would keep a single worker busy."""
     items.sort(key=lambda item: item.path.stem != "test_notebooks")
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: the garbage collector need not look at it again."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_is_given_back() -> Iterator[None]:
+    """What a file's tests have freed is not kept for the next one's, where the C library can."""
+    yield
+    gc.collect()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
 
 
 @pytest.fixture(scope="session")
