@@ -1,5 +1,5 @@
-"""Checks of a recording's channels by themselves: clock, stuck, clipped, held, coarse, filtered and
-noisy channels."""
+"""Checks of a recording's channels by themselves: clock, stuck, clipped, held, coarse, filtered,
+ringing and noisy channels."""
 
 from collections.abc import Iterable
 
@@ -12,6 +12,7 @@ from fbse_drake.discrepancy.residual.evidence import (
     Evidence,
     HygieneFinding,
     NoiseLevel,
+    Severity,
     remark,
     remarks,
 )
@@ -258,17 +259,19 @@ def check_ringing(evidence: Evidence) -> Iterable[HygieneFinding]:
     sizes = 0.5 * np.sqrt(np.median(power / _RINGING, axis=0))
     moves = (0.5 * (values[1:] + values[:-1])).std(axis=0)
     rings = (alternates.mean(axis=0) > 0.5) & (sizes > evidence.quantum[name])
+    drowns = rings & (sizes > _DROWNS * moves)
     text = (
         "{where} goes to and fro from sample to sample, by {size} each way: its loop rings at half "
         "the rate of the log, "
     )
-    for severity, there, consequence in (
-        ("untrustworthy", rings & (sizes > _DROWNS * moves), "which drowns how it moves otherwise"),
-        ("warning", rings & (sizes <= _DROWNS * moves), "which blurs laws of friction"),
-    ):
+
+    def said(severity: Severity, there: np.ndarray, consequence: str) -> Iterable[HygieneFinding]:
         found = {parts[k]: float(sizes[k]) for k in np.flatnonzero(there)}
         units = evidence.units[name]
-        yield from remarks("ringing", severity, name, found, units, text + consequence)
+        return remarks("ringing", severity, name, found, units, text + consequence)
+
+    yield from said("untrustworthy", drowns, "which drowns how it moves otherwise")
+    yield from said("warning", rings & ~drowns, "which blurs laws of friction")
 
 
 def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
