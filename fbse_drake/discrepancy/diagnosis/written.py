@@ -8,6 +8,7 @@ from typing import Any
 from fbse_drake import schema
 from fbse_drake.discrepancy.diagnosis.diagnose import Verdict
 from fbse_drake.errors import InputError
+from fbse_drake.files import from_json, to_json
 
 
 @dataclass(frozen=True)
@@ -80,20 +81,20 @@ class WrittenStudy:
 
 
 def written_diagnosis(content: Mapping[str, Any]) -> WrittenDiagnosis:
-    """The contents of a diagnosis.json, checked.
+    """The contents of a diagnosis.json, checked; what was not written yet may be infinite.
 
     Raises:
         InputError: they are not such.
     """
-    file = "not the contents of a diagnosis.json"
-    return schema.build(WrittenDiagnosis, content, file=file, further_keys=True)
+    file, standard = "not the contents of a diagnosis.json", from_json(to_json(content))
+    return schema.build(WrittenDiagnosis, standard, file=file, further_keys=True)
 
 
 def written_study(content: Mapping[str, Any]) -> WrittenStudy:
-    """The contents of a study.json, checked.
+    """The contents of a study.json, checked; what was not written yet may be infinite.
 
     Raises:
         InputError: they are not such.
     """
-    file = "not the contents of a study.json"
-    return schema.build(WrittenStudy, content, file=file, further_keys=True)
+    file, standard = "not the contents of a study.json", from_json(to_json(content))
+    return schema.build(WrittenStudy, standard, file=file, further_keys=True)
