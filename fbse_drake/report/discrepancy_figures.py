@@ -116,22 +116,24 @@ def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: 
     def place(frame: Frame) -> np.ndarray:
         return frame.CalcPoseInWorld(context).translation()
 
-    def seen(frame: Frame) -> np.ndarray:
-        # From behind: its left is on the left.
-        _, y, z = place(frame)
-        return np.array([-y, z])
-
-    legs = robot.description.legs.values()
+    legs, trunk = robot.description.legs.values(), robot.base.body_frame()
     # Pairs of legs are drawn one above the other, those in front on top.
     hips = [place(plant.GetJointByName(leg.joints[0]).frame_on_child())[0] for leg in legs]
-    lowest = min(place(plant.GetFrameByName(leg.sole))[2] for leg in legs)
     pairs = sorted(hips)[::2]
-    for leg, hip in zip(legs, hips, strict=True):
-        up = np.array([0.0, (_TRUNK - lowest) * sum(hip > pair + _NEAR for pair in pairs)])
-        base = up + seen(robot.base.body_frame())
-        _draw_base(axes, robot, base)
-        places = [up + seen(plant.GetJointByName(joint).frame_on_child()) for joint in leg.joints]
-        line = np.array([base, *places, up + seen(plant.GetFrameByName(leg.sole))])
+    rows = [sum(hip > pair + _NEAR for pair in pairs) for hip in hips]
+    height = _TRUNK - min(place(plant.GetFrameByName(leg.sole))[2] for leg in legs)
+
+    def seen(frame: Frame, row: int) -> np.ndarray:
+        # From behind: its left is on the left.
+        _, y, z = place(frame)
+        return np.array([-y, z + row * height])
+
+    for row in sorted(set(rows)):
+        _draw_base(axes, robot, seen(trunk, row))
+    for leg, row in zip(legs, rows, strict=True):
+        base = seen(trunk, row)
+        places = [seen(plant.GetJointByName(name).frame_on_child(), row) for name in leg.joints]
+        line = np.array([base, *places, seen(plant.GetFrameByName(leg.sole), row)])
         axes.plot(*line.T, color=PLANNED, linewidth=5, solid_capstyle="round", alpha=0.35, zorder=1)
         axes.plot(
             [line[-1, 0] - 0.05, line[-1, 0] + 0.05],
