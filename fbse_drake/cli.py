@@ -268,7 +268,7 @@ def _parser() -> argparse.ArgumentParser:
                 metavar="N",
                 type=_positive_whole_number,
                 default=1,
-                help="simulate so many runs side by side (default: 1)",
+                help="do so many things side by side: simulate, diagnose (default: 1)",
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
 

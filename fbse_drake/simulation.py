@@ -15,7 +15,7 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLog, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from fbse_drake import signals
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
@@ -32,7 +32,7 @@ from fbse_drake.walking.reference import Reference
 from fbse_drake.wiring import release
 
 # Why a run failed that was stopped by Ctrl-C.
-INTERRUPTED = "interrupted"
+_INTERRUPTED = "interrupted"
 # The run is looked at (fall, progress, interruption) this often in simulated time [s], and after so
 # many steps of the plant.
 _LOOK_PERIOD, _LOOK_STEPS = 0.01, 1000
@@ -79,8 +79,80 @@ def simulate(
     >>> run.failure is None, run.log["joint/position"].shape
     (True, (201, 6))
     """
+    with recorded_run(scenario, meshcat=meshcat, progress=progress) as run:
+        log = _make_log(scenario, name, run)
+        return SimulationResult(log, run.end.failure, run.end.wall_time, scenario, name)
+
+
+@dataclass(frozen=True)
+class End:
+    """How a run ended."""
+
+    # Why early, or None.
+    failure: str | None
+    # Did the robot fall, or the solver fail?
+    fell: bool
+    # Did somebody stop it (Ctrl-C)?
+    interrupted: bool
+    # Time the loop took, without building and recording [s].
+    wall_time: float
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRun:
+    """What ports of a station told while it ran."""
+
+    station: Station
+    # By port, at every plant tick as far as all were finite, (N, size) each.
+    ticks: dict[str, np.ndarray]
+    end: End
+
+    @property
+    def steps(self) -> int:
+        """How many steps of the plant ended."""
+        return max(len(next(iter(self.ticks.values()))) - 1, 1)
+
+
+@contextmanager
+def recorded_run(
+    scenario: Scenario,
+    *,
+    ports: Sequence[str] | None = None,
+    reference: Reference | None = None,
+    meshcat: Meshcat | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[RecordedRun]:
+    """Simulates a scenario as `simulate` does; afterwards its station is let go of.
+
+    Args:
+        ports: which of the station's output ports are recorded; by default `recorded_ports`. What
+            nobody reads is not computed.
+        reference: the scenario's motion, where it is planned already.
+        meshcat, progress: see `simulate`.
+
+    Raises:
+        InputError: see `build_station`.
+    """
+    builder = DiagramBuilder()
     with _postponed_interruption() as interrupted:
-        return _simulate(scenario, name, meshcat, progress, interrupted)
+        built = build_station(scenario, meshcat=meshcat, reference=reference)
+        station = builder.AddNamedSystem("station", built)
+        names = recorded_ports(station) if ports is None else list(ports)
+        sink = add_record(builder, station, names, scenario.plant.time_step)
+        diagram = builder.Build()
+        simulator = Simulator(diagram)
+        end = _advance(simulator, station.robot, scenario, meshcat, progress, interrupted)
+        data = sink.FindLog(simulator.get_context()).data()
+        # A run that diverges may end in rows that are not numbers.
+        finite = np.logical_and.accumulate(np.isfinite(data).all(axis=0))
+        if not finite.any():
+            raise InputError(
+                "the state is not finite from the start: values are too large or too small"
+            )
+        places = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
+        ticks = dict(zip(names, np.split(data.T[finite], places, axis=1), strict=True))
+        yield RecordedRun(station, ticks, end)
+    release(diagram)
 
 
 @contextmanager
@@ -105,34 +177,31 @@ def _postponed_interruption() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _simulate(
+def _advance(
+    simulator: Simulator,
+    robot: Robot,
     scenario: Scenario,
-    name: str,
     meshcat: Meshcat | None,
     progress: Callable[[float], None] | None,
     interrupted: threading.Event,
-) -> SimulationResult:
-    builder = DiagramBuilder()
-    station = builder.AddNamedSystem("station", build_station(scenario, meshcat=meshcat))
-    sink = add_record(builder, station, recorded_ports(station), scenario.plant.time_step)
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
+) -> End:
+    """Simulates a scenario to its end."""
     context = simulator.get_mutable_context()
-    robot_context = station.robot.plant.GetMyContextFromRoot(context)
-    height = _base_pose(station.robot, robot_context).translation()[2]
+    robot_context = robot.plant.GetMyContextFromRoot(context)
+    height = _base_pose(robot, robot_context).translation()[2]
     if meshcat is not None:
         meshcat.StartRecording()
 
     # From here on there is something to record.
     simulator.Initialize()
-    views = state_views(diagram, context)
+    views = state_views(simulator.get_system(), context)
     failure, fell, start = None, False, clock.perf_counter()
     try:
         period = min(_LOOK_PERIOD, _LOOK_STEPS * scenario.plant.time_step)
         looks = int(np.ceil(scenario.duration / period - 1e-9))
         for look in range(1, looks + 1):
             simulator.AdvanceTo(min(look * period, scenario.duration))
-            failure = fall_reason(station.robot, robot_context, scenario.fall, height)
+            failure = fall_reason(robot, robot_context, scenario.fall, height)
             if failure is not None:
                 fell = True
                 break
@@ -141,7 +210,7 @@ def _simulate(
             if interrupted.is_set():
                 raise KeyboardInterrupt
     except KeyboardInterrupt:
-        failure = INTERRUPTED
+        failure = _INTERRUPTED
     except RuntimeError as error:
         fell = True
         failure = f"the solver failed: {str(error).splitlines()[0]}"
@@ -154,11 +223,10 @@ def _simulate(
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
+    stopped = failure == _INTERRUPTED
     if failure is not None:
         failure = f"t = {end:.3f} s: {failure}"
-    log = _make_log(scenario, name, station, sink.FindLog(context), failure, fell)
-    release(diagram)
-    return SimulationResult(log, failure, wall_time, scenario, name)
+    return End(failure, fell, stopped, wall_time)
 
 
 def fall_reason(
@@ -212,33 +280,32 @@ def add_record(
     return LogVectorOutput(record.get_output_port(), builder, period)
 
 
+def base_motion(robot: Robot, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of a robot's base in the world, by the plant's states (N, size).
+
+    Returns:
+        Orientation, a quaternion [w, x, y, z] (N, 4), and position (N, 3) [m].
+    """
+    context = robot.plant.CreateDefaultContext()
+    orientation, position = np.empty((len(state), 4)), np.empty((len(state), 3))
+    for k, row in enumerate(state):
+        robot.plant.SetPositionsAndVelocities(context, row)
+        X_WB = _base_pose(robot, context)
+        orientation[k], position[k] = X_WB.rotation().ToQuaternion().wxyz(), X_WB.translation()
+    return orientation, position
+
+
 def _base_pose(robot: Robot, context: Context) -> RigidTransform:
     return robot.plant.EvalBodyPoseInWorld(context, robot.base)
 
 
-def _make_log(
-    scenario: Scenario,
-    name: str,
-    station: Station,
-    record: VectorLog,
-    failure: str | None,
-    fell: bool,
-) -> Log:
-    robot, time_step = station.robot, scenario.plant.time_step
-    names = recorded_ports(station)
-    ends = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
-    # A run that diverges may end in rows that are not numbers.
-    finite = np.logical_and.accumulate(np.isfinite(record.data()).all(axis=0))
-    if not finite.any():
-        raise InputError(
-            "the state is not finite from the start: values are too large or too small"
-        )
-    ticks = dict(zip(names, np.split(record.data().T[finite], ends, axis=1), strict=True))
+def _make_log(scenario: Scenario, name: str, run: RecordedRun) -> Log:
+    station, robot = run.station, run.station.robot
+    time_step, steps, ticks = scenario.plant.time_step, run.steps, dict(run.ticks)
     velocity = _joint_velocity(robot, ticks["plant_state"])
     forces = (ticks["net_actuation"], ticks["explicit_force"])
     ticks["torque_loss"] = loss_over_time(robot, velocity, *forces)
     # Of the plant steps those that ended are known.
-    steps = max(int(finite.sum()) - 1, 1)
     rows = np.arange(0, steps, round(scenario.log.period / time_step))
     raw = {
         port: values[np.minimum(rows + signals.is_late(port), len(values) - 1)]
@@ -272,9 +339,9 @@ def _make_log(
         "title": scenario.title,
         "scenario": dump_scenario(scenario, name),
         "outcome": {
-            "finished": failure is None,
-            "fell": fell,
-            "reason": failure or "finished",
+            "finished": run.end.failure is None,
+            "fell": run.end.fell,
+            "reason": run.end.failure or "finished",
             "time": float(time[-1]),
         },
     }

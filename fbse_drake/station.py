@@ -83,13 +83,13 @@ class Station(Diagram):
         self,
         scenario: Scenario,
         meshcat: Meshcat | None = None,
-        recorded: RecordedReference | None = None,
+        reference: Reference | RecordedReference | None = None,
     ):
         super().__init__()
         builder = DiagramBuilder()
         with located("model: "):
             self.model = build_robot(scenario.believed)
-        self.reference = recorded or planned_reference(scenario, self.model)
+        self.reference = reference or planned_reference(scenario, self.model)
         simulated = add_robot(builder, scenario, self.reference)
         self.robot = simulated.robot
         if self.model.joint_names != self.robot.joint_names:
@@ -119,20 +119,20 @@ def build_station(
     scenario: Scenario,
     *,
     meshcat: Meshcat | None = None,
-    recorded: RecordedReference | None = None,
+    reference: Reference | RecordedReference | None = None,
 ) -> Station:
     """Builds the closed loop of a scenario.
 
     Args:
         meshcat: also draws the robot there.
-        recorded: what the robot is asked for, in the place of the scenario's reference; its joints
-            then start at zero unless the context says otherwise.
+        reference: what the robot is asked for, by default the scenario's motion as its model plans
+            it; joints start at zero in a recorded one unless the context says otherwise.
 
     Raises:
         InputError: a part of the scenario that does not fit the robot, or a motion that it cannot
             make.
     """
-    return Station(scenario, meshcat, recorded)
+    return Station(scenario, meshcat, reference)
 
 
 class SimulatedRobot(NamedTuple):

@@ -3,6 +3,8 @@ model, closed forms for others."""
 
 import dataclasses
 import multiprocessing
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -282,3 +284,15 @@ def test_simulations_side_by_side_end_with_the_work():
     for process in multiprocessing.active_children():
         process.join(10.0)
     assert not multiprocessing.active_children()
+
+
+def test_a_simulation_that_is_stopped_at_the_keyboard_has_no_error():
+    """What was simulated until then would be taken for all of it."""
+    squat = load_scenario("squat", overrides=("duration=0.1",))
+    log = simulate(squat).log
+
+    def stop(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        rollout(squat, log, progress=stop)

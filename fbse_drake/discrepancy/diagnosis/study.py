@@ -1,8 +1,7 @@
 """The whole loop: diagnose, add, and again, until nothing is left."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,10 @@ from fbse_drake.discrepancy.diagnosis.validation import (
     validation_json,
 )
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
+from fbse_drake.discrepancy.residual.rollout import Rollout, RolloutError, Rollouts
 from fbse_drake.effects.effect import Effect
 from fbse_drake.log import Log
+from fbse_drake.processes import Processes
 from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.scenario import Scenario
 from fbse_drake.walking.reference import Recorded
@@ -35,6 +35,8 @@ _LEAST_GAIN = 0.01
 _LEAST_GAIN_IN_NOISE = 0.1
 # Less of a log than this many blocks is not set aside.
 _SHORTEST_REST = 40
+# The log that is diagnosed, among those that models are simulated against.
+_TRAIN = "train"
 # The loop ends after this many rounds; a robot lacks two or three effects at a time, not ten.
 _MOST_ROUNDS = 4
 
@@ -117,44 +119,40 @@ def study(
     Raises:
         InputError: a log that does not fit the scenario.
     """
+    with Processes(jobs) as processes:
+        return _study(scenario, log, effects, rollouts, tests or {}, progress, processes)
+
+
+def _study(
+    scenario: Scenario,
+    log: Log,
+    effects: Iterable[type[Effect]] | None,
+    rollouts: bool,
+    tests: Mapping[str, Log],
+    progress: Progress,
+    processes: Processes,
+) -> Study:
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
-
     # Of the tests, by every model.
     tested: list[dict[str, Predictor]] = []
     interrupted: str | None = None
 
-    def measured_step(
-        added: Sequence[Finding], held_out_rmse: float, train_rmse: float, *, simulated: bool
-    ) -> StudyStep:
-        others = {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
-        tested.append(others)
-        errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
-        rolled, test_rolled = None, {}
-        if simulated:
-            played = partial(
-                rollout, scenario, planned_with=planned_with, progress=progress, jobs=jobs
-            )
-            rolled = played(log, beside=steps[0].rollout if steps else None)
-            if isinstance(scenario.reference, Recorded):
-                candidates = ((name, played(other)) for name, other in (tests or {}).items())
-                test_rolled = {name: error for name, error in candidates if error is not None}
-        return StudyStep(tuple(added), held_out_rmse, train_rmse, rolled, errors, test_rolled)
+    simulated = _Simulated(scenario, log, tests, processes) if rollouts else None
+    diagnosing = processes.beside(progress)
 
     def step(added: Sequence[Finding], held_out_rmse: float, train_rmse: float) -> None:
-        nonlocal interrupted
-        try:
-            simulated = rollouts and interrupted is None
-            made = measured_step(added, held_out_rmse, train_rmse, simulated=simulated)
-        except Interrupted as stop:
-            interrupted = str(stop)
-            made = measured_step(added, held_out_rmse, train_rmse, simulated=False)
-        steps.append(made)
+        others = {name: Predictor(scenario, other) for name, other in tests.items()}
+        tested.append(others)
+        errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
+        steps.append(StudyStep(tuple(added), held_out_rmse, train_rmse, None, errors))
 
     effects = None if effects is None else list(effects)
-    predictor, planned_with = Predictor(scenario, log), scenario.believed
+    predictor = Predictor(scenario, log)
+    if simulated is not None:
+        simulated.begin(scenario)
     while len(diagnoses) < _MOST_ROUNDS and interrupted is None:
-        diagnosis = diagnose(predictor, effects, progress=progress)
+        diagnosis = diagnose(predictor, effects, progress=diagnosing)
         diagnoses.append(diagnosis)
         interrupted = diagnosis.partial
         if not steps:
@@ -171,7 +169,7 @@ def study(
         believed = Predictor(completed, log)
         if len(diagnoses) == 1 and scenario.identify.inertia and interrupted is None:
             try:
-                plain = identify(scenario, log, progress=progress)
+                plain = identify(scenario, log, progress=diagnosing)
             except Interrupted as stop:
                 interrupted = str(stop)
             else:
@@ -184,6 +182,14 @@ def study(
             break
         scenario, predictor = completed, believed
         step(found, *errors)
+        if simulated is not None and interrupted is None:
+            simulated.begin(scenario)
+    if simulated is not None and interrupted is None:
+        try:
+            for k, found_by_step in enumerate(simulated.results(progress)):
+                steps[k] = replace(steps[k], **found_by_step)
+        except Interrupted as stop:
+            interrupted = str(stop)
     because = _reason(diagnoses) if interrupted is None else interrupted
     set_aside = {}
     if len(steps) > 1:
@@ -191,6 +197,42 @@ def study(
     return Study(
         tuple(steps), tuple(diagnoses), because, scenario, interrupted is not None, set_aside
     )
+
+
+class _Simulated:
+    """Models that are simulated against a log, and against tests that say what the robot was asked
+    for, while it is diagnosed what the next one lacks."""
+
+    def __init__(
+        self, scenario: Scenario, log: Log, tests: Mapping[str, Log], processes: Processes
+    ):
+        played = tests if isinstance(scenario.reference, Recorded) else {}
+        self._rollouts = {
+            name: Rollouts(one, scenario.believed, processes)
+            for name, one in {_TRAIN: log, **played}.items()
+        }
+        self._begun: list[dict[str, Rollout | None]] = []
+
+    def begin(self, scenario: Scenario) -> None:
+        """Begins to simulate the model of a step."""
+        self._begun.append({name: of.begin(scenario) for name, of in self._rollouts.items()})
+
+    def results(self, progress: Progress) -> Iterator[dict[str, Any]]:
+        """`rollout` and `test_rollouts` of each step, when they are there.
+
+        Raises:
+            Interrupted: see `Progress`.
+        """
+        first = None
+        for begun in self._begun:
+            errors = {
+                name: one.result(progress, first if name == _TRAIN else None)
+                for name, one in begun.items()
+                if one is not None
+            }
+            train = errors.pop(_TRAIN, None)
+            first = first or train
+            yield {"rollout": train, "test_rollouts": errors}
 
 
 def is_better(model: Predictor, other: Predictor) -> bool:

@@ -1,11 +1,8 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-import multiprocessing
-import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from functools import partial
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -17,13 +14,14 @@ from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.log import Log
+from fbse_drake.processes import Processes, Task
 from fbse_drake.progress import Interrupted, Progress, silent
 from fbse_drake.robot.plant import Robot
-from fbse_drake.scenario import RobotConfig, Scenario
+from fbse_drake.scenario import RobotConfig, Scenario, build_robot, planned_reference
 from fbse_drake.signals import channels_of
-from fbse_drake.simulation import INTERRUPTED, add_record, simulate
+from fbse_drake.simulation import add_record, base_motion, recorded_run
 from fbse_drake.station import build_station
-from fbse_drake.walking.reference import Recorded, RecordedReference
+from fbse_drake.walking.reference import Recorded, RecordedReference, Reference
 from fbse_drake.wiring import release
 
 # Where velocities were not measured, that at the start of a stretch is the slope of a parabola
@@ -34,8 +32,6 @@ _STARTING_SAMPLES = 10
 # alone lets a foot land or a joint slip otherwise, and the rest of the walk is another. The median
 # of three lies between any two of them.
 _AGREEMENT = 0.1
-# How often runs in other processes are looked at [s].
-_LOOK_PERIOD = 0.2
 _SIMULATING = "simulating the model against the log"
 
 
@@ -108,24 +104,68 @@ def rollout(
     Raises:
         InputError: see `simulate`; or the log and the simulation share no time.
     """
-    believed = _believed(scenario, planned_with or scenario.believed)
-    if isinstance(scenario.reference, Recorded):
-        if "reference/joint/position" not in log:
-            return None
-        return _recorded_rollout(believed, scenario.reference, log, progress)
-    believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
-    first, second, third = (
-        replace(believed, seed=seed) for seed in range(scenario.seed + 1, scenario.seed + 4)
-    )
-    draws = (
-        _side_by_side([first, second], log, progress, jobs)
-        if jobs > 1
-        else [_simulated_error(one, log, progress) for one in (first, second)]
-    )
-    if not _agree(*draws, 0.0 if beside is None else beside.mean_position):
-        draws.append(_simulated_error(third, log, progress))
-    # Of two that agree, the worse.
-    return sorted(draws, key=lambda error: (error.failure is not None, error.mean_position))[1]
+    with Processes(jobs) as processes:
+        begun = Rollouts(log, planned_with or scenario.believed, processes).begin(scenario)
+        return None if begun is None else begun.result(progress, beside)
+
+
+class Rollouts:
+    """Models that are simulated against one log, each as by `rollout`, beside other work. The
+    motion is planned once for all."""
+
+    def __init__(self, log: Log, planned_with: RobotConfig, processes: Processes):
+        """Nothing is simulated yet.
+
+        Args:
+            planned_with: see `rollout`.
+            processes: where it is simulated.
+        """
+        self._log, self._planned_with, self._processes = log, planned_with, processes
+        self._reference: Reference | None = None
+
+    def begin(self, scenario: Scenario) -> "Rollout | None":
+        """Begins to simulate a scenario's model; only models differ between scenarios.
+
+        Returns:
+            None where nobody knows what the robot was asked for.
+        """
+        log, processes = self._log, self._processes
+        believed = _believed(scenario, self._planned_with)
+        if isinstance(scenario.reference, Recorded):
+            if "reference/joint/position" not in log:
+                return None
+            played = partial(_recorded_rollout, believed, scenario.reference, log)
+            return Rollout((processes.begin(played),), None, processes)
+        believed = replace(believed, duration=min(scenario.duration, float(log.time[-1])))
+        if self._reference is None:
+            self._reference = planned_reference(believed, build_robot(believed.believed))
+        first, second, third = (
+            partial(_simulated_error, replace(believed, seed=seed), log, self._reference)
+            for seed in range(scenario.seed + 1, scenario.seed + 4)
+        )
+        return Rollout((processes.begin(first), processes.begin(second)), third, processes)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A model that is being simulated against a log."""
+
+    # With each draw of the sensors' noise.
+    draws: tuple[Task[RolloutError], ...]
+    # With another one; None where there is nothing to draw.
+    further: Callable[[Progress], RolloutError] | None
+    processes: Processes
+
+    def result(self, progress: Progress, beside: RolloutError | None = None) -> RolloutError:
+        """Its error, when it is there; see `rollout`."""
+        errors = self.processes.results(list(self.draws), progress, _SIMULATING)
+        if self.further is None:
+            return errors[0]
+        if not _agree(*errors, 0.0 if beside is None else beside.mean_position):
+            third = self.processes.begin(self.further)
+            errors += self.processes.results([third], progress, _SIMULATING)
+        # Of two that agree, the worse.
+        return sorted(errors, key=lambda error: (error.failure is not None, error.mean_position))[1]
 
 
 def _agree(error: RolloutError, other: RolloutError, beside: float) -> bool:
@@ -139,51 +179,6 @@ def _agree(error: RolloutError, other: RolloutError, beside: float) -> bool:
     return error.failure is None and other.failure is None and close
 
 
-def _side_by_side(
-    scenarios: Sequence[Scenario], log: Log, progress: Progress, jobs: int
-) -> list[RolloutError]:
-    """The errors of several scenarios, so many at a time.
-
-    Processes are forked: a plant's configuration does not go through a pipe, and a user's own
-    effects are known here only.
-    """
-    context = multiprocessing.get_context("fork")
-    waiting = dict(enumerate(scenarios))
-    running: dict[Connection, tuple[int, BaseProcess]] = {}
-    found: dict[int, RolloutError] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < jobs:
-                place = min(waiting)
-                receiver, sender = context.Pipe(duplex=False)
-                run = context.Process(target=_send_error, args=(sender, waiting.pop(place), log))
-                run.start()
-                sender.close()
-                running[receiver] = place, run
-            progress(_SIMULATING, len(found) / len(scenarios))
-            for receiver in wait(list(running), timeout=_LOOK_PERIOD):
-                place, run = running.pop(receiver)
-                result = receiver.recv()
-                run.join()
-                if isinstance(result, Exception):
-                    raise result
-                found[place] = result
-    finally:
-        for _, run in running.values():
-            run.terminate()
-    return [found[place] for place in range(len(scenarios))]
-
-
-def _send_error(sender: Connection, scenario: Scenario, log: Log) -> None:
-    """In a process of its own; who started it decides about its end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    try:
-        sender.send(_simulated_error(scenario, log, silent))
-    except Exception as error:
-        sender.send(error)
-
-
 def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
     """The scenario with its model in the robot's place; the rest believes what it believed.
 
@@ -193,30 +188,39 @@ def _believed(scenario: Scenario, planned_with: RobotConfig) -> Scenario:
     return replace(scenario, robot=scenario.believed, model=planned_with, estimator=estimator)
 
 
-def _simulated_error(scenario: Scenario, log: Log, progress: Progress) -> RolloutError:
+def _simulated_error(
+    scenario: Scenario, log: Log, reference: Reference, progress: Progress
+) -> RolloutError:
     """The error of a scenario's robot as it is simulated."""
 
     def tell(time: float) -> None:
         progress(_SIMULATING, time / scenario.duration)
 
-    result = simulate(scenario, progress=tell)
-    if result.failure == INTERRUPTED:
-        raise Interrupted("it was interrupted")
-    simulated = result.log
-    rows = np.searchsorted(simulated.time, log.time - 1e-9)
-    shared = (rows < len(simulated.time)) & (
-        np.abs(simulated.time[np.minimum(rows, len(simulated.time) - 1)] - log.time) < 1e-6
-    )
-    if not shared.any():
-        raise InputError("the log and the simulated model have no sample time in common")
-    there = {name: simulated[name][rows[shared]] for name in _COMPARED if name in log}
-    error = _rollout_error(log, shared, there, float(simulated.time[-1]), result.failure)
-    if "truth/base/orientation" not in simulated:
-        return error
-    base = (simulated[f"truth/base/{name}"][rows[shared]] for name in ("orientation", "position"))
-    return replace(error, **dict(zip(("base_orientation", "base_position"), base, strict=True)))
+    ports = (*_COMPARED_PORTS, "plant_state")
+    with recorded_run(scenario, ports=ports, reference=reference, progress=tell) as run:
+        if run.end.interrupted:
+            raise Interrupted("it was interrupted")
+        robot, time_step = run.station.robot, scenario.plant.time_step
+        rows = np.arange(0, run.steps, round(scenario.log.period / time_step))
+        time = rows * time_step
+        place = np.searchsorted(time, log.time - 1e-9)
+        shared = (place < len(time)) & (
+            np.abs(time[np.minimum(place, len(time) - 1)] - log.time) < 1e-6
+        )
+        if not shared.any():
+            raise InputError("the log and the simulated model have no sample time in common")
+        ticks = {port: values[rows[place[shared]]] for port, values in run.ticks.items()}
+        base_orientation, base_position = base_motion(robot, ticks["plant_state"])
+        channels: dict[str, np.ndarray] = {}
+        for port in _COMPARED_PORTS:
+            channels |= channels_of(port, ticks[port], len(robot.joint_names))
+        there = {name: values for name, values in channels.items() if name in log}
+        error = _rollout_error(log, shared, there, float(time[-1]), run.end.failure)
+    return replace(error, base_orientation=base_orientation, base_position=base_position)
 
 
+# Ports of a station whose channels are compared.
+_COMPARED_PORTS = ("measured_joint_state", "torque_command")
 _COMPARED = ("joint/position", "joint/velocity", "joint/torque_command")
 
 
@@ -287,9 +291,9 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     duration = float(log.time[-1]) - start + time_step
     exact = replace(scenario, sensors=scenario.sensors.without_errors, duration=duration)
     builder = DiagramBuilder()
-    station = builder.AddSystem(build_station(exact, recorded=RecordedReference(log)))
+    station = builder.AddSystem(build_station(exact, reference=RecordedReference(log)))
     robot = station.robot
-    sink = add_record(builder, station, ("measured_joint_state", "torque_command"), time_step)
+    sink = add_record(builder, station, _COMPARED_PORTS, time_step)
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()

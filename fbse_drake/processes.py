@@ -1,0 +1,141 @@
+"""Work in processes of its own, beside what this one does."""
+
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+from fbse_drake.progress import Progress, silent
+
+T = TypeVar("T")
+# How often processes are looked at while nothing else is done [s].
+_LOOK_PERIOD = 0.2
+
+
+@dataclass(eq=False)
+class Task(Generic[T]):
+    """A piece of work and what came out of it, one result or an error, if it is done."""
+
+    work: Callable[[Progress], T]
+    outcome: list[T] = field(default_factory=list)
+    error: Exception | None = None
+
+    @property
+    def is_done(self) -> bool:
+        return bool(self.outcome) or self.error is not None
+
+
+class Processes:
+    """Tasks, so many at a time. With one job each is done when its result is asked for.
+
+    Processes are forked: a plant's configuration does not go through a pipe, and a user's own
+    effects are known in this process only. At the end of the context what still runs is ended.
+    """
+
+    def __init__(self, jobs: int = 1):
+        self._jobs = jobs
+        self._waiting: deque[Task[Any]] = deque()
+        self._running: dict[Connection, tuple[Task[Any], BaseProcess]] = {}
+
+    def __enter__(self) -> "Processes":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for _, process in self._running.values():
+            process.terminate()
+
+    def begin(self, work: Callable[[Progress], T]) -> Task[T]:
+        """A task, which is begun as soon as a process is free for it beside this one.
+
+        Args:
+            work: is told where to tell its progress.
+        """
+        task = Task(work)
+        if self._jobs > 1:
+            self._waiting.append(task)
+            self._look(self._jobs - 1)
+        return task
+
+    def beside(self, progress: Progress) -> Progress:
+        """A progress of other work at which it is also seen to it that tasks go on."""
+
+        def told(text: str, share: float = 0.0) -> None:
+            self._look(self._jobs - 1)
+            progress(text, share)
+
+        return told
+
+    def results(self, tasks: list[Task[T]], progress: Progress, text: str) -> list[T]:
+        """What comes out of tasks; waits for it.
+
+        Args:
+            progress: is told it under this text.
+
+        Raises:
+            Exception: that of the first task that raised one.
+        """
+        for k, task in enumerate(tasks):
+            if self._jobs == 1 and not task.is_done:
+                task.outcome.append(task.work(_part(progress, k, len(tasks))))
+        while not all(task.is_done for task in tasks):
+            progress(text, sum(task.is_done for task in tasks) / len(tasks))
+            self._look(self._jobs, _LOOK_PERIOD)
+        for task in tasks:
+            if task.error is not None:
+                raise task.error
+        return [result for task in tasks for result in task.outcome]
+
+    def _look(self, at_most: int, timeout: float = 0.0) -> None:
+        """Takes results that have come and starts what waits.
+
+        Args:
+            at_most: so many processes run.
+            timeout: waits so long for results [s].
+        """
+        self._start(at_most)
+        ready = wait(list(self._running), timeout=timeout)
+        for receiver in [one for one in self._running if one in ready]:
+            task, process = self._running.pop(receiver)
+            outcome, task.error = receiver.recv()
+            task.outcome += outcome
+            process.join()
+        self._start(at_most)
+
+    def _start(self, at_most: int) -> None:
+        context = multiprocessing.get_context("fork")
+        while self._waiting and len(self._running) < at_most:
+            task = self._waiting.popleft()
+            receiver, sender = context.Pipe(duplex=False)
+            process = context.Process(target=_send_result, args=(sender, task.work))
+            process.start()
+            sender.close()
+            self._running[receiver] = task, process
+
+
+def _part(progress: Progress, done: int, count: int) -> Progress:
+    """Progress of one of several pieces of work."""
+
+    def told(text: str, share: float = 0.0) -> None:
+        progress(text, (done + share) / count)
+
+    return told
+
+
+def _send_result(sender: Connection, work: Callable[[Progress], object]) -> None:
+    """In a process of its own; who started it decides about its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        sender.send(([work(silent)], None))
+    except Exception as error:
+        sender.send(([], error))

@@ -1,0 +1,87 @@
+"""Work in processes of its own (fbse_drake/processes.py)."""
+
+import multiprocessing
+import os
+
+import pytest
+
+from fbse_drake.processes import Processes
+from fbse_drake.progress import Interrupted, Progress, ProgressLines, silent
+
+
+def of_process(number: int) -> tuple[int, int]:
+    return number, os.getpid()
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 3])
+def test_results_come_in_the_order_of_the_tasks(jobs: int):
+    with Processes(jobs) as processes:
+        tasks = [processes.begin(lambda told, k=k: of_process(k)) for k in range(5)]  # noqa: ARG005
+        results = processes.results(tasks, silent, "working")
+    assert [number for number, _ in results] == list(range(5))
+    assert all((pid == os.getpid()) == (jobs == 1) for _, pid in results)
+
+
+def test_tasks_go_on_while_other_work_tells_its_progress():
+    told: list[str] = []
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        told.append(text)
+
+    with Processes(2) as processes:
+        tasks = [processes.begin(lambda told, k=k: k) for k in range(3)]  # noqa: ARG005
+        beside = processes.beside(progress)
+        while not all(task.is_done for task in tasks):
+            beside("other work")
+    assert set(told) == {"other work"}
+
+
+def test_with_one_job_nothing_is_done_before_it_is_asked_for():
+    done: list[int] = []
+
+    def work(told: Progress) -> None:
+        told("working", 0.5)
+        done.append(1)
+
+    shares: list[float] = []
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        shares.append(share)
+
+    with Processes() as processes:
+        tasks = [processes.begin(work), processes.begin(work)]
+        processes.beside(silent)("other work")
+        assert not done
+        processes.results(tasks, progress, "working")
+    assert shares == [0.25, 0.75]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_is_that_of_the_task(jobs: int):
+    def fail(told: Progress) -> None:  # noqa: ARG001
+        raise ValueError("no solution")
+
+    with Processes(jobs) as processes, pytest.raises(ValueError, match="no solution"):
+        processes.results([processes.begin(fail)], silent, "working")
+
+
+def test_no_process_is_left_behind():
+    def endless(told: Progress) -> None:  # noqa: ARG001
+        while True:
+            pass
+
+    def interrupted_at_once(text: str, share: float = 0.0) -> None:
+        lines = ProgressLines(str)
+        lines.stop("enough")
+        lines(text, share)
+
+    def interrupted_work() -> None:
+        with Processes(3) as processes:
+            tasks = [processes.begin(endless), processes.begin(endless)]
+            processes.results(tasks, interrupted_at_once, "working")
+
+    with pytest.raises(Interrupted, match="enough"):
+        interrupted_work()
+    for process in multiprocessing.active_children():
+        process.join(10.0)
+    assert not multiprocessing.active_children()
