@@ -6,6 +6,7 @@ pieces between corners, concave in |v|. What the pieces leave over is small, and
 own, which are moved along the velocity: with its memory, or in and out of reach with its size.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,13 +30,20 @@ _CORNERS = {
     6: (0.0077, (0.2165, 0.4781, 0.7761, 1.1468, 1.6812, 2.7800)),
     7: (0.0058, (0.1866, 0.4090, 0.6539, 0.9394, 1.3015, 1.8305, 2.9266)),
 }
-# They may be off by this share of the torque's rms over the planned motion.
-_DEVIATION = 0.1
+# As few pieces are taken as let the simulated torque be off by this share of its rms, or by so many
+# times what the most would leave.
+_DEVIATION, _OF_THE_LEAST = 4e-3, 2.0
+# Rows of the planned motion that this is judged by. A joint that is to stand still creeps under what
+# it carries, at these shares of the speed at which its law levels off.
+_ROWS, _CREEP = 2000, np.linspace(-3.0, 3.0, 61)
 # Pieces for one direction alone are left out below this share of those for both.
 _ONE_SIDED = 0.01
 # Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
 # add up to its present size.
 _PARTS = np.array([1 / 2, 1 / 4, 1 / 4])
+# Share of the last step's change of velocity that is expected of the next: smooth motion would go
+# on with all of it, a joint that is stopped by a contact with none.
+CARRIED_ON = 0.5
 # Clamps are out of reach when they are moved so far [rad/s].
 _OUT_OF_REACH = 100.0
 # At so many times the speed at which a law levels off, it shows its size.
@@ -129,7 +137,7 @@ def implicit_law(effects: Sequence[ResolvedJointTorque], planned: JointMotion) -
         tuple(speed for k in steady for speed in rises[k].speeds),
         tuple(corner for k in steady for corner in rises[k].corners),
     )
-    clamps = [_clamps(lambda v: law(v) - damping * v, rise, law(planned.velocity))]
+    clamps = [_clamps(lambda v: law(v) - damping * v, rise, planned)]
     moving: list[MovingClamps] = []
     for k, (effect, rise) in enumerate(zip(effects, rises, strict=True)):
         if k in steady or not (rise.speeds or rise.corners):
@@ -151,8 +159,7 @@ def _leaning(
     """Clamps of an effect with a memory, (3, m, n), and what makes them move."""
     still = JointMotion(np.zeros(planned.velocity.shape[1]), time_step=planned.time_step)
     motion = still._replace(memory=effect.effect.start(still, effect.nonlinear))
-    law = _law(effect, motion)
-    return _clamps(law, rise, law(planned.velocity)), LeaningClamps
+    return _clamps(_law(effect, motion), rise, planned), LeaningClamps
 
 
 def _partial(
@@ -169,8 +176,7 @@ def _partial(
     names = ("position", "time", "load")
     known = (np.broadcast_to(getattr(planned, name), torque.shape) for name in names)
     fields = {name: values[strongest] for name, values in zip(names, known, strict=True)}
-    law, over_motion = _law(effect, planned._replace(**fields)), effect.torque_and_slope(planned)[0]
-    whole = _clamps(law, rise, over_motion)
+    whole = _clamps(_law(effect, planned._replace(**fields)), rise, planned)
     moving = partial(
         PartialClamps,
         part=np.repeat(np.arange(len(_PARTS)), whole.shape[1]),
@@ -185,15 +191,17 @@ def _law(effect: ResolvedJointTorque, motion: JointMotion) -> Law:
     return lambda velocity: effect.torque_and_slope(motion._replace(velocity=velocity))[0]
 
 
-def _clamps(law: Law, rise: Rise, planned: np.ndarray) -> np.ndarray:
+def _clamps(law: Law, rise: Rise, planned: JointMotion) -> np.ndarray:
     """Slopes, limits and offsets of clamps that follow a law, (3, m, n).
 
     Args:
         law: of n joints, without damping.
         rise: where it levels off.
-        planned: its torques over the planned motion, (N, n) [Nm].
+        planned: the motion as planned.
     """
-    n, deviation = planned.shape[1], _DEVIATION * np.sqrt(np.mean(planned**2, axis=0))
+    n, rows = planned.velocity.shape[1], slice(None, None, -(-len(planned.velocity) // _ROWS))
+    velocity = planned.velocity[rows]
+    expected = velocity - (1 - CARRIED_ON) * _change_in_a_step(planned)[rows]
     columns = []
     for j in range(n):
 
@@ -204,33 +212,63 @@ def _clamps(law: Law, rise: Rise, planned: np.ndarray) -> np.ndarray:
             return np.array([np.broadcast_to(value, n)[j] for value in values])
 
         speeds, sharp = at_joint(rise.speeds), at_joint(rise.corners)
-        columns.append(_joint_clamps(of_joint, speeds, sharp, deviation[j]))
+        speeds = speeds[np.isfinite(speeds)]
+        choice = [_joint_clamps(of_joint, speeds, sharp, *pieces) for pieces in _CORNERS.values()]
+        if len(speeds) == 0:
+            columns.append(choice[0])
+            continue
+        true, guess = velocity[:, j], expected[:, j]
+        if np.abs(true).max() < speeds.min():
+            true, guess = speeds.min() * _CREEP, np.zeros_like(_CREEP)
+        torque, guessed = of_joint(true), of_joint(guess)
+        errors = np.array(
+            [_rms(torque - _sum(clamps, true) - guessed + _sum(clamps, guess)) for clamps in choice]
+        )
+        allowed = max(_DEVIATION * _rms(torque), _OF_THE_LEAST * errors[-1])
+        columns.append(choice[int(np.argmax(errors <= allowed))])
     clamps = np.zeros((3, max(map(len, columns)), n))
     for j, column in enumerate(columns):
         clamps[:, : len(column), j] = np.reshape(column, (-1, 3)).T
     return clamps
 
 
+def _change_in_a_step(planned: JointMotion) -> np.ndarray:
+    """By how much the planned velocities change in a plant step, (N, n) [rad/s]."""
+    if len(planned.velocity) < 2:
+        return np.zeros_like(planned.velocity)
+    time = np.ravel(planned.time)
+    return planned.time_step * np.gradient(planned.velocity, time, axis=0)
+
+
+def _sum(clamps: Sequence[tuple[float, float, float]], velocity: np.ndarray) -> np.ndarray:
+    """Torque of clamps, each slope, limit and offset, at velocities (N,)."""
+    torques = (np.clip(s * velocity + offset, -limit, limit) for s, limit, offset in clamps)
+    return sum(torques, np.zeros_like(velocity))
+
+
+def _rms(values: np.ndarray) -> float:
+    return math.sqrt(np.mean(np.square(values)))
+
+
 def _joint_clamps(
     law: Callable[[np.ndarray], np.ndarray],
     speeds: np.ndarray,
     sharp: np.ndarray,
-    deviation: float,
+    share: float,
+    at: Sequence[float],
 ) -> list[tuple[float, float, float]]:
     """Slope, limit and offset of each clamp of one joint, whose law takes and gives (N,).
 
-    As few as let it deviate by no more than wanted [Nm], if there are enough corners.
+    Args:
+        speeds, sharp: where it levels off, and its corners.
+        share, at: of so many pieces, see `_CORNERS`.
     """
-    speeds = speeds[np.isfinite(speeds)]
-    for share, at in _CORNERS.values():
-        raised = np.append(np.full(len(at) - 1, 1.0 + share), 1.0 / np.tanh(at[-1]))
-        corner = np.concatenate([sharp, np.multiply.outer(speeds, at).ravel()])
-        raised = np.concatenate([np.ones(len(sharp)), np.tile(raised, len(speeds))])
-        order = np.argsort(corner)
-        corner, raised = corner[order], raised[order]
-        forwards, backwards = raised * law(corner), -raised * law(-corner)
-        if share * np.max([forwards, backwards], initial=0.0) <= deviation or len(speeds) == 0:
-            break
+    raised = np.append(np.full(len(at) - 1, 1.0 + share), 1.0 / np.tanh(at[-1]))
+    corner = np.concatenate([sharp, np.multiply.outer(speeds, at).ravel()])
+    raised = np.concatenate([np.ones(len(sharp)), np.tile(raised, len(speeds))])
+    order = np.argsort(corner)
+    corner, raised = corner[order], raised[order]
+    forwards, backwards = raised * law(corner), -raised * law(-corner)
     both = _pieces(corner, np.minimum(forwards, backwards))
     clamps = [(slope, limit, 0.0) for slope, limit in both]
     pieces = (np.minimum(slope * corner, limit) for slope, limit in both)

@@ -15,16 +15,13 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer
 
-from fbse_drake.effects.implicit import ImplicitLaw
+from fbse_drake.effects.implicit import CARRIED_ON, ImplicitLaw
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
-# Share of the last step's change of velocity that is expected of the next: smooth motion would go
-# on with all of it, a joint that is stopped by a contact with none.
-_CARRIED_ON = 0.5
 # A velocity that goes to and fro is followed by this share: what is left to be explicit of a law
 # that is steep for the step would else ring.
 _FOLLOWED = 0.2
@@ -118,7 +115,7 @@ def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
             if now[_CHANGE, j] * before[_CHANGE, j] < 0:
                 now[_EXPECTED, j] = before[_EXPECTED, j] + _FOLLOWED * (v - before[_EXPECTED, j])
             else:
-                now[_EXPECTED, j] = v + _CARRIED_ON * now[_CHANGE, j]
+                now[_EXPECTED, j] = v + CARRIED_ON * now[_CHANGE, j]
     return now[_EXPECTED]
 
 
