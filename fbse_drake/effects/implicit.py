@@ -33,9 +33,9 @@ _CORNERS = {
 # As few pieces are taken as let the simulated torque be off by this share of its rms, or by so many
 # times what the most would leave.
 _DEVIATION, _OF_THE_LEAST = 4e-3, 2.0
-# Rows of the planned motion that this is judged by. A joint that is to stand still creeps under
-# what it carries, at these shares of the speed at which its law levels off.
-_ROWS, _CREEP = 2000, np.linspace(-3.0, 3.0, 61)
+# Rows of the planned motion that this is judged by. A joint that is to stand still carries anything
+# that its friction holds, and creeps at these shares of the speed at which its law levels off.
+_ROWS, _CREEP = 2000, np.arctanh(np.linspace(-0.95, 0.95, 39))
 # Pieces for one direction alone are left out below this share of those for both.
 _ONE_SIDED = 0.01
 # Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
