@@ -25,6 +25,7 @@ from fbse_drake.discrepancy.diagnosis import diagnose as diagnosing
 from fbse_drake.discrepancy.diagnosis import identify as identifying
 from fbse_drake.discrepancy.diagnosis import study as studying
 from fbse_drake.discrepancy.diagnosis.compare import Comparison
+from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding
 from fbse_drake.discrepancy.diagnosis.identify import Identification
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
@@ -401,7 +402,9 @@ def diagnose(
     'Nm'
     """
     case = Case.divided(scenario, log, tests, name)
-    diagnosis = diagnosing.diagnose(Predictor(case.trusted, case.train), effects, progress=progress)
+    diagnosis = diagnose_confirmed(
+        Predictor(case.trusted, case.train), effects, case.tests, progress=progress
+    )
     if diagnosis.chosen:
         completed = addition.add(case.trusted, diagnosis.chosen)
         set_aside = {

@@ -450,6 +450,17 @@ def test_load_dependent_friction_is_told_from_torque_that_explains_itself(folder
     assert model_error(Predictor(add(scenario(folder), result.chosen), log)).relative < 0.015
 
 
+def test_inertia_that_is_as_believed_is_no_finding(folder: Path) -> None:
+    """Bodies are not trusted, but right: what is named is the friction alone."""
+    right = RobotConfig(str(folder / "true.yaml"))
+    doubting = dataclasses.replace(scenario(folder), robot=right, model=right)
+    result = diagnose(Predictor(doubting, recording()), [library()[name] for name in EFFECTS])
+    assert result.inertia is None
+    assert {f.effect for f in result.chosen} <= set(FRICTION)
+    assert {joint for f in result.chosen for joint in f.targets} == {"shoulder", "elbow"}
+    assert result.held_out_after < 1.2
+
+
 def test_inertia_that_is_trusted_stays(folder: Path) -> None:
     trusting = dataclasses.replace(scenario(folder), identify=IdentifyConfig())
     result = diagnose(Predictor(trusting, recording()), [library()[name] for name in EFFECTS])

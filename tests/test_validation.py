@@ -252,7 +252,8 @@ def test_a_study_keeps_plain_identification_where_that_leaves_less(
         ),
         held_out_after=0.5,
     )
-    monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.study.diagnose", lambda *_, **__: wrong)
+    search = "fbse_drake.discrepancy.diagnosis.study.diagnose_confirmed"
+    monkeypatch.setattr(search, lambda *_, **__: wrong)
     result = study(scenario, log, FEW, rollouts=False)
     first, last = (result.steps[k].errors["train"].relative_by_joint[KNEE] for k in (0, -1))
     assert last < 0.2 * first

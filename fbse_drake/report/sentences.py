@@ -76,11 +76,21 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
         return f"Partial: {diagnosis.partial} before the search was through. {_partly(diagnosis)}"
     parts = [_verdict(diagnosis)]
     parts += [_disturbed(one) for one in diagnosis.disturbances]
+    if diagnosis.refuted:
+        parts.append(_refuted(diagnosis.refuted))
     if _disagreement(diagnosis.chosen):
         parts.append(_disagreement(diagnosis.chosen))
     if diagnosis.averaging is not None and diagnosis.averaging.text:
         parts.append(diagnosis.averaging.text)
     return _headline(" ".join(parts), diagnosis.set_aside)
+
+
+def _refuted(findings: Sequence[Finding]) -> str:
+    """What is not named although it explains the log."""
+    text = (
+        f"{listed_effects(findings)} would explain more of the log, but raises the error of data "
+    )
+    return as_sentence(f"{text}that was set aside, and is not named")
 
 
 def _headline(result: str, set_aside: Mapping[str, Validation]) -> str:
@@ -263,6 +273,8 @@ def _study_result(study: Study) -> str:
             f"{number(first.held_out_rmse)} to {number(last.held_out_rmse)} times the "
             "sensors' noise; no data was set aside to test that."
         )
+    if refused := [finding for one in study.diagnoses for finding in one.refuted]:
+        result += f" {_refuted(refused)}"
     if ended.verdict == "unknown_effect":
         result += f" {_unexplained(ended)}"
     return result

@@ -14,10 +14,10 @@ from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance, disturbanc
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
-from fbse_drake.discrepancy.diagnosis.parsimony import frugal
+from fbse_drake.discrepancy.diagnosis.parsimony import frugal, in_fits, needs_inertia
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, remeasured
+from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, polished, remeasured
 from fbse_drake.discrepancy.diagnosis.rivals import (
     indistinguishable,
     rival_name,
@@ -143,6 +143,8 @@ class Diagnosis:
     set_aside: Mapping[str, Validation] = field(default_factory=dict)
     # In which something acted that no law explains; they were left out.
     disturbances: tuple[Disturbance, ...] = ()
+    # What explains the log and raises the error of data that was set aside: it is not named.
+    refuted: tuple[Finding, ...] = ()
 
     @property
     def chosen(self) -> list[Finding]:
@@ -273,7 +275,9 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
         partial = str(stop)
     alternatives: dict[int, list[Explanation]] = {}
     try:
-        if partial is None and dictionary.inertia is None:
+        if partial is None and dictionary.inertia is not None:
+            path, proposals = _with_trust(proposals, path, effects)
+        if partial is None and proposals.fits.dictionary.inertia is None:
             path[-1], alternatives = _settled_and_frugal(proposals, path[-1])
     except Interrupted as stop:
         partial = str(stop)
@@ -289,6 +293,21 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
     return _Search(
         proposals, path, alternatives, first.white.sse, inertia, unexplained, disturbed, partial
     )
+
+
+def _with_trust(
+    proposals: Proposals, path: list[Explanation], effects: Sequence[type[Effect]]
+) -> tuple[list[Explanation], Proposals]:
+    """A path by the model's own inertia, if what the last explanation fits of it is not needed."""
+    fits = proposals.fits
+    predictor, progress = fits.dictionary.predictor.trusting_inertia(), fits.dictionary.progress
+    trusting = Fits(Dictionary(predictor, effects, progress))
+    trusting, explanation = trusting.doubting(in_fits(trusting, path[-1]))
+    if needs_inertia(fits, path[-1], trusting):
+        return path, proposals
+    frugally = Proposals(trusting)
+    explanation = frugal(frugally, polished(trusting, explanation))
+    return [trusting.explain([]), explanation], frugally
 
 
 def _held(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
@@ -581,6 +600,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for name, s in diagnosis.effects.items()
         },
+        "refuted": [{"effect": f.effect, "joints": list(f.targets)} for f in diagnosis.refuted],
         "left_out": [
             {"start": d.start, "end": d.end, "rows": list(d.rows)} for d in diagnosis.disturbances
         ],

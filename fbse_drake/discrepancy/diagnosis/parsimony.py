@@ -10,6 +10,7 @@ divided by the number of blocks that count as one, see `blocks_per_sample`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -236,6 +237,32 @@ class Judge:
         least = float(chi2.isf(FALSE_ALARM, more)) if more > 0 else MARGIN
         rows = self.gain_by_row(smaller, explanation) - COMPLEXITY * more
         return self.gain(smaller, explanation) < least and rows.max() < least
+
+
+def needs_inertia(fits: Fits, explanation: Explanation, trusting: Fits) -> bool:
+    """Does an explanation need inertia that is fitted along, or does that of the model do as well?
+
+    Its parameters are fitted in every explanation, so that nothing else pays for what they explain;
+    what they bring at last is a single comparison.
+
+    Args:
+        trusting: fits by the model's own inertia.
+    """
+    beside = Fits(fits.dictionary, trusting.white)
+    wider, smaller = (polished(one, in_fits(one, explanation)) for one in (beside, trusting))
+    left, left_by_model = beside.leftover(wider), trusting.leftover(smaller)
+    deviance = trusting.white.deviance_by_row
+    drop = deviance(smaller.held_out_sse) - deviance(wider.held_out_sse)
+    gain = drop / blocks_per_sample((left_by_model - left) * left)
+    more = fits.dictionary.directions.shape[1]
+    return bool(gain.sum() - COMPLEXITY * more >= chi2.isf(FALSE_ALARM, more))
+
+
+def in_fits(fits: Fits, explanation: Explanation) -> Explanation:
+    """The members of an explanation, fitted otherwise."""
+    return fits.explain(
+        [replace(c, signature=fits.white.whiten_signature(c.raw)) for c in explanation.candidates]
+    )
 
 
 def _size(explanation: Explanation) -> int:

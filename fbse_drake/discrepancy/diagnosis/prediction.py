@@ -115,6 +115,12 @@ class Predictor:
         left_out = (*self.left_out, *stretches)
         return Predictor(self.scenario, self.log, self._given_noise, left_out)
 
+    def trusting_inertia(self) -> "Predictor":
+        """The same where the inertia of all bodies is trusted."""
+        identify = replace(self.scenario.identify, inertia=[])
+        scenario = replace(self.scenario, identify=identify)
+        return Predictor(scenario, self.log, self._given_noise, self.left_out)
+
     @property
     def rows(self) -> int:
         """Number of the residual's rows."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.add import add
 from fbse_drake.discrepancy.diagnosis.compare import words
-from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.identify import identify
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.validation import (
@@ -152,7 +153,7 @@ def _study(
     if simulated is not None:
         simulated.begin(scenario)
     while len(diagnoses) < _MOST_ROUNDS and interrupted is None:
-        diagnosis = diagnose(predictor, effects, progress=diagnosing)
+        diagnosis = diagnose_confirmed(predictor, effects, tests, progress=diagnosing)
         diagnoses.append(diagnosis)
         interrupted = diagnosis.partial
         if not steps:

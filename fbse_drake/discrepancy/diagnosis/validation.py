@@ -17,7 +17,7 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import STRETCH
 from fbse_drake.discrepancy.residual.residual import rms
 
-# Of the intervals.
+# Of the intervals, unless they are simultaneous.
 LEVEL = 0.95
 
 Course = Literal["falls", "rises", "unclear"]
@@ -90,8 +90,12 @@ def model_error(predictor: Predictor) -> ModelError:
     )
 
 
-def validated(given: Predictor, completed: Predictor) -> Validation:
-    """Compares two models on the log that both predict."""
+def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> Validation:
+    """Compares two models on the log that both predict.
+
+    Args:
+        level: of the intervals.
+    """
     first, last, n = given.residual, completed.residual, len(given.robot.joint_names)
     known = first.known & last.known
     # A row without any noise, as from ideal sensors, is still told apart from rounding.
@@ -106,12 +110,12 @@ def validated(given: Predictor, completed: Predictor) -> Validation:
     )
     batch = batch_length(len(first.time), first.time[1] - first.time[0])
     return Validation(
-        root_of_ratio(before, known.sum(axis=1), batch),
-        root_of_ratio(after, known.sum(axis=1), batch),
-        root_of_ratio(after, before, batch),
-        root_of_ratio(left, torque, batch),
-        root_of_ratio(left_after, torque, batch),
-        root_of_ratio(left_after, left, batch),
+        root_of_ratio(before, known.sum(axis=1), batch, level),
+        root_of_ratio(after, known.sum(axis=1), batch, level),
+        root_of_ratio(after, before, batch, level),
+        root_of_ratio(left, torque, batch, level),
+        root_of_ratio(left_after, torque, batch, level),
+        root_of_ratio(left_after, left, batch, level),
     )
 
 
@@ -120,12 +124,15 @@ def batch_length(blocks: int, block: float) -> int:
     return max(round(STRETCH / block), int(2 * np.sqrt(blocks)), 1)
 
 
-def root_of_ratio(above: np.ndarray, below: np.ndarray, batch: int) -> Measured:
+def root_of_ratio(
+    above: np.ndarray, below: np.ndarray, batch: int, level: float = LEVEL
+) -> Measured:
     """Root of the ratio of two sums over B blocks, with its interval by batch means.
 
     Args:
         above, below: not negative, (B,).
         batch: so many blocks are taken together; a rest at the end goes to the last batch.
+        level: of the interval.
     """
     edges = np.arange(max(1, len(above) // batch)) * batch
     over, under = (np.add.reduceat(values, edges) for values in (above, below))
@@ -139,7 +146,7 @@ def root_of_ratio(above: np.ndarray, below: np.ndarray, batch: int) -> Measured:
     if count > 1 and ratio > 0:
         scatter = float(((over - ratio * under) ** 2).sum()) * count / (count - 1)
         spread = np.sqrt(scatter) / float(over.sum())
-        half = 0.5 * float(student.ppf((1 + LEVEL) / 2, count - 1)) * spread
+        half = 0.5 * float(student.ppf((1 + level) / 2, count - 1)) * spread
     root = float(np.sqrt(ratio))
     return Measured(root, (root * float(np.exp(-half)), root * float(np.exp(half))))
 
