@@ -22,15 +22,12 @@ from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
-# A velocity that goes to and fro is followed by this share: what is left to be explicit of a law
-# that is steep for the step would else ring.
-_FOLLOWED = 0.2
 # A law that the solver takes but for this share of it is solved exactly.
 _ROUNDING = 1e-12
-# Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, its change
-# in the last step, and what is expected at the end; position and command when it begins; then
-# offsets of clamps and memories of effects.
-_EXPLICIT, _VELOCITY, _CHANGE, _EXPECTED, _POSITION, _COMMAND, _ROWS = range(7)
+# Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, and its
+# change in the last step; position and command when it begins; then offsets of clamps and memories
+# of effects.
+_EXPLICIT, _VELOCITY, _CHANGE, _POSITION, _COMMAND, _ROWS = range(6)
 
 
 class Tick(NamedTuple):
@@ -104,19 +101,21 @@ def loss_over_time(
 @njit(cache=True)
 def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
     """Fills velocities and positions of a tick; returns the velocities that are expected at the
-    next one, (n,) [rad/s]."""
+    next one, (n,) [rad/s].
+
+    A velocity that goes on is expected to do so. One that turned back is expected amid the last
+    two: where it goes to and fro, what is explicit of a law would else make it ring.
+    """
     n, now, before = len(joint_state) // 2, tick.memory, last.memory
     now[_POSITION], now[_VELOCITY] = joint_state[:n], joint_state[n:]
-    now[_EXPECTED], now[_CHANGE] = joint_state[n:], 0.0
+    now[_CHANGE] = 0.0
+    expected = joint_state[n:].copy()
     if not math.isnan(before[_VELOCITY, 0]):
         for j in range(n):
-            v = joint_state[n + j]
-            now[_CHANGE, j] = v - before[_VELOCITY, j]
-            if now[_CHANGE, j] * before[_CHANGE, j] < 0:
-                now[_EXPECTED, j] = before[_EXPECTED, j] + _FOLLOWED * (v - before[_EXPECTED, j])
-            else:
-                now[_EXPECTED, j] = v + CARRIED_ON * now[_CHANGE, j]
-    return now[_EXPECTED]
+            change = joint_state[n + j] - before[_VELOCITY, j]
+            now[_CHANGE, j] = change
+            expected[j] += (-0.5 if change * before[_CHANGE, j] < 0 else CARRIED_ON) * change
+    return expected
 
 
 @njit(cache=True)
