@@ -7,8 +7,9 @@ from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numba import njit
 from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dpotrf, dpotrs, dtbtrs
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import t as student
 
 from fbse_drake.discrepancy.residual.memory import Memory
@@ -142,15 +143,11 @@ class WhitenedResidual:
 
     def whiten(self, row: int, values: np.ndarray) -> np.ndarray:
         """Values (B, ...) of a row, whitened."""
-        index = self._index[row]
-        result = np.zeros(values.shape)
-        # LAPACK ends the process if it is given no columns.
-        if len(index) and values.size:
-            flat = values[index].reshape(len(index), -1)
-            result[index] = dtbtrs(self._factor[row], flat, uplo="L")[0].reshape(
-                values[index].shape
-            )
-        return result
+        index, (diagonal, below) = self._index[row], self._factor[row]
+        flat = np.ascontiguousarray(values).reshape(len(values), -1)
+        result = np.zeros(flat.shape)
+        _divide_by_bidiagonal(result, flat, index, diagonal, below)
+        return result.reshape(values.shape)
 
     def whiten_signature(self, signature: Signature) -> Signature:
         """A signature, whitened."""
@@ -186,6 +183,34 @@ class WhitenedResidual:
     def deviance(self, sse: np.ndarray) -> float:
         """The same of all rows."""
         return float(self.deviance_by_row(sse).sum())
+
+
+@njit(cache=True)
+def _divide_by_bidiagonal(
+    result: np.ndarray,
+    values: np.ndarray,
+    index: np.ndarray,
+    diagonal: np.ndarray,
+    below: np.ndarray,
+) -> None:
+    """Solves L X = Y forwards, all columns of a row together: column after column, as LAPACK does
+    it, takes ten times as long.
+
+    Args:
+        result: X in the rows of the index, (B, K); filled.
+        values: Y in the same rows, (B, K).
+        index: of the N rows of the system, (N,).
+        diagonal, below: of L, (N,) each; the last below is not looked at.
+    """
+    for i in range(len(index)):
+        row = index[i]
+        if i == 0:
+            for k in range(values.shape[1]):
+                result[row, k] = values[row, k] / diagonal[i]
+            continue
+        last = index[i - 1]
+        for k in range(values.shape[1]):
+            result[row, k] = (values[row, k] - below[i - 1] * result[last, k]) / diagonal[i]
 
 
 class PartialFit:
