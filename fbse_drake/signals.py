@@ -147,6 +147,8 @@ _TABLE: list[Signal] = [
     estimated("base/position_std", "base_state", "position_std", "m", (3,)),
     _own("base_state", "foot_innovation"),
     _own("base_state", "foot_innovation_variance"),
+    _own("base_state", "force_innovation"),
+    _own("base_state", "force_innovation_variance"),
     _own("base_state", "covariance"),
     _own("base_state", "innovation"),
     _own("base_state", "innovation_variance"),

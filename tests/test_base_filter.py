@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from fbse_drake import Log
 from fbse_drake.estimators.base_filter import (
     _AT_REST,
+    _LEAST_HABIT,
     _WALKING_SPEED,
     InvariantBaseFilter,
     InvariantFilter,
@@ -22,6 +23,7 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.innovations import LOG_OF_ONE, SMALLEST_SHARE
 from fbse_drake.estimators.records import as_record
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.robot.plant import grasp_map
@@ -285,6 +287,9 @@ def test_updates_are_the_textbooks_with_jacobians_by_differences(kind: str):
     assert np.abs(H).max() > 0.9
     lasting = 2 * (config.force_time if kind == "force" else config.foot_time) / TICK
     noise, C = size**2 * lasting, prior["error_covariance"]
+    if kind == "force":  # Joints and gyro have hardly any noise.
+        pads = len(BASE.measurements()["pad_force"])
+        noise += FOOT_NOISE.acceleration_noise**2 + pads * (FOOT_NOISE.force_noise / MASS) ** 2
     K = C @ H.T @ np.linalg.inv(H @ C @ H.T + noise * np.eye(3))
     e = generator.normal(scale=1e-5, size=SIZE)
     posterior, z = updated(e)
@@ -318,8 +323,6 @@ def elsewhere(x: np.ndarray, turn: Rotation, shift: np.ndarray) -> np.ndarray:
         y[name] = turn.apply(x[name]) + shift
     for name in ("imu_velocity", "base_velocity", "com_velocity"):
         y[name] = turn.apply(x[name])
-    for kind in range(3):  # The foot's angular velocity is in axes of the base.
-        y["foot_agreement"][:, kind] = turn.apply(x["foot_agreement"][:, kind])
     y["error_covariance"] = A @ x["error_covariance"] @ A.T
     return y
 
@@ -488,11 +491,12 @@ def test_a_foot_that_slips_for_a_moment_does_not_upset_the_attitude():
     slipping = LEVEL.copy()
     slipping["foot_jacobian"][:, 3, 6] = 1.0
     slipping["velocity"][6] = 0.2
-    before = x["attitude_std"].copy()
+    resting = x.copy()
     for k in range(400):
         x = rig.step(x, measurements=RESTING, model=slipping if k < 100 else LEVEL)
+        resting = rig.step(resting, measurements=RESTING, model=LEVEL)
         assert tilt_of(x) < 2e-3
-    np.testing.assert_allclose(x["attitude_std"][:2], before[:2], rtol=0.1)
+    np.testing.assert_allclose(x["attitude_std"][:2], resting["attitude_std"][:2], rtol=0.1)
 
 
 def test_an_accelerometer_that_forces_contradict_teaches_no_bias():
@@ -557,21 +561,34 @@ def test_biases_are_found_while_it_stands():
     # robot is; nobody tells it that it rests.
     size = np.ones((len(speed), 3))
     size[:, 2] = np.clip(speed / _WALKING_SPEED, _AT_REST, 1.0)
+    # What they have not done for long they are less and less believed to do.
+    size[:, :] *= (1 + TICK * np.arange(len(size)) / rates.foot_time)[:, None] ** -0.5
     told = 2 * TICK / (2 * rates.foot_time * (rates.foot_rate * size) ** 2)
     information = 1 / beliefs.angular_velocity_bias**2 + told.sum(axis=0)
-    assert information[2] > 5 * information[0]
-    np.testing.assert_allclose(last["angular_velocity_bias_std"], information**-0.5, rtol=0.02)
+    assert information[2] > 3 * information[0]
+    np.testing.assert_allclose(last["angular_velocity_bias_std"], information**-0.5, rtol=0.05)
     left = GYRO_BIAS / beliefs.angular_velocity_bias**2 / information
     np.testing.assert_allclose(last["angular_velocity_bias"], GYRO_BIAS - left, atol=3e-4)
     forces = dataclasses.replace(
         SILENT, force_error=0.05, force_gain_error=0.0, accelerometer_walk=0.0
     )
     last = stand(Filter(forces), time, GYRO_BIAS, ACCELEROMETER_BIAS)[-1]
-    information = 1 / beliefs.acceleration_bias**2 + time / (
-        2 * forces.force_time * forces.force_error**2
-    )
+    # Forces that agree with the accelerometer are less and less believed to be wrong, too; what is
+    # left of that after 0.7 s is white noise, mostly.
+    told = np.log(SMALLEST_SHARE) - LOG_OF_ONE
+    since = np.maximum(1.0, TICK * np.arange(1, len(speed) + 1) / forces.force_time)
+    share = np.maximum(_LEAST_HABIT, since**told)
+    pads = len(BASE.measurements()["pad_force"])
+    white = beliefs.acceleration_noise**2 + pads * (beliefs.force_noise / MASS) ** 2
+    arm = LEVEL["com"] - P_BI
+    turned = 2 * (beliefs.angular_velocity_noise / TICK) ** 2 * (arm @ arm - arm**2)
+    moved = (LEVEL["mass_matrix"][:, 3:6] / MASS) ** 2
+    white = white + turned + 2 * (beliefs.joint_velocity_noise / TICK) ** 2 * moved.sum(axis=0)
+    lasting = 2 * forces.force_time / TICK * share * forces.force_error**2
+    information = 1 / beliefs.acceleration_bias**2 + (1 / (lasting[:, None] + white)).sum(axis=0)
+    information = information[:2]
     # Level; what the first reading tells of the vertical bias is more than that.
-    np.testing.assert_allclose(last["acceleration_bias_std"][:2], information**-0.5, rtol=0.05)
+    np.testing.assert_allclose(last["acceleration_bias_std"][:2], information**-0.5, rtol=0.2)
     np.testing.assert_allclose(last["acceleration_bias"][:2], ACCELEROMETER_BIAS[:2], atol=5e-3)
 
 
@@ -617,15 +634,16 @@ def test_a_slipping_foot(other_stands: bool):
         tilt = Rotation.from_matrix(x["rotation"]).as_rotvec()
         found.append([*x["base_velocity"], *tilt[:2]])
         told.append([*x["velocity_std"], *x["attitude_std"][:2]])
-        doubt.append(x["foot_innovation_variance"][0, 2])
+        doubt.append(x["foot_innovation_variance"][0, 2, 0])
     found, told = np.abs(found)[300:], np.array(told)[300:]
     assert (found <= NORMAL_99 * told).mean(axis=0).min() > 0.99
     # On one foot there is but the IMU, which drifts by its bias and the error of the tilt.
     assert found[:, 0].max() < (0.1 if other_stands else 0.2) * speed[0]
     assert np.rad2deg(found[:, 3:]).max() < 0.15
-    # The condition that the foot rests is given up, and believed again.
+    # The condition that the foot rests is given up, and believed again; what it did is remembered
+    # for a while.
     assert min(doubt[850:1000]) > 10 * doubt[790]
-    assert doubt[-1] < 1.1 * doubt[790]
+    assert doubt[-1] < 2 * doubt[790]
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
@@ -635,7 +653,7 @@ def test_what_a_standing_foot_does_is_learned(size: float):
     They were ten times smaller with a share of 0.3, if nothing were learned.
     """
     config, noise = InvariantFilter(), USUAL_SENSORS
-    generator, rig, squares = np.random.default_rng(11), Filter(config), []
+    generator, rig, squares, shares = np.random.default_rng(11), Filter(config), [], []
     keep = math.exp(-TICK / config.foot_time)
     J, motion = LEVEL["foot_jacobian"][:, :, 6:], np.zeros((2, 6))
     deviation = size * np.repeat([config.foot_rate, config.foot_velocity], 3)
@@ -653,10 +671,12 @@ def test_what_a_standing_foot_does_is_learned(size: float):
         )
         if k > 3000:
             z, S = x["foot_innovation"][:, 2:], x["foot_innovation_variance"][:, 2:]
-            squares.append((z**2).mean(axis=(0, 2)) / S.mean(axis=0))
+            squares.append((z**2 / S).mean(axis=(0, 2)))
+            shares.append(x["foot_restlessness"][:, 3].mean())
     assert np.all(np.abs(np.log(np.mean(squares, axis=0))) < math.log(3.0))
     # The one that the gyro shows as well.
-    assert x["foot_restlessness"][:, 3].mean() == pytest.approx(size**2, rel=0.6)
+    assert np.mean(shares) == pytest.approx(size**2, rel=0.6)
+    assert x["foot_habit"][:, 3].mean() == pytest.approx(size**2, rel=0.6)
 
 
 def joints_but_yaws(log: Log) -> np.ndarray:
@@ -824,7 +844,7 @@ def test_noise_of_foot_forces_is_learned(run: Run):
     nominal = np.median(learned_force_noise(walk), axis=0)
     quiet = learned_force_noise(part(run("paper_walk", "duration=3", noise=False), 2.0))
     np.testing.assert_allclose(noisy[1000:], 1.5, rtol=0.2)
-    np.testing.assert_allclose(nominal, rough_force_noise(walk), rtol=0.05)
+    np.testing.assert_allclose(nominal, rough_force_noise(walk), rtol=0.1)
     assert nominal.max() < math.hypot(0.5, 0.35)
     np.testing.assert_allclose(np.median(quiet, axis=0), 0.5, rtol=0.1)
 

@@ -32,7 +32,13 @@ from fbse_drake.estimators.force_delay import (
     forget_force_delay,
     watch_force_delay,
 )
-from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LARGEST_SHARE
+from fbse_drake.estimators.innovations import (
+    AGREEMENT,
+    AGREEMENT_TIME,
+    LARGEST_SHARE,
+    LOG_OF_ONE,
+    SMALLEST_SHARE,
+)
 from fbse_drake.estimators.records import as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
@@ -74,7 +80,6 @@ _ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = np.ara
 # What a standing foot tells.
 _FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-_OPPOSITE = (-1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
 _NONE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 # While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2], and how
 # long that lasts [s].
@@ -98,9 +103,14 @@ _FOOT_RATE_ERROR = 0.05
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
 _AT_REST, _WALKING_SPEED = 0.1, 0.03
-# How long it takes to learn what a standing foot does [s], and the least that it is taken to do, as
-# a share of the variance believed.
-_RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = 1.0, 0.01
+# How long it takes to learn what a standing foot does at present [s], by what it tells; how much of
+# that, and of larger innovations, one tick may tell; and the least that it is taken to do, as a
+# share of the variance believed.
+_RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = (0.1, 0.1, 0.03, 0.03), 1e-4
+_MOST_TOLD, _LARGEST_SURPRISE = 0.05, 100.0
+# For how long feet [s], and forces, must have erred less than believed to be trusted more, and the
+# least that they are taken to err, as a share of the variance believed.
+_HABIT_TIME, _FORCE_HABIT_TIME, _LEAST_HABIT = 1.0, 3.0, 0.01
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
@@ -111,7 +121,9 @@ _FIRM_LOAD = 0.5
 class InvariantFilter:
     """What the filter believes of the robot; what it believes of the sensors, see `SensorBeliefs`.
 
-    Errors that last are given by their size (standard deviation) and by how long they last.
+    Errors that last are given by their size (standard deviation) and by how long they last. Feet
+    and forces that show less than that are trusted more, up to ten times as much; the more, the
+    longer they do so.
     """
 
     # Do monitor and model hear what it knows?
@@ -215,6 +227,11 @@ def _propagate(P: np.ndarray, x: np.ndarray, gravity: Vector, T: float) -> None:
 
 
 @njit(cache=True)
+def _transposed(A: Rotation) -> Rotation:
+    return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
+
+
+@njit(cache=True)
 def _scaled(factor: float, A: Rotation) -> Rotation:
     return (
         factor * A[0],
@@ -233,6 +250,24 @@ def _scaled(factor: float, A: Rotation) -> Rotation:
 def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
     for i in range(start, start + 3):
         P[i, i] += variance
+
+
+@njit(cache=True)
+def _trusted(x: np.ndarray, foot: int, told: int, axis: int) -> float:
+    """Share of the variance believed of what a standing foot does that it is taken to do: what it
+    usually does, or does at present, and never more than is believed. (More shows as an error that
+    lasts.)"""
+    shown = max(x.foot_habit[foot, told, axis], x.foot_restlessness[foot, told, axis])
+    return min(1.0, max(_LEAST_HABIT, shown))
+
+
+@njit(cache=True)
+def _add_noise_along(P: np.ndarray, start: int, F: Rotation, density: np.ndarray, T: float) -> None:
+    """Adds random walks of these densities (3,) along the columns of F."""
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                P[start + i, start + j] += T * density[k] * F[3 * i + k] * F[3 * j + k]
 
 
 @njit(cache=True)
@@ -272,13 +307,22 @@ def _predict(
             P[i, j] += q * (G[i, 0] * G[j, 0] + G[i, 1] * G[j, 1] + G[i, 2] * G[j, 2])
     _add_noise(P, _GYRO_BIAS, config.gyro_walk**2 * T)
     _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
+    creep, turn, lasts = np.empty(3), np.empty(3), 2.0 * AGREEMENT_TIME
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            turned = _FEET + 6 * foot + 3
-            _add_noise(P, turned - 3, config.foot_creep**2 * T)
+            at, restless = _FEET + 6 * foot, x.foot_restlessness[foot]
+            # A foot that moves more than it does in spite of all does not stay.
+            moving, turning = lasts * config.foot_velocity**2, lasts * config.foot_rate**2
+            F = rotation_matrix(quaternion(x.foot_orientation[foot]))
             for i in range(3):
-                share = _unrest(v) if i == 2 else 1.0
-                P[turned + i, turned + i] += (share * config.foot_turning) ** 2 * T
+                creep[i] = _trusted(x, foot, _FOOT_POSITION, i) * config.foot_creep**2
+                creep[i] += max(0.0, restless[_FOOT_VELOCITY, i] - 1.0) * moving
+                turn[i] = _trusted(x, foot, _FOOT_ORIENTATION, i) * config.foot_turning**2
+                if i == 2:
+                    turn[i] *= _unrest(v) ** 2
+                turn[i] += max(0.0, restless[_FOOT_RATE, i] - 1.0) * turning
+            _add_noise_along(P, at, F, creep, T)
+            _add_noise_along(P, at + 3, F, turn, T)
     acceleration = add(rotate(rotation(x.rotation), f), gravity)
     put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
     put(x.imu_velocity, add(v, scale(T, acceleration)))
@@ -328,8 +372,8 @@ def _update(
     keep: float,
     agreement: np.ndarray,
     innovation: np.ndarray,
-    once: float,
-) -> float:
+    explained: np.ndarray,
+) -> None:
     """Kalman update with z = A error[first] + B error[second] + noise, in place.
 
     Innovations that agree with each other are no white noise, whatever P and the noise say: as
@@ -341,11 +385,8 @@ def _update(
         noise: covariance of z's noise, (3, 3).
         keep: what a tick leaves of the running mean of innovations `agreement` (3,).
         innovation: filled, (3,).
-        once: variance of the noise in one tick, mean over the axes. That of noise which lasts is
-            smaller than `noise`, which is white and leaves as much over many ticks.
-
-    Returns:
-        Variance of the innovation, mean over its axes, as widened.
+        explained: filled with the innovation's variance along each axis by the covariance, and by
+            an error that lasts, (2, 3).
     """
     n = len(P)
     PH, S = np.zeros((3, n)), noise.copy()
@@ -361,19 +402,22 @@ def _update(
         for j in range(3):
             for k in range(3):
                 S[i, j] += PH[i, first + k] * A[3 * j + k] + PH[i, second + k] * B[3 * j + k]
-    # Errors that last mostly point one way, so the sum over the axes counts, not their mean.
-    count, excess = (1.0 + keep) / (1.0 - keep), 0.0
+    # An error that lasts mostly points one way, so the sum over the axes counts; it makes all of
+    # them doubtful, and shows in that way.
+    count, excess, length = (1.0 + keep) / (1.0 - keep), 0.0, 1e-300
     for i in range(3):
         agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
         excess += count * agreement[i] ** 2 - AGREEMENT * S[i, i] / 3.0
+        length += agreement[i] ** 2
     W = _inverse(S)
     distance = dot(vector(innovation), rotate(W, vector(innovation)))
-    widening = max(0.0, excess)
+    lasting = max(0.0, excess)
+    widening = lasting
     if distance > _GATE:
         widening += (distance / _GATE - 1.0) * (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
-    stated = once + widening
     for i in range(3):
-        stated += (S[i, i] - noise[i, i]) / 3.0
+        explained[0, i] = S[i, i] - noise[i, i]
+        explained[1, i] = lasting * agreement[i] ** 2 / (length * count)
     if widening > 0.0:
         for i in range(3):
             S[i, i] += widening
@@ -389,7 +433,6 @@ def _update(
         correction[i] += a * e0 + b * e1 + c * e2
         for j in range(n):
             P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
-    return stated
 
 
 @njit(cache=True)
@@ -471,6 +514,15 @@ def _isotropic(variance: float) -> np.ndarray:
 
 
 @njit(cache=True)
+def _diagonal(x: np.ndarray, foot: int, told: int, variance: float, sensed: float) -> np.ndarray:
+    """Diagonal matrix of a variance believed, as far as the foot is not trusted, and a rest."""
+    S = np.zeros((3, 3))
+    for i in range(3):
+        S[i, i] = _trusted(x, foot, told, i) * variance + sensed
+    return S
+
+
+@njit(cache=True)
 def _listen_to_foot(
     x: np.ndarray,
     P: np.ndarray,
@@ -505,17 +557,21 @@ def _listen_to_foot(
     gyro = sensors.angular_velocity_noise**2
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
-    variance, restless = x.foot_innovation_variance[foot], x.foot_restlessness[foot]
+    explained = np.empty((2, 3))
+    # All in axes of the sole.
+    R_FW = _transposed(rotation_matrix(quaternion(x.foot_orientation[foot])))
+    opposite = _scaled(-1.0, R_FW)
     is_flat = known.is_flat[foot] > 0
+    x.foot_age[foot] += elapsed
 
     own, sensed = light * config.foot_position**2, moving * angle
-    z = subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p))
-    noise = _isotropic(own * lasting + sensed)
-    variance[_FOOT_POSITION] = _update(
-        P, correction, z, start, _IDENTITY, _POSITION, _OPPOSITE, noise, keep,
-        agreement[_FOOT_POSITION], innovation[_FOOT_POSITION],
-        restless[_FOOT_POSITION] * own + sensed,
+    z = rotate(R_FW, subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p)))
+    noise = _diagonal(x, foot, _FOOT_POSITION, own * lasting, sensed)
+    _update(
+        P, correction, z, start, R_FW, _POSITION, opposite, noise, keep,
+        agreement[_FOOT_POSITION], innovation[_FOOT_POSITION], explained,
     )  # fmt: skip
+    _learn_motion(x, foot, _FOOT_POSITION, own, sensed, explained, elapsed)
 
     if is_flat:
         own, sensed = light * config.foot_orientation**2, turning * angle
@@ -524,13 +580,13 @@ def _listen_to_foot(
         z = rotation_vector(
             quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot])))
         )
-        noise = _isotropic(own * lasting + sensed)
-        noise[2, 2] += held * own * lasting
-        variance[_FOOT_ORIENTATION] = _update(
-            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _OPPOSITE, noise, keep,
-            agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION],
-            restless[_FOOT_ORIENTATION] * own + sensed,
+        noise = _diagonal(x, foot, _FOOT_ORIENTATION, own * lasting, sensed)
+        noise[2, 2] += held * _trusted(x, foot, _FOOT_ORIENTATION, 2) * own * lasting
+        _update(
+            P, correction, rotate(R_FW, z), start + 3, R_FW, _ATTITUDE, opposite, noise,
+            keep, agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION], explained,
         )  # fmt: skip
+        _learn_motion(x, foot, _FOOT_ORIENTATION, own, sensed, explained, elapsed)
 
     w_F, v_F = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for j in range(6, J.shape[1]):
@@ -540,14 +596,15 @@ def _listen_to_foot(
     w = subtract(w_raw, vector(x.gyro_bias_B))
     own = light * config.foot_velocity**2
     sensed = moving * rate + dot(p_IF, p_IF) * gyro
-    z = subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v)
-    noise = _isotropic(own * lasting + sensed)
-    variance[_FOOT_VELOCITY] = _update(
-        P, correction, z, _VELOCITY, _IDENTITY, _GYRO_BIAS, matrix_product(R, skew(p_IF)), noise,
-        keep, agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY],
-        restless[_FOOT_VELOCITY] * own + sensed,
+    z = rotate(R_FW, subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v))
+    of_bias = matrix_product(R_FW, matrix_product(R, skew(p_IF)))
+    noise = _diagonal(x, foot, _FOOT_VELOCITY, own * lasting, sensed)
+    _update(
+        P, correction, z, _VELOCITY, R_FW, _GYRO_BIAS, of_bias, noise, keep,
+        agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY], explained,
     )  # fmt: skip
-    possible = max(1.0, restless[_FOOT_VELOCITY]) * own
+    _learn_motion(x, foot, _FOOT_VELOCITY, own, sensed, explained, elapsed)
+    possible = max(1.0, x.foot_habit[foot, _FOOT_VELOCITY].mean()) * own
     for i in range(3):
         possible += P[_VELOCITY + i, _VELOCITY + i] / 3.0
     mean = vector(agreement[_FOOT_VELOCITY])
@@ -555,20 +612,14 @@ def _listen_to_foot(
 
     if is_flat:
         own, sensed = light * config.foot_rate**2, turning * rate + gyro
-        z = add(w, w_BF)
-        noise = _isotropic(own * lasting + sensed)
-        noise[2, 2] += held * own * lasting
-        variance[_FOOT_RATE] = _update(
-            P, correction, z, _GYRO_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise, keep,
-            agreement[_FOOT_RATE], innovation[_FOOT_RATE],
-            restless[_FOOT_RATE] * own + sensed,
+        z = rotate_back(R_BF, add(w, w_BF))
+        noise = _diagonal(x, foot, _FOOT_RATE, own * lasting, sensed)
+        noise[2, 2] += held * _trusted(x, foot, _FOOT_RATE, 2) * own * lasting
+        _update(
+            P, correction, z, _GYRO_BIAS, _transposed(R_BF), _GYRO_BIAS, _NONE, noise, keep,
+            agreement[_FOOT_RATE], innovation[_FOOT_RATE], explained,
         )  # fmt: skip
-    for told in range(_TOLD):
-        if is_flat or told in (_FOOT_POSITION, _FOOT_VELOCITY):
-            restless[told] = _learned_restlessness(
-                restless[told], vector(innovation[told]), variance[told], elapsed
-            )
-
+        _learn_motion(x, foot, _FOOT_RATE, own, sensed, explained, elapsed)
     if is_flat and config.level_ground > 0.0:
         # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
         n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
@@ -578,27 +629,43 @@ def _listen_to_foot(
         z = cross(n, (0.0, 0.0, 1.0))
         _update(
             P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare,
-            spare.copy(), 0.0,
+            spare.copy(), np.empty((2, 3)),
         )  # fmt: skip
     return moves
 
 
 @njit(cache=True)
-def _learned_restlessness(
-    restless: float, innovation: Vector, variance: float, elapsed: float
-) -> float:
+def _learn_motion(
+    x: np.ndarray,
+    foot: int,
+    told: int,
+    own: float,
+    sensed: float,
+    explained: np.ndarray,
+    elapsed: float,
+) -> None:
     """A standing foot may do less than is believed, or more, and its innovations show it.
 
-    They are stated as large as they are. It is trusted as before: what it did not do for some time
-    it does when it leaves the ground.
+    They are stated as large as they have just been.
 
     Args:
-        restless: the share of the variance believed that it showed until now.
-        variance: of each of the innovation's axes.
+        told: what the innovation is of.
+        own, sensed: variance believed of what the foot does there, and of what sensors add.
+        explained: see `_update`.
     """
-    share = min(LARGEST_SHARE, dot(innovation, innovation) / (3.0 * variance))
-    learned = restless * (1.0 + (1.0 - math.exp(-elapsed / _RESTLESSNESS_TIME)) * (share - 1.0))
-    return max(_LEAST_RESTLESSNESS, learned)
+    innovation, variance = x.foot_innovation[foot, told], x.foot_innovation_variance[foot, told]
+    restless, habit = x.foot_restlessness[foot, told], x.foot_habit[foot, told]
+    fast = min(_MOST_TOLD, 1.0 - math.exp(-elapsed / _RESTLESSNESS_TIME[told]))
+    slow = elapsed / min(_HABIT_TIME, x.foot_age[foot])
+    for i in range(3):
+        square = innovation[i] * innovation[i]
+        known = explained[0, i] + sensed
+        variance[i] = known + explained[1, i] + restless[i] * own
+        surprise = min(_LARGEST_SURPRISE, square / variance[i])
+        learned = restless[i] * (1.0 + fast * (surprise - 1.0))
+        restless[i] = max(_LEAST_RESTLESSNESS, learned)
+        shown = min(LARGEST_SHARE, square / (known + habit[i] * own))
+        habit[i] = max(_LEAST_HABIT, habit[i] * (1.0 + slow * (shown - 1.0)))
 
 
 @njit(cache=True)
@@ -622,6 +689,7 @@ def _listen_to_forces(
     w: Vector,
     away: Vector,
     away_before: Vector,
+    model: np.ndarray,
     elapsed: float,
     known: np.ndarray,
 ) -> None:
@@ -639,15 +707,52 @@ def _listen_to_forces(
     f = subtract(f_raw, vector(x.accelerometer_bias_B))
     z = subtract(add(f, relative), scale(1.0 / known.mass, force))
     lasting = max(1.0, 2.0 * config.force_time / elapsed)
-    noise = _isotropic(config.force_error**2 * lasting)
+    sensed = _acceleration_noise(model, elapsed, known)
+    own, noise, once = np.empty(3), np.zeros((3, 3)), np.empty(3)
+    explained = np.empty((2, 3))
     for i in range(3):
         for j in range(3):
-            noise[i, j] += config.force_gain_error**2 * lasting * f_raw[i] * f_raw[j]
-    once = (noise[0, 0] + noise[1, 1] + noise[2, 2]) / (3.0 * lasting)
-    x.force_innovation_variance = _update(
+            noise[i, j] = config.force_gain_error**2 * lasting * f_raw[i] * f_raw[j]
+        own[i] = x.force_habit[i] * config.force_error**2
+        once[i] = own[i] + noise[i, i] / lasting + sensed[i]
+        noise[i, i] += own[i] * lasting + sensed[i]
+    _update(
         P, correction, z, _ACCELEROMETER_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise,
-        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation, once,
+        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation, explained,
     )  # fmt: skip
+    x.force_innovation_variance[:] = once + explained[0] + explained[1]
+    # What lasts shows in the mean over that time, once there is one.
+    x.force_age += elapsed
+    if x.force_age < config.force_time:
+        return
+    gain = elapsed / min(_FORCE_HABIT_TIME, x.force_age)
+    filled = 1.0 - math.exp(-x.force_age / config.force_time)
+    for i in range(3):
+        gained, at = (config.force_gain_error * f_raw[i]) ** 2, _ACCELEROMETER_BIAS + i
+        by_habit = 0.5 * (own[i] + gained) + P[at, at]
+        shown = max(SMALLEST_SHARE, (x.force_agreement[i] / filled) ** 2 / by_habit)
+        told = math.log(min(shown, LARGEST_SHARE)) - LOG_OF_ONE
+        learned = x.force_habit[i] * math.exp(gain * own[i] / (own[i] + gained) * told)
+        x.force_habit[i] = min(1.0, max(_LEAST_HABIT, learned))
+
+
+@njit(cache=True)
+def _acceleration_noise(model: np.ndarray, elapsed: float, known: np.ndarray) -> np.ndarray:
+    """Variance of what the sensors' noise adds to the acceleration of the centre of mass by them,
+    less that by the foot forces, (3,)."""
+    sensors = known.sensors
+    rate = 2.0 * (sensors.joint_velocity_noise / elapsed) ** 2
+    turning = 2.0 * (sensors.angular_velocity_noise / elapsed) ** 2
+    arm = subtract(vector(model.com), vector(known.mount.p_BI))
+    variance = np.empty(3)
+    for i in range(3):
+        moved = 0.0
+        for joint in range(len(model.mass_matrix)):
+            moved += (model.mass_matrix[joint, 3 + i] / known.mass) ** 2
+        turned = dot(arm, arm) - arm[i] ** 2
+        variance[i] = rate * moved + turning * turned + sensors.acceleration_noise**2
+        variance[i] += known.force_variance / known.mass**2
+    return variance
 
 
 @njit(cache=True)
@@ -659,6 +764,9 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
     f = rotate(R_BI, vector(measured.specific_force))
     _turn(x, quaternion_from_gravity(f, 0.0))
     x.foot_restlessness[:] = 1.0
+    x.foot_habit[:] = 1.0
+    x.foot_age[:] = known.config.foot_time
+    x.force_habit[:] = 1.0
     R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
     for foot in range(feet):
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
@@ -680,7 +788,7 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
     noise = _isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
     _update(
         P, correction, z, _ATTITUDE, skew(reading), _ACCELEROMETER_BIAS, R, noise, 0.0, spare,
-        spare.copy(), 0.0,
+        spare.copy(), np.empty((2, 3)),
     )  # fmt: skip
     _correct(x, correction)
 
@@ -794,7 +902,7 @@ def _estimate_base(
             x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
-        _listen_to_forces(x, P, correction, force, f_mean, w, away, before, elapsed, known)
+        _listen_to_forces(x, P, correction, force, f_mean, w, away, before, model, elapsed, known)
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     _correct(x, correction)
@@ -979,13 +1087,17 @@ class InvariantBaseFilter(RecursiveEstimator):
         error_covariance       (n, n)  of the errors [attitude, velocity, position, gyro bias,
                                        accelerometer bias, (position, orientation) of each foot] on
                                        the group, n = 15 + 6 feet
-        foot_innovation, foot_innovation_variance   (feet, 4, 3), (feet, 4)  of a standing foot's
-                                       position, orientation, velocity and angular velocity; the
-                                       variance is the mean over the axes
-        force_innovation, force_innovation_variance   (3,), ()  of the centre of mass's acceleration
+        foot_innovation, foot_innovation_variance   (feet, 4, 3)  of a standing foot's position,
+                                       orientation, velocity and angular velocity, in axes of the
+                                       sole
+        force_innovation, force_innovation_variance   (3,)  of the centre of mass's acceleration, in
+                                       base axes
         foot_agreement, force_agreement   running means of the innovations
-        foot_restlessness  (feet, 4)   of what a standing foot may do, in these four, how much it
-                                       does, as a share of the variance
+        foot_restlessness, foot_habit  (feet, 4, 3)  of what a standing foot may do, in these four,
+                                       how much it does at present and usually, as a share of the
+                                       variance
+        force_habit            (3,)    the same of the forces' error
+        foot_age, force_age    (feet,), ()  for how long each has been listened to [s]
         check                  what `cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
                                feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
                                50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
@@ -1029,6 +1141,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             mount=record(**vars(ImuMount(robot))),
             pads=record(position=pads.position, foot=pads.foot),
             is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
+            force_variance=sensors.force_noise**2 * len(pads.foot),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
             gravity=plant.gravity_field().gravity_vector(),
             start=record(tilt=0.2, velocity=0.1, acceleration=0.05),
@@ -1098,14 +1211,18 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         **dict.fromkeys(triples, (3,)),
         zmp=(2,),
         away_known=(),
-        force_innovation_variance=(),
+        force_innovation_variance=(3,),
+        force_habit=(3,),
+        force_age=(),
         foot_standing=(feet,),
         foot_position=(feet, 3),
         foot_orientation=(feet, 4),
         foot_agreement=(feet, _TOLD, 3),
-        foot_restlessness=(feet, _TOLD),
+        foot_restlessness=(feet, _TOLD, 3),
+        foot_habit=(feet, _TOLD, 3),
+        foot_age=(feet,),
         foot_innovation=(feet, _TOLD, 3),
-        foot_innovation_variance=(feet, _TOLD),
+        foot_innovation_variance=(feet, _TOLD, 3),
         error_covariance=(n, n),
         kept_biases=(2, 2, 3),
         kept_for=(),

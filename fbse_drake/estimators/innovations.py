@@ -15,10 +15,10 @@ AGREEMENT_TIME, AGREEMENT = 0.02, 3.0
 # tick may tell, as a share of the variance.
 NOISE_TIME, LARGEST_SHARE = 0.3, 9.0
 # The same where a tick tells of several numbers; and the least that it may tell.
-_SEVERAL_TIME, _SMALLEST_SHARE = 0.1, 1e-3
+_SEVERAL_TIME, SMALLEST_SHARE = 0.1, 1e-3
 # Means of the logarithm of a mean square of so many normal numbers of variance one: psi(k / 2) -
 # log(k / 2) with the digamma function psi.
-LOG_OF_THREE, LOG_OF_SIX = -0.3690, -0.1758
+LOG_OF_ONE, LOG_OF_THREE, LOG_OF_SIX = -1.2704, -0.3690, -0.1758
 
 
 @njit(cache=True)
@@ -34,5 +34,5 @@ def learned_noise(noise: float, share: float, mean_log: float, elapsed: float) -
         mean_log: of how many numbers the mean is, see `LOG_OF_SIX`.
         elapsed: of the tick [s].
     """
-    told = math.log(min(max(share, _SMALLEST_SHARE), LARGEST_SHARE)) - mean_log
+    told = math.log(min(max(share, SMALLEST_SHARE), LARGEST_SHARE)) - mean_log
     return max(1.0, noise * math.exp((1.0 - math.exp(-elapsed / _SEVERAL_TIME)) * told))

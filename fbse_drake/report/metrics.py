@@ -287,22 +287,31 @@ def normalised_innovations(log: Log) -> dict[str, dict[str, np.ndarray]]:
     """
     result = {}
     for name in ("attitude", "base_state", "joint_acceleration", "friction"):
-        of_feet = f"estimate/{name}/foot_innovation" in log
-        innovation_name = f"estimate/{name}/{'foot_' * of_feet}innovation"
-        channels = (innovation_name, f"{innovation_name}_variance")
-        if not all(channel in log for channel in channels):
-            continue
-        innovation, variance = (log[channel] for channel in channels)
-        components = innovation.shape[1]
-        # Components of one measurement may share a variance.
-        variance = np.repeat(variance, components // variance.shape[1], axis=1)
-        updated = (variance > 0) & (innovation != 0)
-        updated[1:] &= (innovation[1:] != innovation[:-1]) | (variance[1:] != variance[:-1])
-        squares = np.full(innovation.shape, math.nan)
-        np.divide(innovation**2, variance, out=squares, where=updated)
-        parts = _measurement_parts(log, name, components)
-        result[name] = dict(zip(parts, np.split(squares, len(parts), axis=1), strict=True))
+        parts: dict[str, np.ndarray] = {}
+        for source in ("", "foot_", "force_"):
+            squares = _normalised_squares(log, f"estimate/{name}/{source}innovation")
+            if squares is not None:
+                components = squares.shape[1]
+                is_force = source == "force_"
+                names = ["forces"] if is_force else _measurement_parts(log, name, components)
+                parts |= dict(zip(names, np.split(squares, len(names), axis=1), strict=True))
+        if parts:
+            result[name] = parts
     return result
+
+
+def _normalised_squares(log: Log, channel: str) -> np.ndarray | None:
+    """Of an innovation (N, components), see `normalised_innovations`; None without it."""
+    channels = (channel, f"{channel}_variance")
+    if not all(name in log for name in channels):
+        return None
+    innovation, variance = (log[name] for name in channels)
+    # Components of one measurement may share a variance.
+    variance = np.repeat(variance, innovation.shape[1] // variance.shape[1], axis=1)
+    updated = (variance > 0) & (innovation != 0)
+    updated[1:] &= (innovation[1:] != innovation[:-1]) | (variance[1:] != variance[:-1])
+    squares = np.full(innovation.shape, math.nan)
+    return np.divide(innovation**2, variance, out=squares, where=updated)
 
 
 def consistency(log: Log) -> dict[str, dict[str, Consistency]]:
