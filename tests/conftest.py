@@ -4,7 +4,7 @@ import ctypes
 import dataclasses
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from hashlib import sha256
 
@@ -26,11 +26,12 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def memory_is_given_back() -> Iterator[None]:
-    """What a file's tests have freed is not kept for the next one's, where the C library can."""
-    yield
-    gc.collect()
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """What a test has freed is not kept for the next one, where the C library can give it back;
+    nor what a file's tests have left in circles."""
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
 
