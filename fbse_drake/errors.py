@@ -34,6 +34,18 @@ def require_positive(config: object, *names: str) -> None:
             raise InputError(f"{name}: expected a number > 0, found {value:g}")
 
 
+def required(value: float | None, name: str) -> float:
+    """A number that a configuration may leave open, which is known by now: a `Scenario` gives its
+    parts the periods that they have not.
+
+    Raises:
+        InputError: it is still open.
+    """
+    if value is None:
+        raise InputError(f"{name}: expected a number, as nothing else gives one")
+    return value
+
+
 def require_not_negative(config: object, *names: str) -> None:
     """Refuses a configuration in which one of these numbers is < 0."""
     for name in names:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fbse_drake.errors import InputError, located
+from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Estimator, make_estimator
 from fbse_drake.estimators.recursive import start_share
@@ -117,7 +117,8 @@ def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.n
 
     A log that is slower than the control has only samples of what changed in between.
     """
-    share = start_share(float(log.meta["period"]), scenario.control.period)
+    period = required(scenario.control.period, "control.period")
+    share = start_share(float(log.meta["period"]), period)
     after = np.concatenate([torque[1:], torque[-1:]])
     return torque + share * (after - torque)
 

@@ -125,3 +125,9 @@ def test_joint_torque_sensors_read_what_reaches_the_links():
     log = simulate(scenario("paper_walk", "duration=0.3", "sensors.joint_torque={noise: 0.0}")).log
     expected = (log["joint/torque_command"] - log["truth/joint/friction_torque"])[:-1]
     np.testing.assert_allclose(log["joint/torque_measured"][1:], expected, atol=1e-12)
+
+
+def test_a_sensor_of_ones_own_diagram_needs_a_period():
+    """A scenario would give it one."""
+    with pytest.raises(InputError, match="period: expected a number"):
+        Encoders(EncoderConfig(), joints=2, seed=0, duration=1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from fbse_drake.errors import InputError, require_positive
+from fbse_drake.errors import InputError, require_positive, required
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.sampling import is_tick
 from fbse_drake.wiring import weakly
@@ -115,7 +115,7 @@ class PositionLoop(LeafSystem):
         """
         super().__init__()
         n = len(names.joint_names)
-        self._period = config.period
+        self._period = required(config.period, "control.period")
         self._kp = names.per_joint(config.kp, key="control.kp")
         self._kd = names.per_joint(config.kd, key="control.kd")
         limit = names.per_joint(config.torque_limit, key="control.torque_limit")
@@ -135,9 +135,9 @@ class PositionLoop(LeafSystem):
         self.torque_command = self.DeclareVectorOutputPort(
             "torque_command", n, weakly(self._calc), sources
         )
-        self._holds = time_step < config.period
+        self._holds = time_step < self._period
         if self._holds:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._hold))
+            self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, weakly(self._hold))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         if self._holds and not is_tick(context.get_time(), self._period):

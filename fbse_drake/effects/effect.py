@@ -45,6 +45,8 @@ _AT_PRISMATIC_JOINT = {
     "kg m^2": ("kg", -2),
 }
 
+E = TypeVar("E", bound="Effect")
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -156,7 +158,9 @@ class Effect(ABC):
         return np.array([p.bounds[0] for p in cls.parameters.values() if p.linear])
 
     @classmethod
-    def from_values(cls, targets: Sequence[str], values: Mapping[str, Sequence[float]]) -> "Effect":
+    def from_values(
+        cls: type[E], targets: Sequence[str], values: Mapping[str, Sequence[float] | np.ndarray]
+    ) -> E:
         """The effect with these values of each parameter, target by target; other parameters and
         targets keep their defaults.
 

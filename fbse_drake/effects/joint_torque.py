@@ -221,10 +221,11 @@ def basis_over_time(
     names = ("velocity", "position", "command", "time")
     columns = [np.broadcast_to(getattr(motion, name), (samples, n)) for name in names]
     result: list[list[np.ndarray]] = []
-    for step in zip(*columns, strict=True):
+    for velocity, position, command, time in zip(*columns, strict=True):
+        step = JointMotion(velocity, position, command, time, motion.time_step)
         if memory is None:
-            memory = effect.start(JointMotion(*step, motion.time_step), nonlinear)
-        now = JointMotion(*step, motion.time_step, memory)
+            memory = effect.start(step, nonlinear)
+        now = step._replace(memory=memory)
         basis, _ = effect.basis(now, nonlinear)
         result.append([np.broadcast_to(b, (*sets, n)) for b in basis])
         memory = effect.advance(now, nonlinear)

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields, replace
 
-from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
@@ -88,7 +88,9 @@ def beliefs_of(
     """What a scenario says of its robot's sensors; a noise of zero becomes a small one."""
     angle = encoders.angle_noise
     differenced = encoders.velocity == "differenced"
-    rate = math.sqrt(2.0) * angle / encoders.period if differenced else encoders.velocity_noise
+    rate = encoders.velocity_noise
+    if differenced:
+        rate = math.sqrt(2.0) * angle / required(encoders.period, "period")
     stated = {
         "joint_position_noise": angle,
         "joint_velocity_noise": rate,

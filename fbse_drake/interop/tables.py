@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from io import TextIOWrapper
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
@@ -147,13 +148,16 @@ def _open_csv(path: Path) -> Table:
         widths = _widths(path, delimiter, headless=headless, indices=indices)
         line, size = 1 if headless else 2, path.stat().st_size
         rows = Growing((sum(widths.values()),), float)
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with (
+            path.open("rb") as raw,
+            TextIOWrapper(raw, encoding="utf-8-sig", newline="") as file,
+        ):
             if not headless:
                 file.readline()
             while lines := list(islice(file, _CHUNK)):
                 rows.extend(_csv_rows(lines, line, delimiter, fields=names, widths=widths))
                 line += len(lines)
-                progress(f"reading {path.name}: {min(1.0, file.buffer.tell() / size):.0%}")
+                progress(f"reading {path.name}: {min(1.0, raw.tell() / size):.0%}")
         ends = np.cumsum(list(widths.values()))[:-1]
         columns = np.split(rows.rows(), ends, axis=1)
         return {

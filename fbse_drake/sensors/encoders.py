@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Adder
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import InputError, require_not_negative, require_positive, required
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
@@ -154,7 +154,8 @@ class EncoderReadings(LeafSystem):
             "measured_joint_state", 2 * joints, weakly(self._calc), sources
         )
         if config.velocity == "differenced":
-            self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._remember))
+            period = required(config.period, "period")
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         config, n, measured = self._config, self._n, output.get_mutable_value()
@@ -191,10 +192,9 @@ class Encoders(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         scale = np.repeat([config.noise, config.velocity_noise], joints)
-        noise = scale * white_noise(
-            seed, "encoders", ticks_until(duration, config.period), 2 * joints
-        )
-        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        period = required(config.period, "period")
+        noise = scale * white_noise(seed, "encoders", ticks_until(duration, period), 2 * joints)
+        errors = builder.AddNamedSystem("errors", held_signal(noise, period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, 2 * joints))
         readings = builder.AddNamedSystem("readings", EncoderReadings(config, joints))
         builder.Connect(errors.get_output_port(), noisy.get_input_port(1))

@@ -25,7 +25,7 @@ from pydrake.systems.primitives import (
 )
 from scipy.linalg import block_diag
 
-from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
@@ -243,10 +243,9 @@ class FootForceSensors(Diagram):
         )
         size = len(is_force)
         deviation = np.where(is_force, config.noise, config.moment_noise)
-        noise = deviation * white_noise(
-            seed, "foot force", ticks_until(duration, config.period), size
-        )
-        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        period = required(config.period, "period")
+        noise = deviation * white_noise(seed, "foot force", ticks_until(duration, period), size)
+        errors = builder.AddNamedSystem("errors", held_signal(noise, period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, size))
         limit = np.where(is_force, config.range, np.inf)
         measured = builder.AddNamedSystem("measured", Saturation(-limit, limit))

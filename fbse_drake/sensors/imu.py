@@ -11,7 +11,7 @@ from pydrake.systems.sensors import Accelerometer, Gyroscope
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import InputError, require_not_negative, require_positive, required
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
@@ -71,11 +71,12 @@ class ImuConfig(Sensor):
 def imu_errors(config: ImuConfig, seed: int, duration: float) -> np.ndarray:
     """What is added to the ideal signals at each tick, shape (ticks, 6) [m/s^2, rad/s]: bias, its
     random walk, white noise."""
-    ticks = ticks_until(duration, config.period)
+    period = required(config.period, "period")
+    ticks = ticks_until(duration, period)
     noise = np.repeat([config.acceleration_noise, config.angular_velocity_noise], 3)
     walk = np.repeat(
         [config.acceleration_bias_walk, config.angular_velocity_bias_walk], 3
-    ) * np.sqrt(config.period)
+    ) * np.sqrt(period)
     drift = np.cumsum(white_noise(seed, "imu bias", ticks, 6), axis=0)
     bias = np.concatenate([config.acceleration_bias, config.angular_velocity_bias])
     return bias + walk * drift + noise * white_noise(seed, "imu", ticks, 6)
@@ -113,8 +114,9 @@ class Imu(Diagram):
         accelerometer = builder.AddNamedSystem("accelerometer", Accelerometer(body, X_BI, gravity))
         gyroscope = builder.AddNamedSystem("gyroscope", Gyroscope(body, X_BI))
         ideal = builder.AddNamedSystem("ideal", Multiplexer([3, 3]))
+        period = required(config.period, "period")
         errors = builder.AddNamedSystem(
-            "errors", held_signal(imu_errors(config, seed, duration), config.period)
+            "errors", held_signal(imu_errors(config, seed, duration), period)
         )
         measured = builder.AddNamedSystem("measured", Adder(2, 6))
         builder.Connect(accelerometer.get_output_port(), ideal.get_input_port(0))

@@ -29,7 +29,7 @@ from pydrake.systems.framework import (
     State,
 )
 
-from fbse_drake.errors import InputError, require_not_negative, require_positive
+from fbse_drake.errors import InputError, require_not_negative, require_positive, required
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.encoders import quantize
@@ -136,7 +136,8 @@ class WindingThermometers(LeafSystem):
     def __init__(self, config: JointTemperature, heat: WindingHeat):
         super().__init__()
         n = len(heat.resistance)
-        self._heat, self._period, self._resolution = heat, config.period, config.resolution
+        self._heat, self._resolution = heat, config.resolution
+        self._period = required(config.period, "period")
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
         self._torque_loss = self.DeclareVectorInputPort("torque_loss", n)
@@ -144,7 +145,7 @@ class WindingThermometers(LeafSystem):
         self._temperature = self.DeclareDiscreteState(np.full(n, config.start))
         sources = {self.input_port_ticket(self._error.get_index()), self.xd_ticket()}
         self.DeclareVectorOutputPort("measured_temperature", n, weakly(self._calc), sources)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period, 0.0, weakly(self._warm_up))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, weakly(self._warm_up))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         temperature = context.get_discrete_state(self._temperature).value()
@@ -178,10 +179,11 @@ class JointTemperatureSensors(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         thermometers = builder.AddNamedSystem("thermometers", WindingThermometers(config, heat))
-        ticks = ticks_until(run.duration, config.period)
+        period = required(config.period, "period")
+        ticks = ticks_until(run.duration, period)
         size = len(heat.resistance)
         noise = config.noise * white_noise(run.seed, "joint temperature", ticks, size)
-        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        errors = builder.AddNamedSystem("errors", held_signal(noise, period))
         builder.Connect(errors.get_output_port(), thermometers.GetInputPort("error"))
         for name in ("joint_state", "torque_command", "torque_loss"):
             builder.ExportInput(thermometers.GetInputPort(name), name)

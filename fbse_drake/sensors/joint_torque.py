@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Adder
 
-from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.errors import held_signal, ticks_until, white_noise
 from fbse_drake.sensors.sensor import Run, Sensor, in_library
@@ -104,10 +104,11 @@ class JointTorqueSensors(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         true = builder.AddNamedSystem("true", TransmittedTorque(joints, time_step))
+        period = required(config.period, "period")
         noise = config.noise * white_noise(
-            seed, "joint torque", ticks_until(duration, config.period), joints
+            seed, "joint torque", ticks_until(duration, period), joints
         )
-        errors = builder.AddNamedSystem("errors", held_signal(noise, config.period))
+        errors = builder.AddNamedSystem("errors", held_signal(noise, period))
         noisy = builder.AddNamedSystem("noisy", Adder(2, joints))
         builder.Connect(true.get_output_port(), noisy.get_input_port(0))
         builder.Connect(errors.get_output_port(), noisy.get_input_port(1))
