@@ -33,9 +33,12 @@ _CORNERS = {
 # As few pieces are taken as let the simulated torque be off by this share of its rms, or by so many
 # times what the most would leave.
 _DEVIATION, _OF_THE_LEAST = 4e-3, 2.0
-# Rows of the planned motion that this is judged by. A joint that is to stand still carries anything
-# that its friction holds, and creeps at these shares of the speed at which its law levels off.
-_ROWS, _CREEP = 2000, np.arctanh(np.linspace(-0.95, 0.95, 39))
+# Rows of the planned motion that this is judged by.
+_ROWS = 2000
+# A joint that stands still, or moves at less than so many times the speed at which its law levels
+# off (root mean square), is on the steep part for long, and what moves it there nobody has planned:
+# it gets so many pieces.
+_SLOW, _SLOW_PIECES = 5.0, 5
 # Pieces for one direction alone are left out below this share of those for both.
 _ONE_SIDED = 0.01
 # Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
@@ -213,19 +216,25 @@ def _clamps(law: Law, rise: Rise, planned: JointMotion) -> np.ndarray:
 
         speeds, sharp = at_joint(rise.speeds), at_joint(rise.corners)
         speeds = speeds[np.isfinite(speeds)]
-        choice = [_joint_clamps(of_joint, speeds, sharp, *pieces) for pieces in _CORNERS.values()]
-        if len(speeds) == 0:
-            columns.append(choice[0])
-            continue
+        choice = {
+            pieces: _joint_clamps(of_joint, speeds, sharp, *corners)
+            for pieces, corners in _CORNERS.items()
+        }
         true, guess = velocity[:, j], expected[:, j]
-        if np.abs(true).max() < speeds.min():
-            true, guess = speeds.min() * _CREEP, np.zeros_like(_CREEP)
-        torque, guessed = of_joint(true), of_joint(guess)
-        errors = np.array(
-            [_rms(torque - _sum(clamps, true) - guessed + _sum(clamps, guess)) for clamps in choice]
-        )
-        allowed = max(_DEVIATION * _rms(torque), _OF_THE_LEAST * errors[-1])
-        columns.append(choice[int(np.argmax(errors <= allowed))])
+        if len(speeds) == 0:
+            pieces = 1
+        elif _rms(true) < _SLOW * speeds.min():
+            pieces = _SLOW_PIECES
+        else:
+            off_by = of_joint(true) - of_joint(guess)
+            errors = {
+                pieces: _rms(off_by - _sum(clamps, true) + _sum(clamps, guess))
+                for pieces, clamps in choice.items()
+            }
+            least = errors[max(errors)]
+            allowed = max(_DEVIATION * _rms(of_joint(true)), _OF_THE_LEAST * least)
+            pieces = next(pieces for pieces, error in errors.items() if error <= allowed)
+        columns.append(choice[pieces])
     clamps = np.zeros((3, max(map(len, columns)), n))
     for j, column in enumerate(columns):
         clamps[:, : len(column), j] = np.reshape(column, (-1, 3)).T
