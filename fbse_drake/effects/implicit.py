@@ -23,30 +23,20 @@ from fbse_drake.robot.implicit import ImplicitTorque
 # where they reach 1.
 _CORNERS = {
     1: (0.1869, (1.2299,)),
-    2: (0.0582, (0.6163, 1.7832)),
     3: (0.0281, (0.4193, 1.0119, 2.1387)),
-    4: (0.0166, (0.3191, 0.7305, 1.2897, 2.4007)),
-    5: (0.0109, (0.2579, 0.5767, 0.9617, 1.5050, 2.6082)),
-    6: (0.0077, (0.2165, 0.4781, 0.7761, 1.1468, 1.6812, 2.7800)),
     7: (0.0058, (0.1866, 0.4090, 0.6539, 0.9394, 1.3015, 1.8305, 2.9266)),
 }
-# As few pieces are taken as let the simulated torque be off by this share of its rms, or by so many
-# times what the most would leave.
-_DEVIATION, _OF_THE_LEAST = 4e-3, 2.0
-# Rows of the planned motion that this is judged by.
-_ROWS = 2000
+# Pieces of a joint that moves: it passes the steep part of its law in a step or two. Where the law
+# falls beyond by more than a single piece is off, more would not show.
+_PIECES, _FALLING_PIECES = 3, 1
 # A joint that stands still, or moves at less than so many times the speed at which its law levels
-# off (root mean square), is on the steep part for long, and what moves it there nobody has planned:
-# it gets so many pieces.
-_SLOW, _SLOW_PIECES = 5.0, 5
+# off (root mean square), is on the steep part for long: so many pieces.
+_SLOW, _SLOW_PIECES = 5.0, 7
 # Pieces for one direction alone are left out below this share of those for both.
 _ONE_SIDED = 0.01
 # Parts of the largest size that an effect has in the planned motion; those in reach of the velocity
 # add up to its present size.
 _PARTS = np.array([1 / 2, 1 / 4, 1 / 4])
-# Share of the last step's change of velocity that is expected of the next: smooth motion would go
-# on with all of it, a joint that is stopped by a contact with none.
-CARRIED_ON = 0.5
 # Clamps are out of reach when they are moved so far [rad/s].
 _OUT_OF_REACH = 100.0
 # At so many times the speed at which a law levels off, it shows its size.
@@ -202,10 +192,7 @@ def _clamps(law: Law, rise: Rise, planned: JointMotion) -> np.ndarray:
         rise: where it levels off.
         planned: the motion as planned.
     """
-    n, rows = planned.velocity.shape[1], slice(None, None, -(-len(planned.velocity) // _ROWS))
-    velocity = planned.velocity[rows]
-    expected = velocity - (1 - CARRIED_ON) * _change_in_a_step(planned)[rows]
-    columns = []
+    n, columns = planned.velocity.shape[1], []
     for j in range(n):
 
         def of_joint(velocity: np.ndarray, j: int = j) -> np.ndarray:
@@ -216,47 +203,32 @@ def _clamps(law: Law, rise: Rise, planned: JointMotion) -> np.ndarray:
 
         speeds, sharp = at_joint(rise.speeds), at_joint(rise.corners)
         speeds = speeds[np.isfinite(speeds)]
-        choice = {
-            pieces: _joint_clamps(of_joint, speeds, sharp, *corners)
-            for pieces, corners in _CORNERS.items()
-        }
-        true, guess = velocity[:, j], expected[:, j]
-        if len(speeds) == 0:
-            pieces = 1
-        elif _rms(true) < _SLOW * speeds.min():
-            pieces = _SLOW_PIECES
-        else:
-            off_by = of_joint(true) - of_joint(guess)
-            errors = {
-                pieces: _rms(off_by - _sum(clamps, true) + _sum(clamps, guess))
-                for pieces, clamps in choice.items()
-            }
-            least = errors[max(errors)]
-            allowed = max(_DEVIATION * _rms(of_joint(true)), _OF_THE_LEAST * least)
-            pieces = next(pieces for pieces, error in errors.items() if error <= allowed)
-        columns.append(choice[pieces])
+        pieces = _pieces_needed(of_joint, speeds, np.abs(planned.velocity[:, j]))
+        columns.append(_joint_clamps(of_joint, speeds, sharp, *_CORNERS[pieces]))
     clamps = np.zeros((3, max(map(len, columns)), n))
     for j, column in enumerate(columns):
         clamps[:, : len(column), j] = np.reshape(column, (-1, 3)).T
     return clamps
 
 
-def _change_in_a_step(planned: JointMotion) -> np.ndarray:
-    """By how much the planned velocities change in a plant step, (N, n) [rad/s]."""
-    if len(planned.velocity) < 2:
-        return np.zeros_like(planned.velocity)
-    time = np.ravel(planned.time)
-    return planned.time_step * np.gradient(planned.velocity, time, axis=0)
+def _pieces_needed(
+    law: Callable[[np.ndarray], np.ndarray],
+    speeds: np.ndarray,
+    planned: np.ndarray,
+) -> int:
+    """How many pieces a joint gets.
 
-
-def _sum(clamps: Sequence[tuple[float, float, float]], velocity: np.ndarray) -> np.ndarray:
-    """Torque of clamps, each slope, limit and offset, at velocities (N,)."""
-    torques = (np.clip(s * velocity + offset, -limit, limit) for s, limit, offset in clamps)
-    return sum(torques, np.zeros_like(velocity))
-
-
-def _rms(values: np.ndarray) -> float:
-    return math.sqrt(np.mean(np.square(values)))
+    Args:
+        law: of the joint, takes and gives (N,).
+        speeds: where it levels off [rad/s].
+        planned: speeds of the planned motion, (N,) [rad/s].
+    """
+    if len(speeds) > 0 and math.sqrt(np.mean(planned**2)) < _SLOW * speeds.min():
+        return _SLOW_PIECES
+    level = _LEVEL * np.max(speeds, initial=0.0)
+    torque = law(np.append(level, planned[planned > level]))
+    share, _ = _CORNERS[1]
+    return _FALLING_PIECES if torque[0] - torque.min() > share * torque[0] else _PIECES
 
 
 def _joint_clamps(

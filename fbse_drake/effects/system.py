@@ -15,13 +15,16 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer
 
-from fbse_drake.effects.implicit import CARRIED_ON, ImplicitLaw
+from fbse_drake.effects.implicit import ImplicitLaw
 from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
+# Share of the last step's change of velocity that is expected of the next: smooth motion would go
+# on with all of it, a joint that is stopped by a contact with none.
+_CARRIED_ON = 0.5
 # A law that the solver takes but for this share of it is solved exactly.
 _ROUNDING = 1e-12
 # Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, and its
@@ -114,7 +117,7 @@ def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
         for j in range(n):
             change = joint_state[n + j] - before[_VELOCITY, j]
             now[_CHANGE, j] = change
-            expected[j] += (-0.5 if change * before[_CHANGE, j] < 0 else CARRIED_ON) * change
+            expected[j] += (-0.5 if change * before[_CHANGE, j] < 0 else _CARRIED_ON) * change
     return expected
 
 
