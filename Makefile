@@ -37,7 +37,8 @@ lint: $(INSTALLED)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-# Compiles the estimators of two legs and of four, which nearly all tests need, once for all workers; in one process, for they share much.
+# Compiles the estimators of two legs and of four, which nearly all tests need, once for all
+# workers; in one process, for they share much.
 kernels: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
 		[simulate(load(walk, overrides=['duration=0.01'])) for walk in ('paper_walk_fbse', 'quadruped_trot')]"

@@ -10,6 +10,7 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
+from fbse_drake.errors import InputError
 from fbse_drake.progress import Progress, silent
 
 T = TypeVar("T")
@@ -106,8 +107,11 @@ class Processes:
         ready = wait(list(self._running), timeout=timeout)
         for receiver in [one for one in self._running if one in ready]:
             task, process = self._running.pop(receiver)
-            outcome, task.error = receiver.recv()
-            task.outcome += outcome
+            try:
+                outcome, task.error = receiver.recv()
+                task.outcome += outcome
+            except EOFError:
+                task.error = InputError("a process was ended from outside before it was done")
             process.join()
         self._start(at_most)
 

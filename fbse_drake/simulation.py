@@ -141,18 +141,20 @@ def recorded_run(
         sink = add_record(builder, station, names, scenario.plant.time_step)
         diagram = builder.Build()
         simulator = Simulator(diagram)
-        end = _advance(simulator, station.robot, scenario, meshcat, progress, interrupted)
-        data = sink.FindLog(simulator.get_context()).data()
-        # A run that diverges may end in rows that are not numbers.
-        finite = np.logical_and.accumulate(np.isfinite(data).all(axis=0))
-        if not finite.any():
-            raise InputError(
-                "the state is not finite from the start: values are too large or too small"
-            )
-        places = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
-        ticks = dict(zip(names, np.split(data.T[finite], places, axis=1), strict=True))
-        yield RecordedRun(station, ticks, end)
-    release(diagram)
+        try:
+            end = _advance(simulator, station.robot, scenario, meshcat, progress, interrupted)
+            data = sink.FindLog(simulator.get_context()).data()
+            # A run that diverges may end in rows that are not numbers.
+            finite = np.logical_and.accumulate(np.isfinite(data).all(axis=0))
+            if not finite.any():
+                raise InputError(
+                    "the state is not finite from the start: values are too large or too small"
+                )
+            places = np.cumsum([station.GetOutputPort(port).size() for port in names])[:-1]
+            ticks = dict(zip(names, np.split(data.T[finite], places, axis=1), strict=True))
+            yield RecordedRun(station, ticks, end)
+        finally:
+            release(diagram)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import os
 
 import pytest
 
+from fbse_drake.errors import InputError
 from fbse_drake.processes import Processes
 from fbse_drake.progress import Interrupted, Progress, ProgressLines, silent
 
@@ -63,6 +64,16 @@ def test_an_error_is_that_of_the_task(jobs: int):
 
     with Processes(jobs) as processes, pytest.raises(ValueError, match="no solution"):
         processes.results([processes.begin(fail)], silent, "working")
+
+
+def test_a_process_that_is_killed_is_an_error():
+    """As by a machine that runs out of memory."""
+
+    def die(told: Progress) -> None:  # noqa: ARG001
+        os._exit(9)
+
+    with Processes(2) as processes, pytest.raises(InputError, match="ended from outside"):
+        processes.results([processes.begin(die)], silent, "working")
 
 
 def test_no_process_is_left_behind():

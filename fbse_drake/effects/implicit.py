@@ -27,8 +27,9 @@ _CORNERS = {
     7: (0.0058, (0.1866, 0.4090, 0.6539, 0.9394, 1.3015, 1.8305, 2.9266)),
 }
 # Pieces of a joint that moves: it passes the steep part of its law in a step or two. Where the law
-# falls beyond by more than a single piece is off, more would not show.
-_PIECES, _FALLING_PIECES = 3, 1
+# falls beyond by more than a single piece is off, more would not show; at so many speeds it is
+# looked whether it does.
+_PIECES, _FALLING_PIECES, _FALL_SAMPLES = 3, 1, 50
 # A joint that stands still, or moves at less than so many times the speed at which its law levels
 # off (root mean square), is on the steep part for long: so many pieces.
 _SLOW, _SLOW_PIECES = 5.0, 7
@@ -226,7 +227,7 @@ def _pieces_needed(
     if len(speeds) > 0 and math.sqrt(np.mean(planned**2)) < _SLOW * speeds.min():
         return _SLOW_PIECES
     level = _LEVEL * np.max(speeds, initial=0.0)
-    torque = law(np.append(level, planned[planned > level]))
+    torque = law(np.linspace(level, max(level, planned.max()), _FALL_SAMPLES))
     share, _ = _CORNERS[1]
     return _FALLING_PIECES if torque[0] - torque.min() > share * torque[0] else _PIECES
 
