@@ -1,6 +1,7 @@
 """Files: whole or not at all, also where programs are killed and disks are full; JSON by its
 standard."""
 
+import contextlib
 import fcntl
 import json
 import math
@@ -116,13 +117,16 @@ def test_of_two_writers_at_once_the_last_one_stays(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def full_disk() -> Iterator[None]:
-    """No file can have more than a few bytes, as on a disk that is full."""
+    """No file can have more than a few bytes, as on a disk that is full; not even one that pytest
+    tells its progress to."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture
@@ -134,13 +138,12 @@ def log(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["npz", "csv", "mcap"])
-def test_a_full_disk_keeps_what_was_there(
-    kind: str, log: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture
-):
+def test_a_full_disk_keeps_what_was_there(kind: str, log: Path, capsys: pytest.CaptureFixture):
     out = log.with_name(f"out.{kind}")
     out.write_text("mine")
-    request.getfixturevalue("full_disk")
-    assert main(["convert", str(log), str(out), "--force", "--quiet"]) == FAILED
+    with full_disk():
+        status = main(["convert", str(log), str(out), "--force", "--quiet"])
+    assert status == FAILED
     said = capsys.readouterr().err
     assert said == f"fbse: {out}: File too large; no file was left half-written\n"
     assert out.read_text() == "mine"

@@ -238,15 +238,6 @@ class LegKinematics:
         p = p + R @ self.offsets[-1]
         return R @ self.sole, p, _jacobian(axes, origins, p)
 
-    def first_moment(self, q: np.ndarray) -> np.ndarray:
-        """`moment` of `forward` alone, for angles q (N, n) [rad]."""
-        moment = np.zeros((len(q), 3))
-        for mass, center, (_, position, _, R) in zip(
-            self.masses, self.centers, self._links(q), strict=True
-        ):
-            moment = moment + mass * (position + R @ center)
-        return moment
-
     def _links(
         self, q: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
@@ -262,44 +253,40 @@ class LegKinematics:
 
     def forward(self, q: np.ndarray, v: np.ndarray | None = None) -> LegMotion:
         """Sole pose, Jacobians and mass distribution for angles q and rates v, shapes
-        (N, n) [rad, rad/s]."""
-        samples = len(q)
-        v = np.zeros_like(q) if v is None else v
-        axes, origins = [], []
-        # Motion for the given rates and zero joint accelerations, recursed from base to foot.
-        omega, alpha, bias = np.zeros((samples, 3)), np.zeros((samples, 3)), np.zeros((samples, 3))
-        moment, J_moment, bias_moment = (
-            np.zeros((samples, 3)),
-            np.zeros((samples, 3, self.joints)),
-            np.zeros((samples, 3)),
+        (N, n) [rad, rad/s]; without rates, nothing moves."""
+        links = list(self._links(q))
+        axes, origins = [axis for *_, axis, _ in links], [origin for _, origin, *_ in links]
+        R = links[-1][3]
+        sole = origins[-1] + R @ self.offsets[-1]
+        # First moments of mass of what moves with each joint, from foot to hip.
+        J_moment = np.empty((len(q), 3, self.joints))
+        mass, moment = 0.0, np.zeros((len(q), 3))
+        for i, (_, origin, axis, R_BL) in reversed(list(enumerate(links))):
+            mass = mass + self.masses[i]
+            moment = moment + self.masses[i] * (origin + R_BL @ self.centers[i])
+            J_moment[:, :, i] = np.cross(axis, moment - mass * origin)
+        twist, bias = (np.zeros((len(q), 6)), 0 * moment) if v is None else self._bias(links, v)
+        return LegMotion(
+            R @ self.sole, sole, _jacobian(axes, origins, sole), twist, moment, J_moment, bias
         )
+
+    def _bias(
+        self, links: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`Jdot_v` and `Jdot_v_moment`: motion for rates v and zero joint accelerations, recursed
+        from base to foot."""
+        omega, alpha, bias, bias_moment = np.zeros((4, len(v), 3))
 
         def carried(r: np.ndarray) -> np.ndarray:
             return bias + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
 
-        for i, (r, position, axis, R) in enumerate(self._links(q)):
+        for i, (r, _, axis, R) in enumerate(links):
             bias = carried(r)
-            axes.append(axis)
-            origins.append(position)
             alpha = alpha + np.cross(omega, axis) * v[:, i, None]
             omega = omega + axis * v[:, i, None]
-            r = R @ self.centers[i]
-            moment = moment + self.masses[i] * (position + r)
-            bias_moment = bias_moment + self.masses[i] * carried(r)
-            for j in range(i + 1):
-                J_moment[:, :, j] += self.masses[i] * np.cross(axes[j], position + r - origins[j])
-        r = R @ self.offsets[-1]
-        bias, position = carried(r), position + r
-        J = _jacobian(axes, origins, position)
-        return LegMotion(
-            R @ self.sole,
-            position,
-            J,
-            np.concatenate([alpha, bias], axis=1),
-            moment,
-            J_moment,
-            bias_moment,
-        )
+            bias_moment = bias_moment + self.masses[i] * carried(R @ self.centers[i])
+        bias = carried(R @ self.offsets[-1])
+        return np.concatenate([alpha, bias], axis=1), bias_moment
 
 
 def _stance(robot: Robot, leg: Leg) -> np.ndarray:
@@ -333,6 +320,6 @@ def _rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Rotation matrices about a fixed unit axis, shape (N, 3, 3)."""
     x, y, z = axis
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return (
-        np.eye(3) + np.sin(angle)[:, None, None] * K + (1 - np.cos(angle))[:, None, None] * (K @ K)
-    )
+    parts = np.stack([np.eye(3), K, K @ K]).reshape(3, 9)
+    weights = np.stack([np.ones_like(angle), np.sin(angle), 1 - np.cos(angle)], axis=-1)
+    return (weights @ parts).reshape(-1, 3, 3)

@@ -292,28 +292,28 @@ def _inverse_kinematics(
             try:
                 p_BF = _turned(R_BW, plan.feet[side].position - p_WB)
                 q[side] = leg.inverse(R_BF[side], p_BF, start=q.get(side))
-            except UnreachableError as error:
-                raise InputError(_unreachable(plan, side, error)) from None
-        moment = base_moment + sum(leg.first_moment(q[side]) for side, leg in legs.items())
-        com = p_WB + _turned(trunk.rotation, moment / total_mass)
-        correction = plan.com.position - com
-        p_WB = p_WB + correction
-        if np.abs(correction).max() < _COM_TOLERANCE:
+            except UnreachableError as found:
+                raise InputError(_unreachable(plan, side, found)) from None
+        # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m. All in the trunk's axes.
+        still = {side: leg.forward(q[side]) for side, leg in legs.items()}
+        inverse = {
+            side: m.J_moment @ np.linalg.inv(m.J[:, legs[side].ruled]) / total_mass
+            for side, m in still.items()
+        }
+        gain = {side: values[:, :, -3:] for side, values in inverse.items()}
+        # How the CoM moves with the base while the feet stay.
+        lever = np.eye(3) - sum(gain.values())
+        moment = base_moment + sum(m.moment for m in still.values())
+        error = plan.com.position - p_WB - _turned(trunk.rotation, moment / total_mass)
+        if np.abs(error).max() < _COM_TOLERANCE:
             break
+        step = np.linalg.solve(lever, _turned(R_BW, error)[:, :, None])[:, :, 0]
+        p_WB = p_WB + _turned(trunk.rotation, step)
     else:
         raise InputError(
-            f"no posture found for the planned CoM, {np.abs(correction).max():.1e} m off; change "
+            f"no posture found for the planned CoM, {np.abs(error).max():.1e} m off; change "
             "com_height"
         )
-
-    # Feet: V_F - V_B = J qdot. CoM: cdot = v_B + J_moment qdot / m. All in the trunk's axes.
-    still = {side: leg.forward(q[side]) for side, leg in legs.items()}
-    inverse = {
-        side: m.J_moment @ np.linalg.inv(m.J[:, legs[side].ruled]) / total_mass
-        for side, m in still.items()
-    }
-    gain = {side: values[:, :, -3:] for side, values in inverse.items()}
-    lever = np.eye(3) - sum(gain.values())
 
     def solve(
         com: np.ndarray, feet: dict[str, np.ndarray], turning: dict[str, np.ndarray]
