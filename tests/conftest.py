@@ -9,6 +9,7 @@ from functools import lru_cache
 from hashlib import sha256
 
 import pytest
+from matplotlib.figure import Figure
 
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
@@ -60,8 +61,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Log]:
 
 @pytest.fixture
 def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures in reports are empty: drawing them takes most of the time of a short run."""
-    monkeypatch.setattr("fbse_drake.report.html._png_uri", lambda _: "data:image/png;base64,")
+    """Pictures in reports are empty: making them of figures takes most of the time of a short
+    run."""
+
+    def blank(draw: Callable[[], Figure]) -> str:
+        draw()
+        return "data:image/png;base64,"
+
+    monkeypatch.setattr("fbse_drake.report.html._png_uri", blank)
 
 
 def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:

@@ -39,7 +39,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """All figures are empty, which saves the time to draw them."""
-    monkeypatch.setattr(FigureKind, "block", lambda kind, _: FigureBlock(kind.title, "", Figure()))
+    monkeypatch.setattr(FigureKind, "block", lambda kind, _: FigureBlock(kind.title, "", Figure))
 
 
 def strict(path: Path) -> dict:
@@ -114,7 +114,7 @@ def test_pictures_of_runs_have_the_same_axes(kind: FigureKind, tmp_path: Path):
     assert [name for name, _ in row.pictures] == ["a", "b"]
     assert row.caption.endswith("The same axes in all runs.")
     for panel, (first, second) in enumerate(
-        zip(*(figure.axes for _, figure in row.pictures), strict=True)
+        zip(*(draw().axes for _, draw in row.pictures), strict=True)
     ):
         assert first.get_xlim() == second.get_xlim()
         assert first.get_ylim() == second.get_ylim()

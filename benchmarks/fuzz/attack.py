@@ -7,11 +7,12 @@ import shutil
 import sys
 import time as clock
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.fuzz import mutations
 from benchmarks.fuzz.files import KINDS, Kind
@@ -148,7 +149,12 @@ def _undrawn() -> Iterator[None]:
     from fbse_drake.report import html
 
     before = html._png_uri
-    html._png_uri = lambda _: ""
+
+    def drawn(draw: Callable[[], Figure]) -> str:
+        draw()
+        return ""
+
+    html._png_uri = drawn
     try:
         yield
     finally:

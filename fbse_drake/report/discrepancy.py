@@ -1,6 +1,7 @@
 """The reports of compare, diagnose and study."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -276,11 +277,16 @@ def _where(
     robot, residual, motion = predictor.robot, predictor.residual, predictor.motion
     known = [channel for channel in comparison.channels if not np.isnan(channel.rmse)]
     if robot.description.legs:
-        drawn = figures.robot_errors(robot, comparison, motion.blocks.joint_position.mean(axis=0))
+        posture = motion.blocks.joint_position.mean(axis=0)
+        drawn = partial(figures.robot_errors, robot, comparison, posture)
         blocks = [FigureBlock("Error over noise, by joint and by phase", _BY_PHASE, drawn)]
     else:
         blocks = (
-            [FigureBlock("Error over noise, by joint", _RATIOS, figures.channel_errors(known))]
+            [
+                FigureBlock(
+                    "Error over noise, by joint", _RATIOS, partial(figures.channel_errors, known)
+                )
+            ]
             if len(known) > 1
             else []
         )
@@ -293,7 +299,7 @@ def _where(
                 "Mean error in bins. Where the interval is narrow and away from zero, the error "
                 "follows that variable; where it is wide, the error depends on something else. A "
                 "positive error means that the model's torque (or force) is too low.",
-                figures.error_bins(binned),
+                partial(figures.error_bins, binned),
             )
         )
     if worst:
@@ -302,7 +308,7 @@ def _where(
                 "The worst channels over time",
                 f"Averages over {number(1e3 * motion.length * motion.period)} ms. Inside the grey "
                 "band is what sensor noise explains.",
-                figures.errors_over_time(residual, robot.description.sides, worst),
+                partial(figures.errors_over_time, residual, robot.description.sides, worst),
             ),
         ]
     blocks.append(residual_chart(predictor, completed))
@@ -360,7 +366,9 @@ def _why(
         ]
         blocks.append(
             FigureBlock(
-                "What explains the error", caption, figures.ranking([*chosen, *others], names)
+                "What explains the error",
+                caption,
+                partial(figures.ranking, [*chosen, *others], names),
             )
         )
     tables += spread_tables(chosen)
@@ -371,7 +379,7 @@ def _why(
     ]
     if valued:
         caption = "With their 95 % intervals, which respect what is left of correlation in time."
-        blocks.append(FigureBlock("Fitted values", caption, figures.parameters(valued)))
+        blocks.append(FigureBlock("Fitted values", caption, partial(figures.parameters, valued)))
     text = ""
     if not chosen:
         text = (
@@ -405,7 +413,7 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
         "How small an effect could be and still be found, against what is plausible on a "
         "robot of this kind. What lies in the grey area is not visible in this log, which "
         "is not the same as absent.",
-        figures.detectability(statuses),
+        partial(figures.detectability, statuses),
     )
     order = [words(verdict) for verdict in figures.VERDICT_COLORS]
     table = Table(
@@ -440,11 +448,11 @@ def _fall(
         FigureBlock(
             "The error, step by step",
             _FALLING + (simulated if rolled else ""),
-            figures.falling_error(study.steps, small_motions(robot)),
+            partial(figures.falling_error, study.steps, small_motions(robot)),
         )
     ]
     if len(known) > 1:
-        drawn = figures.channel_errors(*map(list, zip(*known, strict=True)))
+        drawn = partial(figures.channel_errors, *map(list, zip(*known, strict=True)))
         blocks.append(FigureBlock("Every channel, before and after", _RATIOS, drawn))
     blocks += _measured_torque(study.scenario, before[0], tests)
     if rolled and len(first.sample_time) and len(last.sample_time):
@@ -457,14 +465,16 @@ def _fall(
             FigureBlock(
                 "The simulated model, before and after",
                 caption,
-                figures.position_errors(first, last, robot.torque_units),
+                partial(figures.position_errors, first, last, robot.torque_units),
             )
         )
     if worst := _worst(after[1]):
         caption = "Mean error of the completed model in bins of what it may depend on."
         blocks.append(
             FigureBlock(
-                "What is left, against what it may depend on", caption, figures.error_bins(worst)
+                "What is left, against what it may depend on",
+                caption,
+                partial(figures.error_bins, worst),
             )
         )
     left = all_failure_tables(
@@ -522,7 +532,7 @@ def _measured_torque(
         f"{number(float(time[-1] - time[0]), 2)} s of {log_name(name)}{part}. Right above each "
         "panel: |error| / |measured| there (2-norms)."
     )
-    drawn = figures.torques_over_time(residual, after.residual, places, stretch)
+    drawn = partial(figures.torques_over_time, residual, after.residual, places, stretch)
     return [FigureBlock("Measured torque and the model's, before and after", caption, drawn)]
 
 
@@ -552,7 +562,7 @@ def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
     block = FigureBlock(
         "The error as effects are added",
         _FALLING,
-        figures.falling_error(steps, small_motions(robot)),
+        partial(figures.falling_error, steps, small_motions(robot)),
     )
     return [Section("How the error falls", text, (growth_table(steps, robot),), (block,))]
 

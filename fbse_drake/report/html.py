@@ -7,11 +7,12 @@ A report is data (`Report`, made of `Section`s); `write_report` puts it into
 import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -67,16 +68,17 @@ class Table:
 
 @dataclass(frozen=True)
 class FigureBlock:
-    """A picture with its title and one or two sentences on what to see."""
+    """A picture with its title and one or two sentences on what to see; drawn when it is shown, so
+    that a report has one figure in memory and not all."""
 
     title: str
     caption: str
-    figure: Figure
+    draw: Callable[[], Figure]
 
     @property
-    def pictures(self) -> tuple[tuple[str, Figure], ...]:
+    def pictures(self) -> tuple[tuple[str, Callable[[], Figure]], ...]:
         """The only one, without a name of its own."""
-        return (("", self.figure),)
+        return (("", self.draw),)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class FigureRow:
 
     title: str
     caption: str
-    pictures: tuple[tuple[str, Figure], ...]
+    pictures: tuple[tuple[str, Callable[[], Figure]], ...]
 
 
 @dataclass(frozen=True)
@@ -181,9 +183,10 @@ def write_report(path: str | Path, report: Report) -> None:
     write_text(Path(path), render_report(report))
 
 
-def _png_uri(figure: Figure) -> str:
+def _png_uri(draw: Callable[[], Figure]) -> str:
     # What `savefig` does, without its first drawing of a figure with a layout engine.
-    canvas, file = FigureCanvasAgg(figure), io.BytesIO()
+    figure, file = draw(), io.BytesIO()
+    canvas = FigureCanvasAgg(figure)
     figure.set_dpi(_DPI)
     # The page shows through, which may be dark.
     for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
@@ -197,4 +200,6 @@ def _png_uri(figure: Figure) -> str:
         layout.execute(figure)
         figure.set_layout_engine("none")
     canvas.print_png(file)
+    # A figure may live on, but the pixels that it was drawn with need not.
+    FigureCanvasBase(figure)
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from fbse_drake.discrepancy.diagnosis.identify import Identification, identifiability_text
@@ -130,7 +131,7 @@ def write_identification_report(path: str | Path, result: Identification, inputs
                     Table(BASE_HEADER, tuple(base_row(base) for base in inertia.base_parameters))
                 ),
             ),
-            (FigureBlock("Combinations", _COMBINATIONS_CAPTION, combinations(result)),)
+            (FigureBlock("Combinations", _COMBINATIONS_CAPTION, partial(combinations, result)),)
             if inertia.base_parameters
             else (),
         ),
@@ -139,7 +140,7 @@ def write_identification_report(path: str | Path, result: Identification, inputs
             "Errors",
             "|residual| / |torque|, 2-norms.",
             (_headed(errors_table(result)),),
-            (FigureBlock("Errors by joint", _ERRORS_CAPTION, errors_by_joint(result)),),
+            (FigureBlock("Errors by joint", _ERRORS_CAPTION, partial(errors_by_joint, result)),),
         ),
         Section(
             "Bodies",

@@ -1,6 +1,7 @@
 """The report of a comparison of methods."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -183,7 +184,7 @@ def write_rivals_report(
         "Left with stance and swing apart, and the 95 % interval of the mean over the seeds; right "
         "what becomes of it when something is not as the methods are told."
     )
-    picture = FigureBlock("Errors of all methods", caption, errors_figure(comparison))
+    picture = FigureBlock("Errors of all methods", caption, partial(errors_figure, comparison))
     broken = [f"Not done: {line}." for line in comparison.broken]
     ended = [
         f"{case}, seed {seed}: {why}."

@@ -313,11 +313,16 @@ def figure_row(kind: FigureKind, runs: Sequence[Run]) -> FigureRow | None:
     blocks = {run.name: kind.block(run.log) for run in runs if kind.available(run.log)}
     if not blocks:
         return None
-    said = _SAME_AXES if _share_axes([block.figure for block in blocks.values()]) else _OWN_AXES
+    figures = {name: block.draw() for name, block in blocks.items()}
+    said = _SAME_AXES if _share_axes(list(figures.values())) else _OWN_AXES
     captions = list(dict.fromkeys(block.caption for block in blocks.values()))
     caption = " ".join([max(captions, key=len), *([said] if len(blocks) > 1 else [])])
-    pictures = tuple((name, block.figure) for name, block in blocks.items())
+    pictures = tuple((name, _drawn(figure)) for name, figure in figures.items())
     return FigureRow(kind.title, caption, pictures)
+
+
+def _drawn(figure: Figure) -> Callable[[], Figure]:
+    return lambda: figure
 
 
 def _share_axes(figures: Sequence[Figure]) -> bool:

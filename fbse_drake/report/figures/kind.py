@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from matplotlib.figure import Figure
 
@@ -34,7 +35,7 @@ class FigureKind:
     def block(self, log: Log) -> FigureBlock:
         """The figure of a log, for a report."""
         caption = self.caption if isinstance(self.caption, str) else self.caption(log)
-        return FigureBlock(self.title, caption, self.draw(log))
+        return FigureBlock(self.title, caption, partial(self.draw, log))
 
 
 def figure_kind(
