@@ -86,13 +86,16 @@ def _sizes(effect: type[Effect]) -> np.ndarray:
 
 
 @cache
-def _walk() -> Predictor:
-    scenario = load_scenario("frictionless_walk", overrides=["duration=3.5"])
+def _walk(*, motor_encoders: bool = False) -> Predictor:
+    overrides = ["duration=3.5"]
+    if motor_encoders:
+        overrides.append("sensors.motor_encoders={resolution: 4.8e-5}")
+    scenario = load_scenario("frictionless_walk", overrides=overrides)
     return Predictor(scenario, simulate(scenario).log)
 
 
 def _residual(effect: type[Effect]) -> Figure:
-    predictor = _walk()
+    predictor = _walk(motor_encoders=effect.needs_motor_encoder)
     residual = predictor.residual
     found = predictor.signature(effect, _target(effect), usual_values(effect))
     added = found.offset + found.values @ _sizes(effect)

@@ -121,6 +121,7 @@ from .effects.sensor import FootForceMisalignment as FootForceMisalignment
 from .effects.sensor import FootMomentBias as FootMomentBias
 from .effects.sensor import GyroscopeBias as GyroscopeBias
 from .effects.sensor import ImuMisalignment as ImuMisalignment
+from .effects.sensor import MotorEncoderOffset as MotorEncoderOffset
 from .effects.sensor import TransmissionElasticity as TransmissionElasticity
 from .effects.transmission import Backlash as Backlash
 from .effects.transmission import JointSpring as JointSpring
@@ -135,6 +136,7 @@ from .sensors.imu import ImuConfig as ImuConfig
 from .sensors.base_wrench import BaseWrench as BaseWrench
 from .sensors.joint_temperature import JointTemperature as JointTemperature
 from .sensors.joint_torque import JointTorqueConfig as JointTorqueConfig
+from .sensors.motor_encoders import MotorEncoderConfig as MotorEncoderConfig
 
 # Estimators, and stages of `Fbse` for diagrams of your own.
 from .estimators.estimator import Estimator as Estimator

@@ -36,6 +36,7 @@ from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.sensors.foot_force import FootForceConfig
 from fbse_drake.sensors.imu import ImuConfig
 from fbse_drake.sensors.joint_torque import JointTorqueConfig
+from fbse_drake.sensors.motor_encoders import MotorEncoderConfig
 from fbse_drake.sensors.sensor import Sensor
 from fbse_drake.walking.plan import TaskPlan
 from fbse_drake.walking.reference import Reference, ReferenceConfig, make_plan, make_reference
@@ -85,6 +86,8 @@ class SensorsConfig:
     foot_force: FootForceConfig = field(default_factory=FootForceConfig)
     # Joint torque sensors, for robots that have them.
     joint_torque: JointTorqueConfig | None = None
+    # Second encoders, on the motors' side of the gears, for robots that have them.
+    motor_encoders: MotorEncoderConfig | None = None
     # Further sensors, each under a name of your choice, as {winding: !JointTemperature {}}.
     more: dict[str, Sensor] = field(default_factory=dict)
 
@@ -101,7 +104,7 @@ class SensorsConfig:
 
     @property
     def _usual(self) -> dict[str, Sensor]:
-        names = ("encoders", "imu", "foot_force", "joint_torque")
+        names = ("encoders", "imu", "foot_force", "joint_torque", "motor_encoders")
         usual = {name: getattr(self, name) for name in names}
         return {name: sensor for name, sensor in usual.items() if sensor is not None}
 
@@ -109,6 +112,12 @@ class SensorsConfig:
     def by_name(self) -> dict[str, Sensor]:
         """All sensors of the robot."""
         return self._usual | self.more
+
+    @property
+    def deflection_noise(self) -> float:
+        """Standard deviation of the difference of a joint's two encoders [rad]."""
+        second = 0.0 if self.motor_encoders is None else self.motor_encoders.angle_noise
+        return math.hypot(self.encoders.angle_noise, second)
 
     @property
     def without_errors(self) -> "SensorsConfig":
@@ -119,6 +128,7 @@ class SensorsConfig:
             imu=ImuConfig(),
             foot_force=FootForceConfig(),
             joint_torque=self.joint_torque and JointTorqueConfig(),
+            motor_encoders=self.motor_encoders and MotorEncoderConfig(),
         )
 
     def with_period(self, period: float) -> "SensorsConfig":

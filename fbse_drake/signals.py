@@ -90,6 +90,8 @@ _TABLE: list[Signal] = [
     Signal(r"foot/\w+/pad_force", "N", ("m", 3), "measured_pad_force"),
     Signal(r"foot/\w+/wrench", "Nm, N", (6,), "measured_pad_force"),
     Signal("joint/torque_measured", "Nm", ("n",), "measured_torque"),
+    # Of the motors, on the joints' side of the gears: as much as the joints turn if nothing gives.
+    Signal("joint/motor_position", "rad", ("n",), "measured_motor_position"),
     Signal("joint/temperature", "degC", ("n",), "measured_temperature"),
     # [moment, force] of the ground on a fixed base, at its origin in its axes.
     Signal("base/wrench", "Nm, N", (6,), "measured_base_wrench"),

@@ -155,6 +155,7 @@ def add_robot(
         With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
         `torque_loss` of the effects in the step that ended (n,) [Nm] and what it is the sum of,
         `net_actuation` and `explicit_force` (see `fbse_drake.effects.system.loss_over_time`),
+        `deflection` of the motors against their links (n,) [rad],
         `plant_state`, `generalized_acceleration` and those of the plant that sensors need:
         `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.
 
@@ -226,7 +227,7 @@ def add_joint_torques(
         ports: of the robot: `joint_state`, `torque_command` and `net_actuation`.
 
     Returns:
-        `torque_loss` and `explicit_force`.
+        `torque_loss`, `deflection` and `explicit_force`.
     """
     plant, instance = robot.plant, robot.base.model_instance()
     effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step))
@@ -249,7 +250,8 @@ def add_joint_torques(
         builder.Connect(offset.get_output_port(), both.get_input_port(1))
         torque = both.get_output_port()
     builder.Connect(torque, plant.get_actuation_input_port())
-    return {name: effects.GetOutputPort(name) for name in ("torque_loss", "explicit_force")}
+    given = ("torque_loss", "deflection", "explicit_force")
+    return {name: effects.GetOutputPort(name) for name in given}
 
 
 def add_sensors(
@@ -275,9 +277,15 @@ def add_sensor_effects(
     resolved = scenario.robot.effects_of(SensorEffect, robot.description, key="robot")
     if not resolved:
         return {}
-    system = SensorEffects(resolved, robot, scenario.control.period)
+    measured = {
+        name: ports[port]
+        for name in ("joint_state", "imu", "pad_force", "motor_position")
+        if (port := f"measured_{name}") in ports
+    }
+    system = SensorEffects(
+        resolved, robot, scenario.control.period, motor_encoders="motor_position" in measured
+    )
     effects = builder.AddNamedSystem("sensor_effects", system)
-    measured = {name: ports[f"measured_{name}"] for name in ("joint_state", "imu", "pad_force")}
     connect_by_name(builder, {**measured, "torque_command": ports["torque_command"]}, effects)
     # A robot without feet has no forces there to split off.
     sizes = {name: port.size() for name, port in measured.items() if port.size() > 0}

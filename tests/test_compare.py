@@ -54,6 +54,7 @@ def made_residual(seed: int = 0) -> Residual:
         specific_force=np.zeros((BLOCKS, 3)),
         pad_force=np.zeros((BLOCKS, 8, 3)),
         torque_command=20 * np.cos(2 * np.pi * time[:, None] / 3.1 + np.arange(12)),
+        motor_position=np.zeros((BLOCKS, 0)),
     )
     return Residual(ROWS, time, value, known, variance, covariance, standing, signals)
 

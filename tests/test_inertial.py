@@ -381,7 +381,9 @@ def test_columns_of_a_floating_robot_are_what_changing_the_model_does() -> None:
     n, body = len(bare.joint_names), "trunk"
     equation = EquationOfMotion(bare)
     vectors = (random.standard_normal((5, k)) for k in (n, n, n, 3, 3, 3))
-    at = Instants(*vectors, np.zeros((5, len(equation.pads.foot), 3)), np.zeros((5, n)))
+    at = Instants(
+        *vectors, np.zeros((5, len(equation.pads.foot), 3)), np.zeros((5, n)), np.zeros((5, 0))
+    )
     delta = random.uniform(-1e-3, 1e-3, 10)
     effect = InertialParameters.from_values(
         [body], dict(zip(PARAMETERS, delta[:, None], strict=True))

@@ -257,6 +257,7 @@ def test_between_two_point_feet_all_but_a_turn_about_their_line_shows(robot: Rob
         angular_velocity=w @ motion.R_BI,
         specific_force=np.zeros((3, 3)),
         torque_command=np.zeros((3, 12)),
+        motor_position=np.zeros((3, 0)),
         **{name: np.zeros(shape) for name, shape in zeros.items()},
     )
 

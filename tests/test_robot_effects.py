@@ -283,6 +283,7 @@ def true_signals(log: Log) -> SensorSignals:
         log["imu/angular_velocity"],
         np.concatenate([log[f"truth/foot/{side}/pad_force"] for side in log.sides], axis=1),
         log["joint/torque_command"],
+        np.zeros((len(log.time), 0)),
     )
 
 
@@ -341,7 +342,9 @@ def test_misalignment_is_that_of_the_imu_configuration():
 def test_foot_force_errors(plain: Robot):
     force = np.random.default_rng(0).normal(size=(5, 8, 3))
     none = np.zeros((5, 12))
-    signals = SensorSignals(none, none, np.zeros((5, 3)), np.zeros((5, 3)), force, none)
+    signals = SensorSignals(
+        none, none, np.zeros((5, 3)), np.zeros((5, 3)), force, none, np.zeros((5, 0))
+    )
 
     def read(effect: SensorEffect) -> np.ndarray:
         return (
@@ -382,7 +385,7 @@ def test_foot_wrench_errors(description: str):
     first, second = robot.description.sides
     force = np.random.default_rng(0).normal(scale=50, size=(400, points, 3))
     none, still = np.zeros((400, n)), np.zeros((400, 3))
-    signals = SensorSignals(none, none, still, still, force, none)
+    signals = SensorSignals(none, none, still, still, force, none, np.zeros((5, 0)))
     true = wrenches(robot, force)
 
     def read(effect: SensorEffect) -> np.ndarray:

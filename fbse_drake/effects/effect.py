@@ -122,6 +122,8 @@ class Effect(ABC):
     composite: ClassVar[bool] = False
     # It is of a motor, its drive or its gear: a joint without any has none of it.
     needs_motor: ClassVar[bool] = False
+    # It is of a joint's second encoder, on the motor's side.
+    needs_motor_encoder: ClassVar[bool] = False
     # Its linear parameters enter linearly only about some values: a search makes it linear about
     # those that fit.
     linear_nearby: ClassVar[bool] = False

@@ -96,6 +96,9 @@ class JointTorqueEffect(Effect):
     """
 
     has_memory: ClassVar[bool] = False
+    # Does it let the motor turn against the link, so that encoders on both sides show it? Such an
+    # effect also gives `deflection` and `memory_over_time`.
+    deflects: ClassVar[bool] = False
     # Does the torque depend on nothing but the velocity? (Then it is simulated faster.)
     of_velocity_alone: ClassVar[bool] = False
     # Can it be told in a joint that rests, as what the drive makes of its command can?
@@ -137,6 +140,12 @@ class JointTorqueEffect(Effect):
         return 0.0
 
     @staticmethod
+    def deflection(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+        """By how much a motor is ahead of its link [rad] with a memory (rows, ..., n), of one that
+        `deflects`; (..., n)."""
+        raise NotImplementedError
+
+    @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
         """Memory at the start of the first step, shape (rows, ..., n). Everything about the step is
         known but its velocity."""
@@ -157,6 +166,11 @@ class JointTorqueEffect(Effect):
             nonlinear: values of the nonlinear parameters, shape (m,) or (m, n).
         """
         return cls.shows_at_rest or travel > 0
+
+    @classmethod
+    def shows_under(cls, command: np.ndarray) -> bool:  # noqa: ARG003
+        """Do the commands of a joint, (N,) [Nm], show what the effect is?"""
+        return True
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
@@ -230,6 +244,24 @@ def basis_over_time(
         result.append([np.broadcast_to(b, (*sets, n)) for b in basis])
         memory = effect.advance(now, nonlinear)
     return np.moveaxis(np.array(result), 0, -2)
+
+
+def deflection_over_time(
+    effect: type[JointTorqueEffect], motion: JointMotion, nonlinear: np.ndarray
+) -> np.ndarray:
+    """By how much motors are ahead of their links at the start of each of N steps [rad].
+
+    Args:
+        motion, nonlinear: see `basis_over_time`.
+
+    Returns:
+        Shape (N, n), or (G, N, n).
+    """
+    of_steps = nonlinear[..., None, :]
+    memory = effect.memory_over_time(motion, of_steps)
+    if memory is None:
+        raise NotImplementedError(f"{effect.__name__}.memory_over_time")
+    return effect.deflection(memory, of_steps)
 
 
 def law_over_time(effects: Sequence[ResolvedJointTorque], motion: JointMotion) -> np.ndarray:

@@ -38,6 +38,8 @@ class SensorSignals:
     pad_force: np.ndarray
     # Of the step that begins, shape (..., n) [Nm].
     torque_command: np.ndarray
+    # Of second encoders, on the motors' side, shape (..., n) [rad]; (..., 0) where there are none.
+    motor_position: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -548,13 +550,45 @@ class EncoderOffset(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
+class MotorEncoderOffset(SensorEffect):
+    """The second encoder of a joint, on the motor's side, reads this angle too much."""
+
+    description: ClassVar[str] = (
+        "The zero of a joint's second encoder, on the motor's side, is not that of the first."
+    )
+    signature: ClassVar[str] = "The angles of motor and link differ by a constant."
+    experiment: ClassVar[str] = "Load each joint in one direction and in the other."
+    needs_motor: ClassVar[bool] = True
+    needs_motor_encoder: ClassVar[bool] = True
+    # Where a motor stands as it is switched on may be its zero.
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "offset": Parameter("rad", linear=True, plausible=(-np.pi, np.pi), bounds=_ANY)
+    }
+
+    offset: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def reading(
+        signals: SensorSignals,
+        memory: np.ndarray,  # noqa: ARG004
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG004
+    ) -> SensorSignals:
+        motors = signals.motor_position.shape[-1]
+        read = signals.motor_position + values.linear[0, :motors]
+        return replace(signals, motor_position=read)
+
+
+@in_library
+@dataclass(frozen=True)
 class TransmissionElasticity(SensorEffect):
     """A massless damped spring between motor and joint, with the encoder on the motor's side: it
     reads q + d, where
 
     time_constant d_dot = compliance * command - d
 
-    The command is held from tick to tick, and the solution is exact. A loop of derivative gain kd
+    With encoders on both sides the second one reads this, and the first the link's angle. The
+    command is held from tick to tick, and the solution is exact. A loop of derivative gain kd
     over such an encoder needs kd * compliance < time_constant.
     """
 
@@ -589,6 +623,9 @@ class TransmissionElasticity(SensorEffect):
     ) -> SensorSignals:
         (compliance,), (time_constant,) = values.linear, values.nonlinear
         followed, command = memory
+        if signals.motor_position.shape[-1]:
+            twisted = signals.motor_position + compliance * followed
+            return replace(signals, motor_position=twisted)
         return replace(
             signals,
             joint_position=signals.joint_position + compliance * followed,
@@ -622,24 +659,33 @@ class SensorEffects(LeafSystem):
         - joint_state
         - imu
         - pad_force
+        - motor_position
         - torque_command
         output_ports:
         - measured
 
     `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific force,
     angular velocity], shape (6,) [m/s^2, rad/s]; `pad_force` three components pad by pad [N];
-    `torque_command` (n,) [Nm]. `measured` is [joint_state, imu, pad_force] as read; it does not
-    depend on the command of its own tick, which is computed from it. Discrete state: each effect's
-    memory.
+    `motor_position` (n,) [rad] of second encoders, where there are any; `torque_command` (n,) [Nm].
+    `measured` is [joint_state, imu, pad_force, motor_position] as read; it does not depend on the
+    command of its own tick, which is computed from it. Discrete state: each effect's memory.
     """
 
-    def __init__(self, effects: Sequence[ResolvedEffect], robot: Robot, period: float):
+    def __init__(
+        self,
+        effects: Sequence[ResolvedEffect],
+        robot: Robot,
+        period: float,
+        *,
+        motor_encoders: bool = False,
+    ):
         """Declares ports, state and the update.
 
         Args:
             effects: sensor effects.
             robot: whose sensors these are.
             period: of the control [s].
+            motor_encoders: are there second encoders?
         """
         super().__init__()
         n, pads = (
@@ -648,6 +694,8 @@ class SensorEffects(LeafSystem):
         )
         self._effects, self._robot, self._period = list(effects), robot, period
         sizes = {"joint_state": 2 * n, "imu": 6, "pad_force": 3 * pads}
+        if motor_encoders:
+            sizes["motor_position"] = n
         self._readings = [self.DeclareVectorInputPort(name, size) for name, size in sizes.items()]
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
         self._memories = [
@@ -662,11 +710,11 @@ class SensorEffects(LeafSystem):
             self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
 
     def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
-        joint_state, imu, pad_force = (port.Eval(context) for port in self._readings)
+        joint_state, imu, pad_force, *second = (port.Eval(context) for port in self._readings)
         position, velocity = np.split(joint_state, 2)
-        return SensorSignals(
-            position, velocity, imu[:3], imu[3:], pad_force.reshape(-1, 3), torque_command
-        )
+        pads = pad_force.reshape(-1, 3)
+        motors = second[0] if second else np.zeros(0)
+        return SensorSignals(position, velocity, imu[:3], imu[3:], pads, torque_command, motors)
 
     def _memory(self, context: Context, place: int) -> np.ndarray:
         values = context.get_discrete_state(self._memories[place]).value()
@@ -684,6 +732,7 @@ class SensorEffects(LeafSystem):
             signals.specific_force,
             signals.angular_velocity,
             signals.pad_force.ravel(),
+            signals.motor_position,
         )
         output.SetFromVector(np.concatenate(read))
 

@@ -185,6 +185,7 @@ class ExplicitTorque(LeafSystem):
         output_ports:
         - torque_loss
         - tick
+        - deflection
 
     The explicit torque of a step is the law less what the solver takes of it, both at the velocity
     that is expected at its end. So its error is the slope of this difference, which is small, times
@@ -193,7 +194,8 @@ class ExplicitTorque(LeafSystem):
     `joint_state` is [positions, velocities], (2n,) [rad, rad/s]; `net_actuation` is the plant's
     [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins.
     `torque_loss` (n,) [Nm] is that of the step that ended (zero before the first); `tick` has the
-    parts of `Tick`. Discrete state: the last tick.
+    parts of `Tick`; `deflection` (n,) [rad] is by how much effects let the motors be ahead of their
+    links now. Discrete state: the last tick.
     """
 
     def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
@@ -231,6 +233,11 @@ class ExplicitTorque(LeafSystem):
         self._torque_loss = self.DeclareVectorOutputPort(
             "torque_loss", n, weakly(self._calc_loss), sources
         )
+        # Nor does the deflection: encoders read it before there is one.
+        sources = {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
+        self.DeclareVectorOutputPort(
+            "deflection", n, weakly(self._calc_deflection), {*sources, self.time_ticket()}
+        )
         sources = {self.all_input_ports_ticket(), self.time_ticket(), self.xd_ticket()}
         self._tick = self.DeclareVectorOutputPort("tick", size, weakly(self._calc), sources)
         self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._remember))
@@ -241,6 +248,25 @@ class ExplicitTorque(LeafSystem):
         # As a whole the solver's part would take longer to hand over than the sum takes.
         solver = (self._solver.damping, self._solver.clamp)
         output.SetFromVector(_loss(last, *ended, *solver, self._velocities))
+
+    def _calc_deflection(self, context: Context, output: BasicVector) -> None:
+        last = _parts(context.get_discrete_state().value(0), self._joints, self._velocities)
+        total = np.zeros(self._joints)
+        if not math.isnan(last.memory[_VELOCITY, 0]):
+            for _, effect, rows in self._others:
+                if effect.effect.deflects:
+                    memory = self._advanced(context, last, effect, rows)
+                    total += effect.effect.deflection(memory, effect.nonlinear)
+        output.SetFromVector(total)
+
+    def _advanced(
+        self, context: Context, last: Tick, effect: ResolvedJointTorque, rows: slice
+    ) -> np.ndarray:
+        """Memory of an effect at the end of the step that ended, (rows, n)."""
+        before, time_step = last.memory, self._time_step
+        velocity = self._joint_state.Eval(context)[self._joints :]
+        ended = (before[_POSITION], before[_COMMAND], context.get_time() - time_step, time_step)
+        return effect.effect.advance(JointMotion(velocity, *ended, before[rows]), effect.nonlinear)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
@@ -285,9 +311,7 @@ class ExplicitTorque(LeafSystem):
                 at_start = motion._replace(velocity=now[_VELOCITY])
                 now[rows] = effect.effect.start(at_start, effect.nonlinear)
             elif effect.effect.has_memory:
-                ended = (before[_POSITION], before[_COMMAND], time - time_step, time_step)
-                step = JointMotion(now[_VELOCITY], *ended, before[rows])
-                now[rows] = effect.effect.advance(step, effect.nonlinear)
+                now[rows] = self._advanced(context, last, effect, rows)
             if k in moving:
                 offset = moving[k].offset(effect, motion._replace(memory=now[rows]))
                 now[self._offsets][moving[k].rows] = offset
@@ -309,11 +333,13 @@ class JointTorqueEffects(Diagram):
         - torque_command
         output_ports:
         - torque_loss
+        - deflection
         - explicit_force
         - clamp_offset
 
     Inputs are those of `ExplicitTorque`. `torque_loss` (n,) [Nm] is that of the plant step that
-    ended (zero before the first). `explicit_force` goes to the plant's applied generalized force;
+    ended (zero before the first), `deflection` that of `ExplicitTorque`. `explicit_force` goes to
+    the plant's applied generalized force;
     `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm], where any has one.
     """
 
@@ -329,7 +355,8 @@ class JointTorqueEffects(Diagram):
         builder.Connect(tick, split.get_input_port())
         for name in ("joint_state", "net_actuation", "torque_command"):
             builder.ExportInput(explicit.GetInputPort(name), name)
-        builder.ExportOutput(explicit.GetOutputPort("torque_loss"), "torque_loss")
+        for name in ("torque_loss", "deflection"):
+            builder.ExportOutput(explicit.GetOutputPort(name), name)
         builder.ExportOutput(split.get_output_port(0), "explicit_force")
         if law.moves_clamps:
             builder.ExportOutput(split.get_output_port(2), "clamp_offset")

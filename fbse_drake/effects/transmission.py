@@ -158,7 +158,7 @@ class Backlash(JointTorqueEffect):
 
     In the gap the rotor turns against the link with the acceleration command / rotor_inertia; the
     link's own motion is left out, and so is the impact at the other side. The step in which the gap
-    closes counts in part.
+    closes counts in part. An encoder on the motor's side shows where the rotor is in the gap.
     """
 
     description: ClassVar[str] = (
@@ -176,6 +176,7 @@ class Backlash(JointTorqueEffect):
         ),
     }
     has_memory: ClassVar[bool] = True
+    deflects: ClassVar[bool] = True
 
     gap: dict[str, float] = field(default_factory=dict)
     rotor_inertia: dict[str, float] = field(default_factory=lambda: {"all": 0.25})
@@ -186,6 +187,16 @@ class Backlash(JointTorqueEffect):
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
         _, _, share = _cross(motion, nonlinear)
         return (share * motion.command,), (0.0,)
+
+    @classmethod
+    def shows_under(cls, command: np.ndarray) -> bool:
+        """Where the torque never changes sign the motor stays on one side, as with another zero of
+        its encoder."""
+        return bool(command.min() < 0 < command.max())
+
+    @staticmethod
+    def deflection(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
+        return memory[0]
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:

@@ -317,13 +317,13 @@ def _plain_log(axis: Axis) -> None:
 
 # What an error may depend on, of a revolute and of a prismatic joint, by the unit of its row.
 _LABELS = {
-    "Nm": {
+    "turns": {
         "speed": "|velocity| [rad/s]\n(error along the motion)",
         "velocity": "velocity [rad/s]",
         "position": "angle [rad]",
         "load": "torque command [Nm]",
     },
-    "N": {
+    "slides": {
         "speed": "|velocity| [m/s]\n(error along the motion)",
         "velocity": "velocity [m/s]",
         "position": "position [m]",
@@ -335,7 +335,9 @@ _LABELS = {
 def _label(variable: str, row: Row) -> str:
     if variable == "time":
         return "time [s]"
-    return _LABELS[row.unit][variable] if row.kind == "joint" else f"{variable} [N]"
+    if not row.joint:
+        return f"{variable} [N]"
+    return _LABELS["slides" if row.unit in ("N", "m") else "turns"][variable]
 
 
 def binned_variables(channel: Channel) -> list[str]:

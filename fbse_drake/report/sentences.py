@@ -35,7 +35,12 @@ _NOTHING = Step(
     "Nothing. A motion that loads and moves the joints more would show smaller effects."
 )
 
-_KINDS = {"joint": "joints", "base": "rows of the base", "kinematic": "rows of the soles"}
+_KINDS = {
+    "joint": "joints",
+    "base": "rows of the base",
+    "kinematic": "rows of the soles",
+    "transmission": "transmissions",
+}
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from fbse_drake.sensors import (
     imu,
     joint_temperature,
     joint_torque,
+    motor_encoders,
 )
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "imu",
     "joint_temperature",
     "joint_torque",
+    "motor_encoders",
 ]

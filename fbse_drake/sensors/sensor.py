@@ -68,9 +68,9 @@ class Sensor(ABC):
 
         Its output ports are those of its signals. Its input ports are named like the robot's
         ports, of which it takes what it needs: `joint_state` [q, v], `torque_command` and
-        `torque_loss` (of the step that ended), `body_poses`, `body_spatial_velocities`,
-        `body_spatial_accelerations` and `reaction_forces` (of the step that ends), see
-        `fbse_drake.station.add_robot`.
+        `torque_loss` (of the step that ended), `deflection`, `body_poses`,
+        `body_spatial_velocities`, `body_spatial_accelerations` and `reaction_forces` (of the step
+        that ends), see `fbse_drake.station.add_robot`.
         """
 
     def add(

@@ -241,7 +241,7 @@ class _RowErrors:
         """When each phase is, and the names of those that exclude each other."""
         sides, single = description.sides, standing.sum(axis=1) == 1
         own = next(
-            (k for k, leg in enumerate(description.legs.values()) if self.row.name in leg.joints),
+            (k for k, leg in enumerate(description.legs.values()) if self.row.joint in leg.joints),
             None,
         )
         both = {"double_support": standing.all(axis=1)} if len(sides) == 2 else {}
@@ -258,7 +258,8 @@ class _RowErrors:
     ) -> dict[str, _Variable]:
         plus, signals = np.ones(len(self.time)), residual.signals
         found = [_Variable("none", 0 * plus, plus, np.array([-np.inf, np.inf]))]
-        if self.row.kind == "joint":
+        if self.row.joint:
+            place = residual.row_index[self.row.joint]
             velocity = signals.joint_velocity[:, place]
             speeds = self._edges(np.abs(velocity), _SPEED_QUANTILES)[1:-1]
             speeds = speeds[speeds > 0]
@@ -531,7 +532,8 @@ def words(name: str) -> str:
 def range_text(row: Row, where: Bin) -> str:
     """The range of a bin's variable, as `|velocity| < 0.1 rad/s`; empty if it is the whole
     range."""
-    quantities = _QUANTITY_ALONG if row.kind == "joint" and row.unit == "N" else _QUANTITY
+    slides = bool(row.joint) and row.unit in ("N", "m")
+    quantities = _QUANTITY_ALONG if slides else _QUANTITY
     name, unit = quantities.get(where.variable, (where.variable, "N"))
     low, high = (f"{bound:.4g}" for bound in (where.low, where.high))
     from_below = np.isinf(where.low) or (where.variable == "speed" and where.low == 0)
@@ -585,6 +587,9 @@ def _text(row: Row, where: Bin, *, has_phases: bool) -> str:
             f"model {'force' if row.unit == 'N' else 'torque'} {size} {unit} too "
             f"{'low' if more else 'high'}{along}"
         )
+    elif row.kind == "transmission":
+        along = " in the direction of motion" if where.variable == "speed" else ""
+        what = f"motor {size} {unit} {'ahead of' if more else 'behind'} its link{along}"
     elif kind == "force" and axis == "z":
         what = (
             f"the feet push {size} N {'more' if more else 'less'} upwards "

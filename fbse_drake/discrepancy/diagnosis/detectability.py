@@ -60,11 +60,15 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
             if len(here)
             else 0
         )
-        needed = fits.needed(len(effect.parameters)) + fits.systematic(np.array([row]))
-        sets = grid.sets[row]
-        gram, _ = beside.moments_of_sets(sets.signature, 0, sets.gram)
-        power = gram[:, 0, 0] / beside.scale[row]
-        if not np.all(
+        rows = fits.dictionary.rows_of(effect, [joint])
+        needed = fits.needed(len(effect.parameters)) + fits.systematic(rows)
+        grams = {
+            at: beside.moments_of_sets(grid.sets[at].signature, 0, grid.sets[at].gram)[0]
+            for at in rows.tolist()
+        }
+        power = sum(gram[:, 0, 0] / beside.scale[at] for at, gram in grams.items())
+        command = fits.dictionary.predictor.motion.signals.torque_command[:, row]
+        if not effect.shows_under(command) or not np.all(
             effect.shows_within(
                 fits.dictionary.travel[row], fits.dictionary.usual_at(effect, joint)
             )
@@ -111,11 +115,17 @@ def separation(
     total = float((signal**2).sum())
     if issubclass(rival, JointTorqueEffect):
         grid = fits.grid(rival)
-        for row, joint in enumerate(fits.dictionary.joints):
-            if joint in targets and signal[:, row].any():
-                sets = grid.sets[row]
-                right = columns_of(sets.signature)[0].T @ signal[:, row]
-                gain = grid_gain(rival, sets.gram, right.reshape(sets.gram.shape[:2]))
+        for joint in (joint for joint in fits.dictionary.joints if joint in targets):
+            rows = fits.dictionary.rows_of(rival, [joint]).tolist()
+            if signal[:, rows].any():
+                sets = [grid.sets[row] for row in rows]
+                rights = [
+                    (columns_of(s.signature)[0].T @ signal[:, row]).reshape(s.gram.shape[:2])
+                    for s, row in zip(sets, rows, strict=True)
+                ]
+                gain = grid_gain(
+                    rival, np.sum([s.gram for s in sets], axis=0), np.sum(rights, axis=0)
+                )
                 total -= float(gain.max())
         return total
     gains = []

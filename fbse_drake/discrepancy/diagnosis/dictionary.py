@@ -115,9 +115,20 @@ class Dictionary:
         return [*((joint,) for joint in self.joints), *dict.fromkeys(wider)]
 
     def groups_of(self, effect: type[JointTorqueEffect]) -> list[tuple[str, ...]]:
-        """Those of the groups all of whose joints can have an effect."""
+        """Those of the groups all of whose joints can have an effect; of several joints, if the log
+        shows in all what it is."""
         allowed = set(self._targets(effect))
-        return [group for group in self.groups if allowed.issuperset(group)]
+        command = self.predictor.motion.signals.torque_command
+        shown = {
+            joint
+            for joint, of_joint in zip(self.joints, command.T, strict=True)
+            if effect.shows_under(of_joint)
+        }
+        return [
+            group
+            for group in self.groups
+            if allowed.issuperset(group) and (len(group) == 1 or shown.issuperset(group))
+        ]
 
     @cached_property
     def fixed(self) -> list[FixedColumns]:
@@ -128,23 +139,39 @@ class Dictionary:
             self.progress("predicting what each effect would do", k / len(self.effects))
             if issubclass(effect, JointTorqueEffect):
                 continue
-            # Their nonlinear parameters keep the default.
             for target in self._targets(effect):
-                usual = self.usual_at(effect, target)
-                raw = self.predictor.signature(effect, target, usual)
-                raw = replace(
-                    raw,
-                    lowest=effect.lowest_values(self.predictor.robot, target),
-                    prior=effect.linear_beliefs() ** -2,
-                )
-                if len(raw.rows):
-                    noise = (
-                        self.predictor.noise_in(effect, target, raw)
-                        if issubclass(effect, InertiaEffect)
-                        else None
-                    )
-                    result.append(FixedColumns(effect, target, usual, raw, noise))
+                usual = self._fixed(effect, target, self.usual_at(effect, target))
+                if self._is_deflection(usual.signature):
+                    points = self._around(effect, target)
+                    result += [self._fixed(effect, target, values) for values in points]
+                if len(usual.signature.rows):
+                    result.append(usual)
         return result
+
+    def _fixed(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> FixedColumns:
+        raw = self.predictor.signature(effect, target, nonlinear)
+        raw = replace(
+            raw,
+            lowest=effect.lowest_values(self.predictor.robot, target),
+            prior=effect.linear_beliefs() ** -2,
+        )
+        noise = None
+        if issubclass(effect, InertiaEffect) and len(raw.rows):
+            noise = self.predictor.noise_in(effect, target, raw)
+        return FixedColumns(effect, target, nonlinear, raw, noise)
+
+    def _is_deflection(self, signature: Signature) -> bool:
+        """Does an effect show in a transmission alone? Elsewhere the data hardly tell nonlinear
+        parameters of what is no joint torque effect from others: they keep their default."""
+        rows = self.predictor.motion.rows
+        kinds = {rows[row].kind for row in signature.rows}
+        return kinds == {"transmission"}
+
+    def _around(self, effect: type[Effect], target: str) -> list[np.ndarray]:
+        """Values over the plausible ranges of nonlinear parameters, (m,) each; none without any."""
+        searched = [p for p in self.parameters(effect, target).values() if not p.linear]
+        axes = [np.geomspace(*p.plausible, p.grid) for p in searched]
+        return [np.array(values) for values in itertools.product(*axes)] if axes else []
 
     def _targets(self, effect: type[Effect]) -> Sequence[str]:
         """What an effect is tried on. Of bodies whose inertia is not trusted all is fitted
@@ -152,7 +179,9 @@ class Dictionary:
         if effect.acts_on == "body":
             suspected = effect.suspected_bodies(self.predictor.robot)
             return [body for body in suspected if body not in self._untrusted]
-        driven = self.predictor.is_driven
+        driven, motion = self.predictor.is_driven, self.predictor.motion
+        if effect.needs_motor_encoder and not motion.signals.motor_position.shape[1]:
+            return []
         return {
             "joint": [
                 joint
@@ -162,6 +191,11 @@ class Dictionary:
             "foot": self.predictor.robot.description.sides,
             "robot": ["robot"],
         }[effect.acts_on]
+
+    def rows_of(self, effect: type[JointTorqueEffect], joints: Sequence[str]) -> np.ndarray:
+        """Places of the rows in which a joint torque effect on some joints shows, those of their
+        torques first; see `Predictor.rows_of`."""
+        return self.predictor.rows_of(effect, np.array([self.joints.index(j) for j in joints]))
 
     def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
         """First grid of an effect's nonlinear values for each joint, (m, G, n)."""
@@ -177,13 +211,13 @@ class Dictionary:
         return points[:, :, None] * factors[:, None]
 
     def grid(self, effect: type[JointTorqueEffect]) -> np.ndarray:
-        """Columns of an effect's first grid, (B, n, p, G)."""
+        """Columns of an effect's first grid in the rows of all joints, (B, r, p, G)."""
         if effect in self._grids:
             return self._grids[effect]
         self.progress("predicting what each joint effect would do", self._predicted)
-        columns = self.predictor.joint_columns(
-            effect, self.points(effect), np.arange(len(self.joints))
-        )
+        rows = self.rows_of(effect, self.joints)
+        points = self.points(effect)[..., self.predictor.joints_of(rows)]
+        columns = self.predictor.joint_columns(effect, points, rows)
         columns = np.transpose(columns, (2, 3, 0, 1))
         # Where no law is doubted, nothing is weighed anew, and nobody asks again.
         if self.per_step:

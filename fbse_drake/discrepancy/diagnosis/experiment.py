@@ -57,6 +57,7 @@ def planned_log(scenario: Scenario) -> Log:
         specific_force @ R_BI,
         np.zeros((len(coarse), pads, 3)),
         np.zeros((len(coarse), n)),
+        np.zeros((len(coarse), 0)),
     )
     if robot.has_floating_base and plan is not None:
         support = np.stack([plan.support(side) for side in robot.description.sides], axis=1)
@@ -79,6 +80,8 @@ def planned_log(scenario: Scenario) -> Log:
         "imu/linear_acceleration": sampled(at.specific_force),
         "imu/angular_velocity": sampled(at.angular_velocity),
     }
+    if scenario.sensors.motor_encoders is not None:
+        channels["joint/motor_position"] = channels["joint/position"]
     force = sampled(at.pad_force)
     for foot, side in enumerate(robot.description.sides):
         channels[f"foot/{side}/pad_force"] = force[:, equation.pads.foot == foot]

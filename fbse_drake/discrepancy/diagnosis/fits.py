@@ -1,7 +1,7 @@
 """Fits of explanations to one residual: how well effects explain it together, and what they
 leave."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -45,7 +45,7 @@ _MOST_POLISHED = 5_000_000
 
 @dataclass(frozen=True)
 class ColumnSets:
-    """Columns of a joint torque effect in one joint for G sets of its nonlinear values."""
+    """Columns of a joint torque effect in one row for G sets of its nonlinear values."""
 
     # Whitened, p columns for each set, one set after the other.
     signature: Signature
@@ -64,8 +64,8 @@ class Grid:
 
     # (m, G, n).
     points: np.ndarray
-    # For each joint.
-    sets: tuple[ColumnSets, ...]
+    # By row.
+    sets: Mapping[int, ColumnSets]
 
 
 class Fits:
@@ -205,6 +205,8 @@ class Fits:
             if c in taking:
                 added = c.raw.values @ parameters[start:stop] + c.raw.offset
                 for row, values in zip(c.raw.rows, added.T, strict=True):
+                    if row >= torque.shape[1]:
+                        continue
                     taken[row] = taken.get(row, 0.0) + values
             start = stop
         factor = np.ones(self.white.y.shape[1])
@@ -234,8 +236,9 @@ class Fits:
         """First grid of an effect's nonlinear values, in all joints."""
         if effect.__name__ not in self._grids:
             points, columns = self.dictionary.points(effect), self.dictionary.grid(effect)
-            sets = (self._whitened(columns[:, j], j) for j in range(columns.shape[1]))
-            self._grids[effect.__name__] = Grid(points, tuple(sets))
+            rows = self.dictionary.rows_of(effect, self.dictionary.joints).tolist()
+            sets = {row: self._whitened(columns[:, k], row) for k, row in enumerate(rows)}
+            self._grids[effect.__name__] = Grid(points, sets)
         return self._grids[effect.__name__]
 
     def sets(
@@ -246,7 +249,7 @@ class Fits:
         *,
         noisier: bool = False,
     ) -> ColumnSets:
-        """Sets of an effect's nonlinear values, (m, G), in one joint; if they are to be noisier,
+        """Sets of an effect's nonlinear values, (m, G), in one row; if they are to be noisier,
         with the sensors' noise once more."""
 
         def made() -> ColumnSets:
@@ -274,7 +277,7 @@ class Fits:
         Args:
             beside: what the explanation leaves that it is to be added to.
         """
-        places = np.array([self.dictionary.joints.index(joint) for joint in group])
+        places = self.dictionary.rows_of(effect, group)
         parameters = self.dictionary.parameters(effect, group[0])
         names = [name for name, parameter in parameters.items() if not parameter.linear]
         smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])

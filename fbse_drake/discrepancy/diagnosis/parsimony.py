@@ -347,8 +347,8 @@ def _on_fewer_targets(
         others = [c for c in explanation.candidates if c is not member]
         rest = proposals.fits.explain(others)
         gain = judge.gain_by_row(rest, explanation)
-        joints = proposals.fits.dictionary.joints
-        kept = tuple(t for t in member.targets if gain[joints.index(t)] > -MARGIN)
+        rows_of = proposals.fits.dictionary.rows_of
+        kept = tuple(t for t in member.targets if gain[rows_of(member.effect, [t])].sum() > -MARGIN)
         if kept and len(kept) < len(member.targets):
             yield proposals.beside(rest, member.effect, kept)
 

@@ -22,7 +22,6 @@ from fbse_drake.discrepancy.residual.residual import (
     block_means,
     foot_pairs,
     joint_velocity_noise,
-    residual_rows,
     rms,
     within_steps,
 )
@@ -43,6 +42,7 @@ from fbse_drake.effects.joint_torque import (
     JointTorqueEffect,
     ResolvedJointTorque,
     basis_over_time,
+    deflection_over_time,
 )
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError, located
@@ -124,7 +124,7 @@ class Predictor:
     @property
     def rows(self) -> int:
         """Number of the residual's rows."""
-        return len(residual_rows(self.robot))
+        return len(self.motion.rows)
 
     @cached_property
     def residual(self) -> Residual:
@@ -220,11 +220,11 @@ class Predictor:
         in the residual already."""
         result = np.zeros((len(self.motion.time), self.rows))
         if issubclass(effect.effect, JointTorqueEffect):
-            columns = self.joint_columns(
-                effect.effect, effect.nonlinear, np.arange(len(effect.targets))
-            )
+            rows = self.rows_of(effect.effect, np.arange(len(effect.targets)))
+            joint = self.joints_of(rows)
+            columns = self.joint_columns(effect.effect, effect.nonlinear[:, joint], rows)
             amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
-            result[:, : len(effect.targets)] = np.einsum("pbn,pn->bn", columns, amounts)
+            result[:, rows] = np.einsum("pbn,pn->bn", columns, amounts[:, joint])
         elif issubclass(effect.effect, ContactEffect):
             signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
             result[:, signature.rows] = signature.values @ effect.linear[:, 0]
@@ -296,34 +296,82 @@ class Predictor:
         """Which joints get any torque, (n,) bool: the others show nothing of a motor."""
         return self.motion.signals.torque_command.any(axis=0)
 
+    def rows_of(self, effect: type[JointTorqueEffect], joints: np.ndarray) -> np.ndarray:
+        """Places of the rows in which a joint effect on some joints (T,) shows: their torques, and
+        the deflections of their transmissions where it has any and they are measured."""
+        motors = self.motion.signals.motor_position.shape[1]
+        if not (effect.deflects and motors):
+            return joints
+        return np.concatenate([joints, self.rows - motors + joints])
+
+    def joints_of(self, rows: np.ndarray) -> np.ndarray:
+        """Places of the joints of such rows."""
+        n = len(self.robot.joint_names)
+        return np.where(rows < n, rows, rows - self.rows + n)
+
     def joint_columns(
         self,
         effect: type[JointTorqueEffect],
         nonlinear: np.ndarray,
-        joints: np.ndarray,
+        rows: np.ndarray,
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """Torque of a joint effect per unit of each linear parameter, averaged over blocks.
+        """What a joint effect adds to rows of its joints per unit of each linear parameter, block
+        by block.
 
         Args:
-            nonlinear: (m, T), or (m, G, T) for G sets of values, for the joints.
-            joints: places of the joints, shape (T,).
+            nonlinear: (m, T), or (m, G, T) for G sets of values, for the rows.
+            rows: their places, see `rows_of`, shape (T,).
             noisier: with the sensors' noise once more.
 
         Returns:
             Shape (p, B, T), or (p, G, B, T); zero where the effect needs a motor and none is known
             to drive the joint.
         """
+        torques = rows < len(self.robot.joint_names)
+        parts = [
+            columns(effect, nonlinear[..., of], self.joints_of(rows[of]), noisier=noisier)
+            for of, columns in ((torques, self._torques), (~torques, self._deflections))
+            if of.any()
+        ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+
+    def _deflections(
+        self,
+        effect: type[JointTorqueEffect],
+        nonlinear: np.ndarray,
+        joints: np.ndarray,
+        *,
+        noisier: bool,
+    ) -> np.ndarray:
+        """Of the deflections of these joints."""
+        motion = self._motion_of(joints, 1, noisier=noisier)
+        motion = motion._replace(command=self.motion.steps.torque_command[:, joints])
+        begin = deflection_over_time(effect, motion, nonlinear)
+        end = np.concatenate([begin[..., 1:, :], begin[..., -1:, :]], axis=-2)
+        share = self.motion.motion_share
+        amid = (1.0 - share) * begin + share * end
+        return self.is_driven[joints] * self._averages(amid[None], 1)
+
+    def _motion_of(self, joints: np.ndarray, step: int, *, noisier: bool) -> JointMotion:
+        """What effects on some joints depend on, averaged over so many steps."""
+        whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
+        names = ("velocity", "position", "command", "load")
+        return whole._replace(**{name: getattr(whole, name)[:, joints] for name in names})
+
+    def _torques(
+        self,
+        effect: type[JointTorqueEffect],
+        nonlinear: np.ndarray,
+        joints: np.ndarray,
+        *,
+        noisier: bool,
+    ) -> np.ndarray:
+        """Of the torques of these joints."""
         # What remembers must see every step.
         step = 1 if effect.has_memory else self._joined_steps
-        whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
-        motion = whole._replace(
-            **{
-                name: getattr(whole, name)[:, joints]
-                for name in ("velocity", "position", "command", "load")
-            }
-        )
+        motion = self._motion_of(joints, step, noisier=noisier)
         acts = self.is_driven[joints].astype(float) if effect.needs_motor else 1.0
         if nonlinear.ndim == 2:
             return acts * self._averages(basis_over_time(effect, motion, nonlinear), step)
@@ -365,8 +413,9 @@ class Predictor:
         """
         if issubclass(effect, JointTorqueEffect):
             joint = self.robot.joint_names.index(target)
-            columns = self.joint_columns(effect, nonlinear[:, None], np.array([joint]))
-            return Signature(np.array([joint]), np.moveaxis(columns, 0, 2))
+            rows = self.rows_of(effect, np.array([joint]))
+            values = np.repeat(nonlinear[:, None], len(rows), axis=1)
+            return Signature(rows, np.moveaxis(self.joint_columns(effect, values, rows), 0, 2))
         if issubclass(effect, ContactEffect):
             values = self._contact_columns(effect)
         else:
@@ -663,7 +712,7 @@ class Predictor:
         posture, rate = (
             (2 * share, 3 * share - 1) if motion.recording.rows == "per_step" else (0.5, 0.0)
         )
-        place = result.shape[1] - sum(row.kind == "kinematic" for row in residual_rows(self.robot))
+        place = next(k for k, row in enumerate(motion.rows) if row.kind == "kinematic")
         velocities = []
         for rotation, displacement in motions:
             turning, moving = (

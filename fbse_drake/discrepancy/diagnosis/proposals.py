@@ -87,7 +87,7 @@ class Proposals:
             dictionary.progress(LOOKING, 0.3 * k / len(dictionary.joint_effects))
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
             for group in dictionary.groups_of(effect):
-                places = [dictionary.joints.index(joint) for joint in group]
+                places = dictionary.rows_of(effect, group)
                 if (
                     taken & set(group)
                     or (effect, group) in self._barred
@@ -154,7 +154,7 @@ class Proposals:
         """An explanation with one more joint torque effect, with the nonlinear values that fit best
         beside it."""
         remainder = self.fits.remainder(base)
-        places = [self.fits.dictionary.joints.index(joint) for joint in targets]
+        places = self.fits.dictionary.rows_of(effect, targets)
         moments = self._grid_moments(effect, places, remainder)
         gain = grid_gain(effect, *_weighted(moments, remainder.scale[places]))
         best = self._best_on(effect, targets, int(gain.argmax()), remainder)
@@ -175,9 +175,9 @@ class Proposals:
     def _grid_moments(
         self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
     ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Inner products of the sets of an effect's first grid, in each of some joints."""
+        """Inner products of the sets of an effect's first grid, in each of some rows."""
         grid, moments = self.fits.grid(effect), []
-        for place in places:
+        for place in map(int, places):
             # Found once for what an explanation has in a row.
             key = (effect, place, *beside.beside(place).key)
             if key not in self._moments:
@@ -208,7 +208,7 @@ class Proposals:
     ) -> Candidate:
         """A joint torque effect with the nonlinear values that fit best; found once for what is
         left in the group's rows."""
-        places = [self.fits.dictionary.joints.index(joint) for joint in group]
+        places = self.fits.dictionary.rows_of(effect, group)
         key = (effect, group, *(part for j in places for part in beside.beside(j).key))
 
         def made() -> Candidate:

@@ -162,10 +162,10 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     """Does a candidate bring more than chance to an explanation without it, with values that can
     be?"""
     rows = added.signature.rows
-    if issubclass(added.effect, JointTorqueEffect) and not np.any(
-        added.effect.shows_within(fits.dictionary.travel[rows], added.nonlinear)
-    ):
-        return False
+    if issubclass(added.effect, JointTorqueEffect):
+        travel = fits.dictionary.travel[fits.dictionary.predictor.joints_of(rows)]
+        if not np.any(added.effect.shows_within(travel, added.nonlinear)):
+            return False
     if base.deviance - wider.deviance < fits.required(added):
         return False
     if fits.dictionary.per_step:

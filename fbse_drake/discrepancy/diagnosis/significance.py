@@ -21,7 +21,8 @@ class Significance:
         """Measures the log.
 
         Joint rows are measured by their torque, base rows by what the feet give, those of soles by
-        how fast single joints turn and move them, and by gravity.
+        how fast single joints turn and move them, and by gravity; deflections by how they vary, for
+        the zero of a second encoder may be anywhere.
         """
         motion, equation = predictor.motion, predictor.motion.equation
         blocks, rows = motion.blocks, motion.residual.rows
@@ -41,6 +42,12 @@ class Significance:
                 ("relative_velocity", _length(legs[:, 3:])),
             ):
                 self._sizes[[kind in row.name for row in rows]] = size
+
+        if motors := blocks.motor_position.shape[1]:
+            deflection = blocks.motor_position - blocks.joint_position
+            known = motion.known[:, -motors:]
+            mean = np.average(deflection, axis=0, weights=np.maximum(known, 1e-12))
+            self._sizes[-motors:] = rms(deflection - mean, known)
 
     def share(self, explanation: Explanation, candidate: Candidate) -> float:
         """Largest root mean square of what a member of an explanation adds to a row, as a share of

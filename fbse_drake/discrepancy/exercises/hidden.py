@@ -174,6 +174,7 @@ _RECIPES = {
     "GyroscopeBias": Recipe((2e-3, 4e-2), _vector("xyz")),
     "ImuMisalignment": Recipe((5e-3, 4e-2), _vector("xyz")),
     "EncoderOffset": Recipe((1e-3, 1e-2), _signed("offset")),
+    "MotorEncoderOffset": Recipe((1e-3, 1e-2), _signed("offset")),
     "TransmissionElasticity": Recipe(
         (1e-5, 1e-4),
         lambda draw, size: {"compliance": size, "time_constant": draw.between(5e-3, 1.5e-2)},
@@ -392,7 +393,9 @@ def _hidden_effect(
 
 def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
     """Can the robot have it? In a gantry, only in its joints; feet creep only if the contact solver
-    lets them."""
+    lets them, and few robots have second encoders."""
+    if effect.needs_motor_encoder and scenario.sensors.motor_encoders is None:
+        return False
     if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in (
         "lagged",
         "similar",

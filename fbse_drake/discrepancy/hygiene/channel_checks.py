@@ -284,6 +284,7 @@ def estimated_noise(motion: RecordedMotion) -> list[NoiseLevel]:
     evidence = Evidence(motion)
     believed = {
         "joint/position": max(sensors.encoders.noise, sensors.encoders.resolution / np.sqrt(12)),
+        "joint/motor_position": (sensors.motor_encoders or sensors.encoders).angle_noise,
         "joint/velocity": sensors.encoders.velocity_noise
         if sensors.encoders.velocity == "exact"
         else np.nan,

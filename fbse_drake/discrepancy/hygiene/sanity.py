@@ -19,6 +19,8 @@ _ANOTHER_UNIT = 20.0
 # Angles beyond this, or this many times as large as the joint's limits and beyond them by so much,
 # are no angles in radians [rad].
 _LARGEST_ANGLE, _BEYOND_LIMITS, _BEYOND = 4 * np.pi, 3.0, 1.0
+# A joint that moves less than this, root mean square, says nothing about its second encoder [rad].
+_SMALLEST_MOTION = 0.05
 # A base that turns less than this, root mean square, says nothing about its gyroscope [rad/s].
 _SMALLEST_RATE = 0.02
 
@@ -32,6 +34,7 @@ def check_sensors(motion: RecordedMotion) -> None:
     robot = motion.robot
     _check_angles(motion)
     _check_velocity(motion)
+    _check_motor_angles(motion)
     if robot.has_floating_base:
         _check_gravity(motion)
         _check_weight(motion)
@@ -78,6 +81,21 @@ def _check_velocity(motion: RecordedMotion) -> None:
             raise InputError(
                 f"channel joint/velocity: {joint} reads {slope:.2g} times the rate "
                 f"of joint/position; {hint}"
+            )
+
+
+def _check_motor_angles(motion: RecordedMotion) -> None:
+    """A second encoder must turn as the joint does, but for what the transmission gives."""
+    of_motor = motion.signals.motor_position
+    moved = motion.signals.joint_position - motion.signals.joint_position.mean(axis=0)
+    power = (moved**2).mean(axis=0)
+    for k in np.flatnonzero(np.sqrt(power[: of_motor.shape[1]]) > _SMALLEST_MOTION):
+        slope = float((of_motor[:, k] * moved[:, k]).mean() / power[k])
+        if not 0.7 < slope < 1.3:
+            raise InputError(
+                f"channel joint/motor_position: {motion.robot.joint_names[k]} turns {slope:.3g} "
+                "times as far as joint/position; expected the motor's angle divided by the gear's "
+                "ratio, in the joint's direction"
             )
 
 

@@ -30,7 +30,6 @@ from fbse_drake.discrepancy.residual.residual import (
     EquationOfMotion,
     Instants,
     RecordedMotion,
-    residual_rows,
 )
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import (
@@ -261,7 +260,7 @@ class UntrustedInertia:
 
 def untrusted_inertia(motion: RecordedMotion, bodies: Sequence[str]) -> UntrustedInertia:
     """Columns of the bodies' inertial parameters over a log."""
-    rows = sum(row.kind != "kinematic" for row in residual_rows(motion.robot))
+    rows = sum(row.kind in ("joint", "base") for row in motion.rows)
     size = len(PARAMETERS)
     model = np.concatenate([_of_body(motion.robot, body) for body in bodies])
     scale, columns = (

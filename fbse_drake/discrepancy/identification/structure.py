@@ -85,16 +85,17 @@ def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dic
         n = len(values)
         return 0.25 * (padded[:n] + padded[1 : n + 1] + padded[5 : n + 5] + padded[6 : n + 6])
 
-    if row < n:
-        velocity = without_own_noise(blocks.joint_velocity[:, row])
-        result["position"] = hat_functions(blocks.joint_position[:, row])
+    if joint := white.residual.rows[row].joint:
+        own = white.residual.row_index[joint]
+        velocity = without_own_noise(blocks.joint_velocity[:, own])
+        result["position"] = hat_functions(blocks.joint_position[:, own])
         # Fine near standstill, coarse elsewhere.
         result["velocity"] = hat_functions(np.arcsinh(velocity / 0.02))
-        result["load"] = hat_functions(without_own_noise(blocks.torque_command[:, row]))
+        result["load"] = hat_functions(without_own_noise(blocks.torque_command[:, own]))
         result["acceleration"] = hat_functions(
-            np.arcsinh(without_own_noise(blocks.joint_acceleration[:, row]))
+            np.arcsinh(without_own_noise(blocks.joint_acceleration[:, own]))
         )
-        others = [j for j in range(n) if j != row]
+        others = [j for j in range(n) if j != own]
         result["other joints' torque"] = blocks.torque_command[:, others]
     else:
         result["angular velocity"] = without_own_noise(blocks.angular_velocity)

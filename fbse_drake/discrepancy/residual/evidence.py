@@ -64,6 +64,7 @@ class Evidence:
         names = {
             "joint/position": self.joints,
             "joint/velocity": self.joints,
+            "joint/motor_position": self.joints,
             "joint/torque_command": self.joints,
             "imu/linear_acceleration": axes,
             "imu/angular_velocity": axes,
@@ -167,6 +168,7 @@ class Evidence:
         }
         return {
             "joint/position": of_angle,
+            "joint/motor_position": of_angle,
             "joint/velocity": {joint: f"{unit}/s" for joint, unit in of_angle.items()},
             "joint/torque_command": dict(zip(self.joints, self.robot.torque_units, strict=True)),
         }

@@ -9,9 +9,10 @@ from scipy.special import comb
 from scipy.stats import chi2
 
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
-from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, residual_rows, rms
+from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, rms
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
+from fbse_drake.sensors.motor_encoders import MotorEncoderConfig
 
 # Order of the differences of neighbours, and their number in a window.
 _ORDER, _WINDOW = 4, 20
@@ -110,6 +111,12 @@ def measured_sensors(
             believed[name] = feet.noise
     if encoders.velocity != "exact" or recording.velocity != "measured":
         del believed["joint/velocity"]
+    second = sensors.motor_encoders or MotorEncoderConfig(encoders.resolution, encoders.noise)
+    if "joint/motor_position" in log:
+        believed |= {
+            "joint/position": encoders.angle_noise,
+            "joint/motor_position": second.angle_noise,
+        }
     noisier = []
     for name, expected in believed.items():
         level = channel_noise(log, name) if name in log else np.nan
@@ -118,9 +125,15 @@ def measured_sensors(
     level_of = believed | {noise.channel: noise.level for noise in noisier}
     feet_level = max((v for name, v in level_of.items() if name.startswith("foot/")), default=0.0)
     velocity = level_of.get("joint/velocity", encoders.velocity_noise)
+    # Beside the rounding.
+    of_link, of_motor = (
+        float(np.sqrt(max(level_of.get(name, 0.0) ** 2 - encoder.resolution**2 / 12.0, 0.0)))
+        for name, encoder in (("joint/position", encoders), ("joint/motor_position", second))
+    )
     measured = replace(
         sensors,
-        encoders=replace(encoders, velocity_noise=velocity),
+        encoders=replace(encoders, velocity_noise=velocity, noise=max(of_link, encoders.noise)),
+        motor_encoders=replace(second, noise=max(of_motor, second.noise)),
         imu=replace(
             imu,
             acceleration_noise=level_of["imu/linear_acceleration"],
@@ -163,7 +176,9 @@ def measured_noise(
     )
     power = noise_power(residual.value, residual.known, believed)
     least = chi2.isf(_FALSE_ALARM / rows, power.freedom) / power.freedom
-    noisy = power.ratio > np.maximum(least, _LEAST**2)
+    # A rotor that goes to and fro in its gap is no noise: that of encoders their channels tell.
+    turned = np.array([row.kind == "transmission" for row in residual.rows])
+    noisy = (power.ratio > np.maximum(least, _LEAST**2)) & ~turned
     typical = np.nan_to_num(rms(np.sqrt(believed), residual.known)) ** 2
     ratio = np.where(noisy, power.ratio, 1.0)
     white = (ratio - 1) * typical * length
@@ -192,7 +207,7 @@ def noise_finding(motion: RecordedMotion, noise: Noise) -> HygieneFinding | None
         for c in noise.channels
         if c.believed > 0
     ]
-    rows, n = residual_rows(motion.robot), len(motion.robot.joint_names)
+    rows, n = motion.rows, len(motion.robot.joint_names)
     torque = motion.blocks.torque_command
     torque_noise = np.sqrt(motion.torque_variance(torque).mean(axis=0) + noise.white[:n])
     worth = motion.step_noise[0].mean(axis=0) + motion.step_noise[1].mean(axis=0) > _ROUNDING

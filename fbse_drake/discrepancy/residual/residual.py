@@ -1,5 +1,5 @@
-"""What the equation of motion leaves over on a log: joint, base and kinematic residuals, with the
-noise that the sensors put into them.
+"""What the equation of motion leaves over on a log: joint, base, kinematic and transmission
+residuals, with the noise that the sensors put into them.
 
 Per plant step, with the base's origin at rest and the measured specific force in the place of
 gravity (see `estimators.floating_base`):
@@ -9,7 +9,9 @@ gravity (see `estimators.floating_base`):
 * kinematic rows, of every standing sole but a point foot's, in its frame: angular velocity, and
   specific force less that of a level resting sole; while both feet stand also the velocity of one
   sole relative to the other; on more than two feet, of one standing point foot relative to the next
-  that stands.
+  that stands;
+* transmission rows, of joints with encoders on both sides of the gear: by how much the motor is
+  ahead of the link.
 
 All are averaged over blocks of time. Averages of one and the same window have one group delay,
 telescope what is differentiated, and leave noise whose covariance is known: white noise
@@ -63,11 +65,13 @@ class Row:
 
     # As `left_knee_pitch`, `base/force_z`, `left_sole/angular_velocity_x`.
     name: str
-    # `joint`, `base` or `kinematic`.
+    # `joint`, `base`, `kinematic` or `transmission`.
     kind: str
     unit: str
     # Sides of the feet whose soles it is about.
     feet: tuple[str, ...] = ()
+    # The joint that it is about.
+    joint: str = ""
 
 
 def foot_pairs(robot: Robot) -> list[tuple[int, int]]:
@@ -85,15 +89,21 @@ def foot_pairs(robot: Robot) -> list[tuple[int, int]]:
     return list(combinations(points, 2))
 
 
-def residual_rows(robot: Robot) -> list[Row]:
-    """The residual's rows for a robot, in order."""
+def residual_rows(robot: Robot, *, motor_encoders: bool = False) -> list[Row]:
+    """The residual's rows for a robot, in order; with second encoders also those that they show."""
+    units = dict(zip(robot.joint_names, robot.torque_units, strict=True))
+    rows = [Row(name, "joint", unit, joint=name) for name, unit in units.items()]
+    rows += _rows_of_floating_base(robot) if robot.has_floating_base else []
+    if motor_encoders:
+        rows += [
+            Row(f"{name}/deflection", "transmission", "m" if unit == "N" else "rad", joint=name)
+            for name, unit in units.items()
+        ]
+    return rows
+
+
+def _rows_of_floating_base(robot: Robot) -> list[Row]:
     rows = [
-        Row(name, "joint", unit)
-        for name, unit in zip(robot.joint_names, robot.torque_units, strict=True)
-    ]
-    if not robot.has_floating_base:
-        return rows
-    rows += [
         Row(f"base/{kind}_{axis}", "base", unit)
         for kind, unit in (("moment", "Nm"), ("force", "N"))
         for axis in _AXES
@@ -194,6 +204,7 @@ def read_signals(
         angular_velocity=angular_velocity,
         pad_force=pad_force,
         torque_command=on_grid(torque) if recording.rows == "instantaneous" else held(torque),
+        motor_position=on_grid(log.get("joint/motor_position", np.zeros((len(log.time), 0)))),
     )
     return signals, known
 
@@ -246,6 +257,8 @@ class Instants:
     # (M, P, 3) [N].
     pad_force: np.ndarray
     torque_command: np.ndarray
+    # (M, n), or (M, 0) without second encoders.
+    motor_position: np.ndarray
 
 
 def steps(
@@ -278,6 +291,7 @@ def steps(
         specific_force=signals.specific_force[1:],
         pad_force=signals.pad_force[1:],
         torque_command=signals.torque_command[:-1],
+        motor_position=within_steps(signals.motor_position, share),
     )
 
 
@@ -395,7 +409,7 @@ class EquationOfMotion:
         """All rows, shape (M, rows); kinematic ones have their value whether or not a sole stands.
 
         Args:
-            kinematic: are the kinematic rows wanted? Else they are left out.
+            kinematic: are the kinematic and transmission rows wanted? Else they are left out.
         """
         if len(at.joint_position) > _MOST_INSTANTS:
             parts = [
@@ -430,6 +444,8 @@ class EquationOfMotion:
                 # The base's columns of J hold R_FB.
                 moving = np.einsum("fmij,fmi->fmj", J[:, :, 3:, 3:6], velocity[..., 3:])
                 kinematic_rows += [moving[one] - moving[other] for one, other in self._pairs]
+        if kinematic and at.motor_position.shape[1]:
+            kinematic_rows.append(at.motor_position - at.joint_position)
         # Joints first.
         joints = at.torque_command - generalized[:, self._joints]
         return np.concatenate(
@@ -524,8 +540,10 @@ class EquationOfMotion:
         """
         robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
         M, n, v = len(at.joint_position), len(robot.joint_names), len(order)
-        rows = len(residual_rows(robot))
+        motors = at.motor_position.shape[1]
+        rows = len(residual_rows(robot, motor_encoders=motors > 0))
         white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
+        white[:, rows - motors :] = sensors.deflection_noise**2
         velocity_noise = joint_velocity_noise(sensors)
         gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
         floating = robot.has_floating_base
@@ -659,7 +677,8 @@ class RecordedMotion:
                 f"the log is too short: {len(log.time)} samples, at least "
                 f"{20 * self.length} are needed"
             )
-        names = [row.name for row in residual_rows(robot)]
+        self.rows = residual_rows(robot, motor_encoders=self.signals.motor_position.shape[1] > 0)
+        names = [row.name for row in self.rows]
         for pattern in recording.unused_rows:
             if not fnmatch.filter(names, pattern):
                 raise InputError(
@@ -738,7 +757,7 @@ class RecordedMotion:
     @cached_property
     def known(self) -> np.ndarray:
         """Which averages of which rows are known, (B, R)."""
-        rows = residual_rows(self.robot)
+        rows = self.rows
         # A force at the end of the sensor's range is any force beyond it.
         measured = self.measured & (
             np.abs(self.signals.pad_force) < self.sensors.foot_force.range
@@ -767,7 +786,9 @@ class RecordedMotion:
         starts = [self.start, *(part["start"] for part in self.log.meta.get("segments", ()))]
         since = self.time[:, None] - np.array(starts)
         settling = np.any((since >= 0) & (since <= _SETTLING), axis=1)
-        known &= ~kinematic | ~settling[:, None]
+        # Nor is it known where a motor stands in its gap at first.
+        begins = kinematic | np.array([row.kind == "transmission" for row in rows])
+        known &= ~begins | ~settling[:, None]
         around = 2 * round(_ROLLING / (self.length * self.period)) + 1
         at_rest = binary_erosion(self.standing, np.ones((around, 1)), border_value=1)
         for foot, (side, leg) in enumerate(self.robot.description.legs.items()):
@@ -831,7 +852,7 @@ class RecordedMotion:
         covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
         covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
         return Residual(
-            residual_rows(self.robot),
+            self.rows,
             self.time,
             value,
             self.known,
