@@ -7,10 +7,12 @@ table of signals (`fbse_drake.signals`).
 """
 
 from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import (
     Adder,
@@ -31,9 +33,10 @@ from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.robot.description import RobotDescription, load_description
-from fbse_drake.robot.plant import Robot
-from fbse_drake.robot.push import Push, PushSource
-from fbse_drake.scenario import Scenario, build_robot, planned_reference
+from fbse_drake.robot.plant import Ground, Robot
+from fbse_drake.robot.push import AppliedPushes, Push, PushSource
+from fbse_drake.robot.trial_step import TrialStep
+from fbse_drake.scenario import RobotConfig, Scenario, build_robot, planned_reference
 from fbse_drake.sensors.sensor import Run
 from fbse_drake.walking.reference import RecordedReference, Reference
 from fbse_drake.wiring import connect_by_name, outputs_by_name
@@ -171,6 +174,7 @@ def add_robot(
         ground, settings = contact_with_effects(config.effects.values(), *contact)
         simulated = {"builder": builder, "plant": settings, "ground": ground}
         robot = build_robot(config, **simulated, implicit=law.torque)
+        trial = _trial_step(config, settings, ground, law) if scenario.solve_twice else None
         add_pushes(builder, config.pushes, robot)
     reference.set_start(robot, ground)
     plant = robot.plant
@@ -187,8 +191,21 @@ def add_robot(
     }
     for name in ("body_poses", "body_spatial_velocities", "body_spatial_accelerations"):
         ports[name] = plant.GetOutputPort(name)
-    ports |= add_joint_torques(builder, robot, law, time_step, ports)
+    ports |= add_joint_torques(builder, robot, law, time_step, ports, trial)
     return SimulatedRobot(robot, command.get_input_port(), ports)
+
+
+def _trial_step(
+    config: RobotConfig,
+    settings: MultibodyPlantConfig,
+    ground: Ground,
+    law: ImplicitLaw,
+) -> TrialStep:
+    """Of a robot like that of `add_robot`."""
+    builder, settings = DiagramBuilder(), copy(settings)
+    settings.use_sampled_output_ports = False
+    robot = build_robot(config, builder=builder, plant=settings, ground=ground, implicit=law.torque)
+    return TrialStep(robot, builder.Build(), AppliedPushes(config.pushes, robot))
 
 
 def add_pushes(builder: DiagramBuilder, pushes: Mapping[str, Push], robot: Robot) -> None:
@@ -198,7 +215,7 @@ def add_pushes(builder: DiagramBuilder, pushes: Mapping[str, Push], robot: Robot
         InputError: a body that the robot has not.
     """
     if pushes:
-        source = builder.AddNamedSystem("pushes", PushSource(pushes, robot))
+        source = builder.AddNamedSystem("pushes", PushSource(AppliedPushes(pushes, robot)))
         port = robot.plant.get_applied_spatial_force_input_port()
         builder.Connect(source.get_output_port(), port)
 
@@ -220,17 +237,19 @@ def add_joint_torques(
     law: ImplicitLaw,
     time_step: float,
     ports: Ports,
+    trial: TrialStep | None,
 ) -> dict[str, OutputPort]:
     """Adds what moves a robot's joints: commanded torque, and the losses of its effects.
 
     Args:
-        ports: of the robot: `joint_state`, `torque_command` and `net_actuation`.
+        ports: of the robot: `joint_state`, `torque_command`, `net_actuation` and `plant_state`.
+        trial: where every step is tried first, what it is tried with.
 
     Returns:
         `torque_loss`, `deflection` and `explicit_force`.
     """
     plant, instance = robot.plant, robot.base.model_instance()
-    effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step))
+    effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step, trial))
     connect_by_name(builder, ports, effects)
     force = plant.get_applied_generalized_force_input_port()
     builder.Connect(effects.GetOutputPort("explicit_force"), force)

@@ -337,7 +337,7 @@ def test_a_run_that_does_not_follow_a_law_says_so(tmp_path: Path, capsys: pytest
         assert (joint.replace("_", " ") in line) == (value > 0.01)
     said = f"in {worst.replace('_', ' ')} ({share})"
     assert said in line
-    assert "--set plant.time_step=" in line
+    assert "--set solve_twice=true" in line
     assert said in (tmp_path / "report.html").read_text()
 
 

@@ -26,6 +26,7 @@ from fbse_drake.wiring import release
 
 _PAGE = 4096 / 2**20
 _STATISTICS = Path("/proc/self/statm")
+_PUSH = "robot.pushes.lift={body: trunk, force: [0, 0, 9], start: 0, duration: 1}"
 
 
 def resident() -> float:
@@ -42,6 +43,7 @@ def resident() -> float:
             ["sensors.joint_torque={noise: 0.3}", "sensors.more={winding: !JointTemperature {}}"],
         ),
         ("paper_walk_fbse", ["robot.effects.gain=!FootForceGain {gain: {left: 0.1}}"]),
+        ("sway", ["solve_twice=true", _PUSH]),
     ],
 )
 def test_a_released_station_and_all_systems_in_it_are_freed(

@@ -341,6 +341,9 @@ _FOLLOWED = [
     ("leg_swing_gantry", "duration=3", FALLING_LAW),
     ("squat", "duration=2", FALLING_LAW),
     ("sway", "duration=2", FALLING_LAW),
+    ("walks/sideways", "duration=2", FALLING_LAW),
+    # Its feet hit the ground, and then it falls.
+    ("paper_walk_pd", "duration=3", FALLING_LAW),
 ]
 
 

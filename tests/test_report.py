@@ -232,8 +232,8 @@ def test_report_says_where_a_law_is_not_followed(tmp_path):
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
     text = page_text(tmp_path / "report.html")
     assert 'worst joint (left knee)</td><td class="number">25.0</td><td>% of law</td>' in text
-    assert "in left knee (25.0 %), right knee (2.0 %). A smaller plant step" in text
-    assert "--set plant.time_step=" in text
+    assert "in left knee (25.0 %), right knee (2.0 %). Steps that are solved twice" in text
+    assert "--set solve_twice=true" in text
     assert "Thin: the law" in text
 
 
@@ -243,7 +243,7 @@ def test_report_of_laws_that_are_followed_has_their_error_only(tmp_path, walk_re
     write_run_report(tmp_path / "report.html", log, run_metrics(log, 2.0), name="a_walk")
     text = page_text(tmp_path / "report.html")
     assert 'worst joint (left knee)</td><td class="number">0.900</td><td>% of law</td>' in text
-    for words in ("A smaller plant step", "Thin: the law"):
+    for words in ("Steps that are solved twice", "Thin: the law"):
         assert words not in text
     # A log without a law says nothing of it.
     assert "% of law" not in walk_report

@@ -1,7 +1,7 @@
 """Joint torque effects in a diagram."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,6 +12,7 @@ from pydrake.systems.framework import (
     DiagramBuilder,
     LeafSystem,
     State,
+    ValueProducer,
 )
 from pydrake.systems.primitives import Demultiplexer
 
@@ -20,6 +21,7 @@ from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 from fbse_drake.effects.law_table import LawTable, law_table, look_up
 from fbse_drake.robot.implicit import implicit_loss
 from fbse_drake.robot.plant import Robot
+from fbse_drake.robot.trial_step import TrialStep
 from fbse_drake.wiring import weakly
 
 # Share of the last step's change of velocity that is expected of the next: smooth motion would go
@@ -172,6 +174,29 @@ def _calc_steady(
         parts.force[:] = 0.0
 
 
+@njit(cache=True)
+def _correct_steady(
+    tick: np.ndarray,
+    end: np.ndarray,
+    offset: np.ndarray,
+    velocities: int,
+    unit: np.ndarray,
+    rate: np.ndarray,
+    velocity: np.ndarray,
+    torque: np.ndarray,
+    slope: np.ndarray,
+    damping: np.ndarray,
+    clamp_slope: np.ndarray,
+    clamp_limit: np.ndarray,
+    clamp: np.ndarray,
+    velocity_index: np.ndarray,
+) -> None:
+    """Fills the force of a tick of `_calc_steady` anew, for velocities (n,) [rad/s] at its end."""
+    table = LawTable(unit, rate, velocity, torque, slope)
+    solver = _Solver(damping, clamp_slope, clamp_limit, clamp, velocity_index)
+    _finish(_parts(tick, len(end), velocities), end, look_up(table, end), offset, solver)
+
+
 class ExplicitTorque(LeafSystem):
     """What Drake's solver does not take of joint torque effects, and their loss as a whole.
 
@@ -182,6 +207,7 @@ class ExplicitTorque(LeafSystem):
         - joint_state
         - net_actuation
         - torque_command
+        - plant_state (optional)
         output_ports:
         - torque_loss
         - tick
@@ -189,16 +215,23 @@ class ExplicitTorque(LeafSystem):
 
     The explicit torque of a step is the law less what the solver takes of it, both at the velocity
     that is expected at its end. So its error is the slope of this difference, which is small, times
-    what the expectation is wrong by.
+    what the expectation is wrong by. The past tells what to expect; with a `TrialStep`, where the
+    step ends that is made with the torque so found does.
 
     `joint_state` is [positions, velocities], (2n,) [rad, rad/s]; `net_actuation` is the plant's
-    [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins.
-    `torque_loss` (n,) [Nm] is that of the step that ended (zero before the first); `tick` has the
-    parts of `Tick`; `deflection` (n,) [rad] is by how much effects let the motors be ahead of their
-    links now. Discrete state: the last tick.
+    [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins;
+    `plant_state` is there where steps are tried. `torque_loss` (n,) [Nm] is that of the step that
+    ended (zero before the first); `tick` has the parts of `Tick`; `deflection` (n,) [rad] is by how
+    much effects let the motors be ahead of their links now. Discrete state: the last tick.
     """
 
-    def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
+    def __init__(
+        self,
+        law: ImplicitLaw,
+        robot: Robot,
+        time_step: float,
+        trial: TrialStep | None = None,
+    ):
         super().__init__()
         n, torque = len(robot.joint_names), law.torque
         self._law, self._time_step, self._joints = law, time_step, n
@@ -221,10 +254,18 @@ class ExplicitTorque(LeafSystem):
             if effect.effect.has_memory:
                 rows += len(effect.effect.start(still, effect.nonlinear))
             self._others.append((k, effect, slice(start, rows)))
+        self._trial = None if self._is_solved and not self._others else trial
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
         actuators = robot.plant.num_actuators()
         self._net_actuation = self.DeclareVectorInputPort("net_actuation", actuators)
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
+        if self._trial is not None:
+            states = robot.plant.num_multibody_states()
+            self._plant_state = self.DeclareVectorInputPort("plant_state", states)
+            # Never computed anew: an entry of the cache is what a context can keep for itself.
+            never: Any = ValueProducer.NoopCalc
+            producer = ValueProducer(self._trial.allocate, never)
+            self._workspace = self.DeclareCacheEntry("trial", producer, {self.nothing_ticket()})
         size = self._velocities + rows * n
         self._last = self.DeclareDiscreteState(np.full(size, math.nan))
         ended = (self._joint_state, self._net_actuation)
@@ -272,24 +313,34 @@ class ExplicitTorque(LeafSystem):
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
         joint_state = self._joint_state.Eval(context)
         if not self._others:
-            _calc_steady(
-                *vectors,
-                joint_state,
-                self._law.torque.offset,
-                self._velocities,
-                self._is_solved,
-                *self._table,
-                *self._solver,
-            )
+            sizes = (self._law.torque.offset, self._velocities)
+            known = (*self._table, *self._solver)
+            _calc_steady(*vectors, joint_state, *sizes, self._is_solved, *known)
+            if self._trial is not None:
+                tick = _parts(vectors[0], self._joints, self._velocities)
+                end = self._tried(self._trial, context, tick)
+                _correct_steady(vectors[0], end, *sizes, *known)
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
-        expected = _begin(tick, last, joint_state)
-        motion = self._motion(context, tick, last, expected)
-        torque = look_up(self._table, expected)
+        motion = self._motion(context, tick, last, _begin(tick, last, joint_state))
+        self._put_force(tick, motion)
+        if self._trial is not None:
+            end = self._tried(self._trial, context, tick)
+            self._put_force(tick, motion._replace(velocity=end))
+
+    def _tried(self, trial: TrialStep, context: Context, tick: Tick) -> np.ndarray:
+        """Velocities of the joints at the end of the step as it is, (n,) [rad/s]."""
+        workspace: Any = self._workspace.Eval(context)
+        time, state = context.get_time(), self._plant_state.Eval(context)
+        known = (self._torque_command.Eval(context), tick.memory[self._offsets], tick.force)
+        return trial.joint_velocity(workspace, time, state, *known)
+
+    def _put_force(self, tick: Tick, motion: JointMotion) -> None:
+        """Fills the force of a step that ends as is expected."""
+        torque = look_up(self._table, motion.velocity)
         for _, effect, rows in self._others:
-            at = motion._replace(memory=tick.memory[rows])
-            torque += effect.torque_and_slope(at)[0]
-        _finish(tick, expected, torque, tick.memory[self._offsets], self._solver)
+            torque += effect.torque_and_slope(motion._replace(memory=tick.memory[rows]))[0]
+        _finish(tick, motion.velocity, torque, tick.memory[self._offsets], self._solver)
 
     def _motion(
         self,
@@ -343,18 +394,26 @@ class JointTorqueEffects(Diagram):
     `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm], where any has one.
     """
 
-    def __init__(self, law: ImplicitLaw, robot: Robot, time_step: float):
+    def __init__(
+        self,
+        law: ImplicitLaw,
+        robot: Robot,
+        time_step: float,
+        trial: TrialStep | None = None,
+    ):
         super().__init__()
         builder = DiagramBuilder()
-        explicit = builder.AddNamedSystem("explicit", ExplicitTorque(law, robot, time_step))
+        system = ExplicitTorque(law, robot, time_step, trial)
+        explicit = builder.AddNamedSystem("explicit", system)
         n, tick = len(robot.joint_names), explicit.GetOutputPort("tick")
         sizes = [robot.plant.num_velocities(), _ROWS * n, law.torque.offset.size]
         sizes.append(tick.size() - sum(sizes))
         parts = Demultiplexer([size for size in sizes if size > 0])
         split = builder.AddNamedSystem("parts", parts)
         builder.Connect(tick, split.get_input_port())
-        for name in ("joint_state", "net_actuation", "torque_command"):
-            builder.ExportInput(explicit.GetInputPort(name), name)
+        for i in range(explicit.num_input_ports()):
+            port = explicit.get_input_port(i)
+            builder.ExportInput(port, port.get_name())
         for name in ("torque_loss", "deflection"):
             builder.ExportOutput(explicit.GetOutputPort(name), name)
         builder.ExportOutput(split.get_output_port(0), "explicit_force")

@@ -15,7 +15,8 @@ from fbse_drake.errors import InputError, located, require_not_negative, require
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
-_Forces = Value[list[ExternallyAppliedSpatialForce]]
+# What the plant's port takes.
+Forces = Value[list[ExternallyAppliedSpatialForce]]
 # Times are compared give or take this [s].
 _ROUNDING = 1e-9
 
@@ -43,6 +44,33 @@ class Push:
         return self.start - _ROUNDING <= time < self.start + self.duration - _ROUNDING
 
 
+class AppliedPushes:
+    """Pushes of a robot, with its bodies found.
+
+    Raises:
+        InputError: a body that the robot has not.
+    """
+
+    def __init__(self, pushes: Mapping[str, Push], robot: Robot):
+        self._pushes: list[tuple[Push, RigidBody]] = []
+        for name, push in pushes.items():
+            with located(f"pushes.{name}.body: "):
+                self._pushes.append((push, robot.body(push.body)))
+
+    def forces(self, time: float) -> list[ExternallyAppliedSpatialForce]:
+        """For the plant's port, in a step that begins at this time [s]."""
+        forces = []
+        for push, body in self._pushes:
+            if push.acts_at(time):
+                force = ExternallyAppliedSpatialForce()
+                force.body_index = body.index()
+                force.p_BoBq_B = body.default_com()
+                F: Any = np.array([0.0, 0.0, 0.0, *push.force])
+                force.F_Bq_W = SpatialForce(F=F)
+                forces.append(force)
+        return forces
+
+
 class PushSource(LeafSystem):
     """Pushes a robot.
 
@@ -55,29 +83,12 @@ class PushSource(LeafSystem):
     `spatial_forces` is a list of `ExternallyAppliedSpatialForce`, for the plant's port.
     """
 
-    def __init__(self, pushes: Mapping[str, Push], robot: Robot):
-        """Finds the bodies.
-
-        Raises:
-            InputError: a body that the robot has not.
-        """
+    def __init__(self, pushes: AppliedPushes):
         super().__init__()
-        self._pushes: list[tuple[Push, RigidBody]] = []
-        for name, push in pushes.items():
-            with located(f"pushes.{name}.body: "):
-                self._pushes.append((push, robot.body(push.body)))
+        self._pushes = pushes
         self.DeclareAbstractOutputPort(
-            "spatial_forces", _Forces, weakly(self._calc), {self.time_ticket()}
+            "spatial_forces", Forces, weakly(self._calc), {self.time_ticket()}
         )
 
     def _calc(self, context: Context, output: Value) -> None:
-        forces = []
-        for push, body in self._pushes:
-            if push.acts_at(context.get_time()):
-                force = ExternallyAppliedSpatialForce()
-                force.body_index = body.index()
-                force.p_BoBq_B = body.default_com()
-                F: Any = np.array([0.0, 0.0, 0.0, *push.force])
-                force.F_Bq_W = SpatialForce(F=F)
-                forces.append(force)
-        output.set_value(forces)
+        output.set_value(self._pushes.forces(context.get_time()))
