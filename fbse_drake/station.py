@@ -237,7 +237,7 @@ def add_joint_torques(
     law: ImplicitLaw,
     time_step: float,
     ports: Ports,
-    trial: TrialStep | None,
+    trial: TrialStep | None = None,
 ) -> dict[str, OutputPort]:
     """Adds what moves a robot's joints: commanded torque, and the losses of its effects.
 
