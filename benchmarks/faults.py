@@ -16,8 +16,9 @@ is
 An estimator that states no `estimate/joint/friction_torque_std` is judged by the rms of its error
 without faults, joint by joint. A torque command that is wrong by a little cannot be told from
 friction; its faults are counted with the rest, and summed up by themselves. --only keeps the faults
-whose `group: kind` has this text. Prints counts and the faults that are silent, not recovered or
-not finite, and writes DIR/faults.json. It is one process; a fault takes half a second or more.
+whose `group: kind` has this text, --set KEY=VALUE changes the scenario. Prints counts and the
+faults that are silent, not recovered or not finite, and writes DIR/faults.json. It is one process;
+a fault takes half a second or more.
 """
 
 import argparse
@@ -470,9 +471,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     only = "faults with this in their name; may be repeated"
     parser.add_argument("--only", action="append", metavar="TEXT", help=only)
     parser.add_argument("--out", type=Path, default=Path("out/fbse"), help="default out/fbse")
+    overrides = "of the scenario, as 'estimator.friction=!WholeBody {}'; may be repeated"
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=overrides)
     options = parser.parse_args(arguments)
     console = Console(width=190, highlight=False)
-    scenario = load_scenario(_SCENARIO, overrides=[f"duration={_DURATION}"])
+    scenario = load_scenario(_SCENARIO, overrides=[f"duration={_DURATION}", *options.set])
     log = simulate(replace(scenario, estimator=NoEstimator())).log
     walk = Walk.of(scenario, log)
     faults = [f for f in all_faults(log) if any(text in f.name for text in options.only or [""])]

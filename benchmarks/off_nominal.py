@@ -105,11 +105,14 @@ CASES = (
 )
 
 
-def watchers(default: Estimator, alone: bool) -> Iterator[tuple[str, str, Estimator]]:
+def watchers(
+    default: Estimator, whole_body: Estimator, alone: bool
+) -> Iterator[tuple[str, str, Estimator]]:
     """Method, variant and estimator of each that runs over a log; or of the default alone."""
     yield "default", "", default
     if alone:
         return
+    yield "whole-body filter", "", whole_body
     for bandwidth in _BANDWIDTHS:
         yield "momentum observer", f"{bandwidth:g} Hz", DisturbanceObserver(bandwidth)
     yield "paper's method", "", load_scenario(_PAPER_WALK, "paper_method").estimator
@@ -214,9 +217,12 @@ def run(case: Case, seed: int, duration: float, alone: bool) -> Walked:
     nobody = ["estimator=!NoEstimator {}"]
     result = simulate(load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold]))
     believed = load_scenario(case.scenario, overrides=common)
+    # The same model of the friction, by the other filter.
+    told = [text.replace("!ModelAided", "!WholeBody") for text in common]
+    other = load_scenario(case.scenario, overrides=["estimator.friction=!WholeBody {}", *told])
     figures = {
         (method, variant): Figures.of(estimate(replace(believed, estimator=config), result.log).log)
-        for method, variant, config in watchers(believed.estimator, alone)
+        for method, variant, config in watchers(believed.estimator, other.estimator, alone)
     }
     return Walked(case.name, result.failure, figures)
 

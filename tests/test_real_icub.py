@@ -205,8 +205,8 @@ def yaw(orientation: Rotation) -> np.ndarray:
 
 
 def test_base_pose_is_the_recordings_own(estimated: EstimationResult) -> None:
-    """The own pose is off by 0.9 deg from the robot's own attitude sensor; while it stands by up to
-    1 deg from accelerometer and soles, which agree. So nobody can be much nearer to it."""
+    """The own pose is off by 0.9 deg from the robot's own attitude sensor; while it stands by 0.4
+    to 1.1 deg from the accelerometer. So nobody can be much nearer to it."""
     log = estimated.log
     found, own = (
         Rotation.from_quat(log[f"{source}/base/orientation"], scalar_first=True)
@@ -226,13 +226,22 @@ def test_at_rest_the_tilt_is_that_of_the_accelerometer(estimated: EstimationResu
     """Stretches of some seconds in which the robot stands, long after the start."""
     log = estimated.log
     R_BI = Rotation.from_euler("xyz", [-2.09439521059, 0.0, -1.57079632679])
-    found = Rotation.from_quat(log["estimate/base/orientation"], scalar_first=True)
+    found, own = (
+        Rotation.from_quat(log[f"{source}/base/orientation"], scalar_first=True)
+        for source in ("estimate", "recorded")
+    )
     seconds = log.time - log.time[0]
+    own_error = []
     for start, end in ((16, 20), (32, 37), (54, 60), (71, 75), (85, 88)):
         rows = np.flatnonzero((seconds >= start) & (seconds < end))
         up = R_BI.apply(log["imu/linear_acceleration"][rows].mean(axis=0))
-        expected = found[rows].apply(up / np.linalg.norm(up)).mean(axis=0)
-        assert np.rad2deg(np.hypot(*expected[:2])) < 0.6
+        up /= np.linalg.norm(up)
+        expected, own_up = (poses[rows].apply(up).mean(axis=0) for poses in (found, own))
+        # Measured, 0.2 deg: the accelerometer's bias.
+        assert np.rad2deg(np.hypot(*expected[:2])) < 0.35
+        own_error.append(np.rad2deg(np.hypot(*own_up[:2])))
+    # The recording's own pose is no better a truth than this.
+    assert np.sqrt(np.mean(np.square(own_error))) > 0.6
 
 
 def test_no_joint_is_stuck(estimated: EstimationResult) -> None:

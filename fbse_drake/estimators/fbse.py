@@ -22,6 +22,7 @@ from fbse_drake.estimators.joint_acceleration import (
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
+from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.robot.description import RobotDescription
 
 BaseStateConfig = InvariantFilter | AdaptiveLipm | ContactAided
@@ -49,8 +50,8 @@ class Fbse(Estimator):
     # !MeasuredSupport or the paper's !PlannedSupport.
     support: SupportConfig = field(default_factory=MeasuredSupport)
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
-    # !ModelAided or the paper's !RecursiveLeastSquares.
-    friction: FrictionConfig = field(default_factory=ModelAided)
+    # !ModelAided, !WholeBody or the paper's !RecursiveLeastSquares.
+    friction: FrictionConfig | WholeBody = field(default_factory=ModelAided)
 
     @staticmethod
     def paper() -> "Fbse":
@@ -103,6 +104,7 @@ class Fbse(Estimator):
             partial(self.friction.system, sensors, robot),
             measurements="sensor_monitor",
             link_torque="link_torque",
+            **self.friction.sources,
         )
 
     def add_base(self, chain: Chain) -> None:

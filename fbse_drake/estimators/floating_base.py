@@ -116,6 +116,10 @@ def _put_terms(
         for j in range(v):
             posterior.mass_matrix[i - 6, j] = M[order[i], order[j]]
         posterior.bias[i - 6] = bias[order[i]]
+    for i in range(6):
+        for j in range(6):
+            posterior.base_inertia[i, j] = M[order[i], order[j]]
+        posterior.base_bias[i] = bias[order[i]]
     # The base's block of H is [[I, m [c]x], [-m [c]x, m]], for the base stands upright.
     x, y, z, mass = order[0], order[1], order[2], M[order[3], order[3]]
     put(posterior.com, (M[z, order[4]] / mass, M[x, order[5]] / mass, M[y, order[3]] / mass))
@@ -152,6 +156,8 @@ def model_type(robot: Robot) -> np.dtype:
         status=(),
         mass_matrix=(n, v),
         bias=(n,),
+        base_inertia=(6, 6),
+        base_bias=(6,),
         foot_jacobian=(f, 6, v),
         foot_bias=(f, 6),
         foot_position=(f, 3),
@@ -196,6 +202,8 @@ class FloatingBaseModel(RecursiveEstimator):
 
         mass_matrix     (n, v)     joint rows of H [kg m^2, kg m]
         bias            (n,)       joint rows of C v [Nm]
+        base_inertia    (6, 6)     the base's block of H [kg m^2, kg m, kg]
+        base_bias       (6,)       the base's rows of C v [Nm, N]
         foot_jacobian   (f, 6, v)  J_m: spatial velocity [angular, linear] of each sole in F
         foot_bias       (f, 6)     J_m_dot v [rad/s^2, m/s^2]
         foot_position   (f, 3)     p_BF_B [m]

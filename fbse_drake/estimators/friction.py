@@ -38,6 +38,10 @@ class RecursiveLeastSquares:
     """
 
     allows_for_delay: ClassVar[bool] = False
+    # Does it know how well it knows the parameters of its model?
+    states_variance: ClassVar[bool] = False
+    # What it hears beside measurements and link torque: by input, the stage that feeds it.
+    sources: ClassVar[dict[str, str]] = {}
 
     # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are
     # identified, from their values here on; the others stay as they are.
@@ -85,6 +89,8 @@ class ModelAided:
 
     # Does it go back to the tick that late forces belong to?
     allows_for_delay: ClassVar[bool] = True
+    states_variance: ClassVar[bool] = True
+    sources: ClassVar[dict[str, str]] = {}
 
     # Friction model, of which the linear parameters are identified, from their values here on; the
     # others stay as they are.
@@ -401,7 +407,7 @@ def smooth_velocity(
 
 
 @njit(cache=True)
-def _put_regressor(
+def put_regressor(
     row: np.ndarray, basis: tuple[np.ndarray, ...], shaped: np.ndarray, joint: int, n: int
 ) -> None:
     """Fills the regressor of the weights of one of n joints, see `FrictionRegressor`."""
@@ -460,8 +466,8 @@ def _estimate_friction(
         x[:m] = last.weights[joint]
         x[m] = last.disturbance[joint]
         # By how much the friction rises with the velocity.
-        _put_regressor(rise, slopes, shaped, joint, n)
-        _put_regressor(regressor, phi, shaped, joint, n)
+        put_regressor(rise, slopes, shaped, joint, n)
+        put_regressor(regressor, phi, shaped, joint, n)
         slope = 0.0
         for k in range(m):
             slope += x[k] * rise[k]
@@ -538,7 +544,7 @@ def _estimate_friction(
             P[:, 0] = 0.0
         if link.late > 0:
             # What was measured is of some ticks ago, the estimate of now.
-            _put_regressor(regressor, phi_now, shaped, joint, n)
+            put_regressor(regressor, phi_now, shaped, joint, n)
             velocity_error, velocity_variance = 0.0, noise * known.velocity_variance
         total = -slope * velocity_error
         variance = slope**2 * max(0.0, velocity_variance)

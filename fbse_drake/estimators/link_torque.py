@@ -81,7 +81,7 @@ def _watch_forces(
 
 
 @njit(cache=True)
-def _is_loaded(wrench: np.ndarray, variance: np.ndarray) -> bool:
+def is_loaded(wrench: np.ndarray, variance: np.ndarray) -> bool:
     """Does a foot show more than its sensors' noise, as load or otherwise?
 
     One that touches the ground may be held sideways before it carries anything.
@@ -179,7 +179,7 @@ def _estimate_link_torque(
         link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
         for foot in range(feet):
             variance = posterior.force_noise[foot] * known.wrench_variance[foot]
-            if _is_loaded(wrench[foot], variance):
+            if is_loaded(wrench[foot], variance):
                 for k in range(6):
                     lever = past.lever[then, foot, k, i]
                     link_torque -= wrench[foot, k] * lever
@@ -193,7 +193,7 @@ def _estimate_link_torque(
         posterior.valid[i] = past.valid[then, i] if is_trusted else 0.0
 
 
-def _wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
+def wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
     """Of the noise in a foot's measured wrench [moment, force], (6,) [(Nm)^2, N^2]."""
     if robot.description.legs[side].has_six_axes:
         return np.repeat([sensors.moment_noise**2, sensors.force_noise**2], 3)
@@ -284,7 +284,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
         )
         super().__init__(posterior_type, clock)
         pads = FootPads(robot)
-        variance = np.array([_wrench_variance(sensors, robot, side) for side in legs])
+        variance = np.array([wrench_variance(sensors, robot, side) for side in legs])
         self._known = record(
             noise=sensors,
             pads=record(position=pads.position, foot=pads.foot),

@@ -8,9 +8,12 @@ called with the record itself, but numba needs ten times as long to unpack one.)
 
 from dataclasses import is_dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+
+# A record in a compiled function, whose fields are its attributes.
+Record: TypeAlias = Any
 
 
 def record_type(**fields: tuple[int, ...] | np.dtype) -> np.dtype:

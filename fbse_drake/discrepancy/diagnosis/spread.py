@@ -90,7 +90,8 @@ def _told(explanation: Explanation, member: Candidate) -> tuple[np.ndarray, np.n
     """Values of a member's parameters, their standard deviations and degrees of freedom, (m,)
     each."""
     _, values, part = explanation.fitted(member)
-    spread = explanation.solved.spread
+    assert explanation.fit is not None
+    spread = explanation.fit.spread
     # What does not move a row of these blocks is not told by them.
     seen = (member.signature.values**2).sum(axis=(0, 1))[: len(values)] > 0
     return np.where(seen, values, np.nan), spread.deviation[part], spread.freedom[part]

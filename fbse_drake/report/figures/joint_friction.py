@@ -9,7 +9,8 @@ from pydrake.common.yaml import yaml_load
 from fbse_drake import schema
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.fbse import Fbse
-from fbse_drake.estimators.friction import FrictionConfig, ModelAided
+from fbse_drake.estimators.friction import FrictionConfig
+from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.log import Log
 from fbse_drake.report.figures.kind import figure_kind
 from fbse_drake.report.figures.panels import (
@@ -271,7 +272,8 @@ def friction_parameters(log: Log) -> Figure:
         titles = [f"parameter {place}" for place in range(1, values.shape[2] + 1)]
     # The variance of recursive least squares is in units of a noise that it does not know.
     deviation = None
-    if isinstance(config, ModelAided) and "estimate/friction/parameter_variance" in log:
+    knows_variance = config is not None and config.states_variance
+    if knows_variance and "estimate/friction/parameter_variance" in log:
         deviation = np.sqrt(np.maximum(0.0, log["estimate/friction/parameter_variance"]))
     rows = joint_rows(log)
     figure, grid = time_grid(
@@ -320,7 +322,7 @@ def _meanings(log: Log) -> str:
     return "".join(meanings)
 
 
-def _friction_config(log: Log) -> FrictionConfig | None:
+def _friction_config(log: Log) -> FrictionConfig | WholeBody | None:
     """How the log's friction was estimated, by the scenario that it holds; None where that does not
     tell."""
     text = log.meta.get("estimator_scenario", log.meta.get("scenario"))

@@ -1,0 +1,554 @@
+"""Friction through the equation of motion of the whole robot.
+
+One extended Kalman filter takes the velocities of base and joints from the equation of motion and
+identifies the friction law in it at the same time. So the law is asked for the velocity that fits
+the torques, not for the one that a noisy encoder shows, and is identified at it.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numba import njit
+from pydrake.systems.framework import Context
+
+from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
+from fbse_drake.errors import require_not_negative, required
+from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.floating_base import ImuMount, model_type
+from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
+from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
+from fbse_drake.estimators.link_torque import is_loaded, wrench_variance
+from fbse_drake.estimators.records import Record, record, record_type
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.sensor_monitor import measurements_type
+from fbse_drake.estimators.spatial import (
+    cross,
+    put,
+    rotate,
+    rotation,
+    skew,
+    subtract,
+    vector,
+)
+from fbse_drake.robot.plant import Robot
+
+# An innovation counts as little as makes it just likely beyond so many standard deviations, ...
+_GATE = 5.0
+# ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
+_DOUBT_TIME = 0.1
+
+
+@dataclass(frozen=True)
+class WholeBody:
+    """Extended Kalman filter for velocities and friction laws of the whole robot.
+
+    Its states are the angular velocity of the base, the velocities of the joints, the linear
+    parameters of each joint's friction law, and what the equation of motion lacks in each of its
+    rows (wrong masses, friction that follows no law), a random walk. It takes command, foot forces
+    and accelerometer for granted but for their noise; gyro and encoders are measurements. Friction
+    that rises steeply with the velocity is solved implicitly.
+
+    Foot forces and commands have to be right: a delay of theirs is not allowed for, and what is
+    wrong with them makes the laws wrong.
+    """
+
+    # Does it go back to the tick that late forces belong to?
+    allows_for_delay: ClassVar[bool] = False
+    # Does it know how well it knows the parameters of its model?
+    states_variance: ClassVar[bool] = True
+    # What it hears beside measurements and link torque.
+    sources: ClassVar[dict[str, str]] = {
+        "model_over_step": "model.over_step",
+        "attitude": "attitude",
+    }
+
+    # Friction model, of which the linear parameters are identified, from their values here on; the
+    # others stay as they are.
+    model: FrictionModel = field(default_factory=CoulombViscousFriction)
+    # Initial standard deviation of every parameter [its unit].
+    parameter_uncertainty: float = 3.0
+    # By what the nonlinear parameters (a transition velocity) may be wrong: the model is a mixture
+    # of such shapes; and the initial standard deviation of each one's weight [Nm].
+    factors: list[float] = field(default_factory=lambda: [0.2, 5.0])
+    shape_uncertainty: float = 3.0
+    # Random walk of the torque that a joint's row lacks [Nm/sqrt(s)], and its initial standard
+    # deviation [Nm]; and of the moment that the base's rows lack.
+    disturbance_walk: float = 0.15
+    disturbance_uncertainty: float = 0.1
+    moment_walk: float = 0.5
+    moment_uncertainty: float = 0.5
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, "parameter_uncertainty", "shape_uncertainty")
+        require_not_negative(self, "disturbance_walk", "disturbance_uncertainty")
+        require_not_negative(self, "moment_walk", "moment_uncertainty")
+
+    def system(self, sensors: SensorBeliefs, robot: Robot, **arguments: Any) -> "WholeBodyFilter":
+        """The estimator with these settings; arguments as of its class."""
+        return WholeBodyFilter(self, sensors, robot, **arguments)
+
+
+@njit(cache=True)
+def _equation_of_motion(
+    measured: Record,
+    model: Record,
+    link: Record,
+    attitude: Record,
+    torque_command: np.ndarray,
+    known: Record,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of base turning and joints, where the base's acceleration is taken at the IMU.
+
+    The accelerometer measures there, so what it says is no function of the unknown angular
+    acceleration; moments are about the IMU.
+
+    Returns:
+        A (r, r), `push` (r,) and the variance (r, r) of the push, for r = 3 + n, of A a = push -
+        friction, with a the base's angular acceleration and those of the joints.
+    """
+    n = len(torque_command)
+    r, noise = 3 + n, known.sensors.acceleration_noise
+    R_BI, p = rotation(known.mount.R_BI), vector(known.mount.p_BI)
+    # a_B = a_I - w_dot x p - w x (w x p), of the IMU's origin I seen from the base's.
+    w, moved = vector(model.velocity), np.empty((3, 3))
+    put(moved, skew(p))
+    force = subtract(vector(measured.mean.specific_force), vector(attitude.acceleration_bias))
+    linear = np.empty(3)
+    put(linear, subtract(rotate(R_BI, force), cross(w, cross(w, p))))
+    base, joints = model.base_inertia, model.mass_matrix
+    A, of_linear, push = np.empty((r, r)), np.empty((r, 3)), np.empty(r)
+    of_linear[:3] = base[:3, 3:] + moved.T @ np.ascontiguousarray(base[3:, 3:])
+    of_linear[3:] = joints[:, 3:6]
+    A[:3, :3] = base[:3, :3] + moved.T @ np.ascontiguousarray(base[3:, :3]) + of_linear[:3] @ moved
+    A[3:, :3] = joints[:, :3] + of_linear[3:] @ moved
+    A[:3, 3:] = A[3:, :3].T
+    A[3:, 3:] = joints[:, 6:]
+    push[:3] = -model.base_bias[:3] - moved.T @ model.base_bias[3:]
+    push[3:] = torque_command - model.bias
+    push -= of_linear @ linear
+    variance = noise**2 * (of_linear @ of_linear.T)
+    for foot in range(len(link.wrench)):
+        wrench, of_wrench = link.wrench[foot], link.force_noise[foot] * known.wrench_variance[foot]
+        if is_loaded(wrench, of_wrench):
+            J, lever = model.foot_jacobian[foot], np.empty((6, r))
+            lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
+            lever[:, 3:] = J[:, 6:]
+            push += lever.T @ wrench
+            variance += (lever.T * of_wrench) @ lever
+    return A, push, variance
+
+
+@njit(cache=True)
+def _inverse(A: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric positive definite matrix."""
+    inverse = np.linalg.inv(A)
+    return 0.5 * (inverse + inverse.T)
+
+
+@njit(cache=True)
+def _implicit_step(
+    x: Record, velocity: np.ndarray, A: np.ndarray, push: np.ndarray, T: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A Newton step of velocity' = velocity + T A^-1 (push - lacking - friction(velocity')).
+
+    Args:
+        x: record with `lacking` (r,), and the friction's linearisation: `friction_there` (n,) and
+            `slope` (n,) at `law_velocity` (n,).
+        velocity: where the step in time begins, (r,).
+
+    Returns:
+        velocity' (r,), and the inverse (r, r) of A + T slope.
+    """
+    implicit, impulse = A.copy(), T * (push - x.lacking)
+    for joint in range(len(x.slope)):
+        slope, ahead = x.slope[joint], velocity[3 + joint] - x.law_velocity[joint]
+        implicit[3 + joint, 3 + joint] += T * slope
+        impulse[3 + joint] -= T * (x.friction_there[joint] + slope * ahead)
+    inverse = _inverse(implicit)
+    return velocity + inverse @ impulse, inverse
+
+
+@njit(cache=True)
+def _linearise(
+    x: Record,
+    velocity: np.ndarray,
+    phi: tuple[np.ndarray, ...],
+    slopes: tuple[np.ndarray, ...],
+    shaped: np.ndarray,
+) -> None:
+    """Fills the linearisation of the friction at velocities of the joints (n,).
+
+    Args:
+        phi, slopes, shaped: see `FrictionRegressor`.
+    """
+    n, m = x.weights.shape
+    row = np.ones(m + 1)
+    for joint in range(n):
+        put_regressor(row, slopes, shaped, joint, n)
+        slope = 0.0
+        for k in range(m):
+            slope += row[k] * x.weights[joint, k]
+        put_regressor(row, phi, shaped, joint, n)
+        there = 0.0
+        for k in range(m):
+            x.regressor[joint, k] = row[k]
+            there += row[k] * x.weights[joint, k]
+        # A law that falls would make the step in time unstable.
+        x.slope[joint], x.friction_there[joint] = max(0.0, slope), there
+        x.law_velocity[joint] = velocity[joint]
+
+
+@njit(cache=True)
+def _propagate(
+    x: Record, A: np.ndarray, inverse: np.ndarray, variance: np.ndarray, T: float
+) -> None:
+    """Covariance after a step in time, in place: that of the velocities (r,) that come first.
+
+    The others, `lacking` (r,) and `weights` (n, m), stay.
+
+    Args:
+        inverse: see `_implicit_step`; variance: of the push, (r, r).
+    """
+    P, (n, m) = x.covariance, x.weights.shape
+    r, size = 3 + n, len(x.covariance)
+    moved = A @ P[:r]
+    for i in range(r):
+        for k in range(size):
+            moved[i, k] -= T * P[r + i, k]
+    for joint in range(n):
+        for j in range(m):
+            at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
+            for k in range(size):
+                moved[3 + joint, k] -= share * P[at, k]
+    moved = inverse @ moved
+    own = np.ascontiguousarray(moved[:, :r]) @ A
+    for i in range(r):
+        for k in range(r):
+            own[i, k] -= T * moved[i, r + k]
+        for joint in range(n):
+            for j in range(m):
+                at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
+                own[i, 3 + joint] -= share * moved[i, at]
+    own = own @ inverse + T * T * (inverse @ variance @ inverse)
+    P[:r] = moved
+    P[:, :r] = moved.T
+    P[:r, :r] = 0.5 * (own + own.T)
+
+
+@njit(cache=True)
+def _state(x: Record) -> np.ndarray:
+    """[velocities, lacking, weights], a copy."""
+    return np.concatenate((x.velocity, x.lacking, x.weights.copy().ravel()))
+
+
+@njit(cache=True)
+def _put_state(x: Record, state: np.ndarray) -> None:
+    r = len(x.velocity)
+    x.velocity[:], x.lacking[:] = state[:r], state[r : 2 * r]
+    x.weights[:] = state[2 * r :].reshape(x.weights.shape)
+
+
+@njit(cache=True)
+def _listen(x: Record, last: Record, predicted: np.ndarray, elapsed: float, known: Record) -> None:
+    """Kalman updates with gyro and encoders, one after the other.
+
+    Args:
+        predicted: velocities (r,) before the updates.
+    """
+    P, r, state = x.covariance, len(x.velocity), _state(x)
+    size, column = len(P), np.empty(len(P))
+    keep = math.exp(-elapsed / AGREEMENT_TIME)
+    count = (1.0 + keep) / (1.0 - keep)
+    for i in range(r):
+        # How noisy a sensor is shows in its steps, whatever the model is wrong by.
+        step = x.reading[i] - last.reading[i] - (predicted[i] - last.velocity[i])
+        share = step * step / (2.0 * last.noise[i] * known.variance[i])
+        x.noise[i] = learned_noise(last.noise[i], share, LOG_OF_ONE, elapsed)
+        innovation, variance = x.reading[i] - state[i], x.noise[i] * known.variance[i]
+        S = P[i, i] + variance
+        x.innovation[i], x.innovation_variance[i] = innovation, S
+        # Innovations that agree are no noise: something is lacking that the model does not know.
+        x.agreement[i] = keep * last.agreement[i] + (1.0 - keep) * innovation
+        excess = count * x.agreement[i] ** 2 - AGREEMENT * S
+        if excess > 0.0:
+            P[r + i, r + i] += (1.0 - keep) * excess * (P[r + i, i] / S) ** 2
+        S_gate = S * max(1.0, innovation**2 / (_GATE**2 * S))
+        column[:] = P[i]
+        for j in range(size):
+            gain = column[j] / S_gate
+            state[j] += gain * innovation
+            for k in range(size):
+                P[j, k] -= gain * column[k]
+    _put_state(x, state)
+
+
+@njit(cache=True)
+def _forget_motion(posterior: Record, known: Record) -> None:
+    """Where a sensor is not trusted, velocities are what was measured, and nothing is lacking."""
+    x, known = posterior[()], known[()]
+    P, r = x.covariance, len(x.velocity)
+    P[:r] = 0.0
+    P[:, :r] = 0.0
+    for i in range(r):
+        P[i, i] = x.noise[i] * known.variance[i]
+        P[r + i, r + i] += x.lacking[i] ** 2
+    x.velocity[:], x.lacking[:], x.agreement[:] = x.reading, 0.0, 0.0
+
+
+@njit(cache=True)
+def _conclude(
+    posterior: Record,
+    last: Record,
+    elapsed: float,
+    phi: tuple[np.ndarray, ...],
+    slopes: tuple[np.ndarray, ...],
+    shaped: np.ndarray,
+) -> None:
+    """Fills friction and its standard deviation, by the law where the tick ends.
+
+    Args:
+        phi, slopes, shaped: see `FrictionRegressor`.
+    """
+    x, last = posterior[()], last[()]
+    _linearise(x, x.velocity[3:], phi, slopes, shaped)
+    P, (n, m) = x.covariance, x.weights.shape
+    r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME)
+    for joint in range(n):
+        of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
+        slope, lacking = x.slope[joint], x.lacking[3 + joint]
+        variance = slope * slope * P[of_velocity, of_velocity] + P[of_lacking, of_lacking]
+        variance += 2.0 * slope * P[of_velocity, of_lacking]
+        unsettled = 0.0
+        for j in range(m):
+            share, at = x.regressor[joint, j], first + j
+            variance += 2.0 * share * (slope * P[of_velocity, at] + P[of_lacking, at])
+            for k in range(m):
+                variance += share * x.regressor[joint, k] * P[at, first + k]
+            settled = keep * last.settled[joint, j] + (1.0 - keep) * x.weights[joint, j]
+            x.settled[joint, j] = settled
+            unsettled += share * (x.weights[joint, j] - settled)
+        x.friction[joint] = x.friction_there[joint] + lacking
+        # What the law does not explain, or learned just now, is not confirmed yet.
+        x.doubt[joint] = max(abs(lacking) + abs(unsettled), keep * last.doubt[joint])
+        x.friction_std[joint] = math.sqrt(max(0.0, variance) + x.doubt[joint] ** 2)
+        for k in range(x.parameters.shape[1]):
+            x.parameters[joint, k] = x.weights[joint, k]
+            x.parameter_variance[joint, k] = P[first + k, first + k]
+
+
+@njit(cache=True)
+def _begin(
+    posterior: Record,
+    last: Record,
+    elapsed: float,
+    measured: Record,
+    model: Record,
+    attitude: Record,
+    torque_command: np.ndarray,
+    known: Record,
+) -> bool:
+    """Takes over what was known a tick ago, and reads gyro and encoders.
+
+    Args:
+        elapsed: of the tick [s], 0 of the first.
+
+    Returns:
+        Is all known that the equation of motion needs?
+    """
+    x, last, measured = posterior[()], last[()], measured[()]
+    model, attitude, known = model[()], attitude[()], known[()]
+    posterior[()] = last
+    x.status = measured.trust.max()
+    x.innovation[:] = 0.0
+    rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
+    put(x.reading[:3], rotate(rotation(known.mount.R_BI), rate))
+    x.reading[3:] = measured.joint_velocity
+    for i in range(len(x.lacking)):
+        walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
+        x.covariance[len(x.lacking) + i, len(x.lacking) + i] += walk**2 * elapsed
+    is_known = x.status == 0.0 and last.status == 0.0 and np.isfinite(torque_command).all()
+    return bool(elapsed > 0.0 and is_known and model.velocity.any())
+
+
+@njit(cache=True)
+def _predict(
+    posterior: Record,
+    elapsed: float,
+    measured: Record,
+    model: Record,
+    link_torque: Record,
+    attitude: Record,
+    torque_command: np.ndarray,
+    known: Record,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The velocities at which the tick ends, (r,), with the law linearised where it was last.
+
+    Returns:
+        Them and what `_equation_of_motion` returns.
+    """
+    x, known = posterior[()], known[()]
+    A, push, variance = _equation_of_motion(
+        measured[()], model[()], link_torque[()], attitude[()], torque_command, known
+    )
+    velocity, _ = _implicit_step(x, x.velocity, A, push, elapsed)
+    return velocity, A, push, variance
+
+
+@njit(cache=True)
+def _update(
+    posterior: Record,
+    last: Record,
+    elapsed: float,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    phi: tuple[np.ndarray, ...],
+    slopes: tuple[np.ndarray, ...],
+    shaped: np.ndarray,
+    known: Record,
+) -> None:
+    """Covariance and measurements of a tick, the law linearised where it is expected to end.
+
+    Args:
+        motion: see `_predict`.
+        phi, slopes, shaped: see `FrictionRegressor`.
+    """
+    x, last, known = posterior[()], last[()], known[()]
+    guess, A, push, variance = motion
+    _linearise(x, guess[3:], phi, slopes, shaped)
+    predicted, inverse = _implicit_step(x, x.velocity, A, push, elapsed)
+    x.velocity[:] = predicted
+    _propagate(x, A, inverse, variance, elapsed)
+    _listen(x, last, predicted, elapsed, known)
+
+
+class WholeBodyFilter(RecursiveEstimator):
+    """Friction through the whole robot's equation of motion, see `WholeBody`.
+
+    .. pydrake_system::
+
+        name: WholeBodyFilter
+        input_ports:
+        - measurements
+        - link_torque
+        - model_over_step
+        - attitude
+        - torque_command
+        output_ports:
+        - posterior
+        - (one for each field)
+
+    Inputs: posteriors of `SensorMonitor`, `LinkTorqueEstimator`, `FloatingBaseModel` over the step
+    and `AttitudeEstimator` or `InvariantBaseFilter`; `torque_command` (n,) [Nm] is remembered for
+    the next tick. Fields of the posterior, for n joints, r = 3 + n and m weights of each law:
+
+        friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
+        parameters, parameter_variance   (n, ...)  linear parameters of the law
+        velocity                 (r,)    of the base's turning in its axes, and of the joints
+                                         [rad/s]
+        lacking                  (r,)    torque that the equation of motion lacks [Nm]
+        weights, settled         (n, m)  parameters and those of other shapes; the same some time
+                                         ago
+        covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
+        innovation, innovation_variance, agreement   (r,)  of gyro and encoders [rad/s]; the last
+                                         is the innovation's running mean
+        noise                    (r,)    by how much the variance of these is larger than believed,
+                                         at least 1
+        reading                  (r,)    what they read, free of the bias [rad/s]
+        doubt                    (n,)    the largest `lacking` of late, with what has been learned
+                                         since then [Nm]
+        law_velocity, friction_there, slope, regressor   the law where it was linearised
+    """
+
+    def __init__(
+        self,
+        config: WholeBody,
+        sensors: SensorBeliefs,
+        robot: Robot,
+        measurements: np.dtype,
+        link_torque: np.dtype,
+        model_over_step: np.dtype,
+        attitude: np.dtype,
+        clock: Clock,
+    ):
+        """Declares ports and state.
+
+        Args:
+            measurements, link_torque, model_over_step, attitude: types of the inputs.
+        """
+        self._config = config
+        self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
+        n, m = len(robot.joint_names), self._regressor.weights
+        r = 3 + n
+        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "agreement")
+        per_joint = ("friction", "friction_std", "doubt", "law_velocity", "friction_there", "slope")
+        posterior_type = record_type(
+            time=(),
+            status=(),
+            **dict.fromkeys((*per_row, "noise", "reading"), (r,)),
+            **dict.fromkeys(per_joint, (n,)),
+            **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
+            **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
+            covariance=(2 * r + n * m, 2 * r + n * m),
+        )
+        super().__init__(posterior_type, clock)
+        gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
+        encoder = required(sensors.joint_velocity_noise, "joint_velocity_noise")
+        self._known = record(
+            config=config,
+            sensors=sensors,
+            mount=record(**vars(ImuMount(robot))),
+            wrench_variance=np.array(
+                [wrench_variance(sensors, robot, side) for side in robot.description.legs]
+            ),
+            variance=np.repeat([gyro**2, encoder**2], [3, n]),
+        )
+        self._measurements = self._declare_record_input("measurements", measurements)
+        self._link = self._declare_record_input("link_torque", link_torque)
+        self._model = self._declare_record_input("model_over_step", model_over_step)
+        self._attitude = self._declare_record_input("attitude", attitude)
+        self._torque_command = self._declare_remembered_input("torque_command", n)
+        self._declare_posterior()
+
+    @staticmethod
+    def input_types(robot: Robot) -> dict[str, np.dtype]:
+        feet = len(robot.description.legs)
+        return {
+            "measurements": measurements_type(robot),
+            "link_torque": record_type(wrench=(feet, 6), force_noise=(feet,)),
+            "model_over_step": model_type(robot),
+            "attitude": record_type(acceleration_bias=(3,), angular_velocity_bias=(3,)),
+        }
+
+    def _tick(
+        self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
+    ) -> None:
+        measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
+        model, known, shaped = self._model.Eval(context), self._known, self._regressor.shaped
+        torque_command = self._torque_command.Eval(context)
+        if math.isnan(elapsed):
+            last, elapsed = self._start(), 0.0
+        if _begin(posterior, last, elapsed, measured, model, attitude, torque_command, known):
+            link = self._link.Eval(context)
+            motion = _predict(
+                posterior, elapsed, measured, model, link, attitude, torque_command, known
+            )
+            phi, slopes = self._regressor(motion[0][3:])
+            _update(posterior, last, elapsed, motion, phi, slopes, shaped, known)
+        else:
+            _forget_motion(posterior, known)
+        phi, slopes = self._regressor(posterior["velocity"][3:])
+        _conclude(posterior, last, elapsed, phi, slopes, shaped)
+
+    def _start(self) -> np.ndarray:
+        """What is known before the first tick."""
+        config, regressor, start = self._config, self._regressor, np.zeros((), self.posterior_type)
+        n, m = start["weights"].shape
+        start["weights"][:, : regressor.parameters] = regressor.initial
+        start["settled"], start["noise"] = start["weights"], 1.0
+        lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
+        weights = np.full(m, config.shape_uncertainty)
+        weights[: regressor.parameters] = config.parameter_uncertainty
+        deviations = np.concatenate([np.zeros(3 + n), lacking, np.tile(weights, n)])
+        start["covariance"] = np.diag(deviations**2)
+        return start
