@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.identification.structure import Structure
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
+from fbse_drake.report import html
 from fbse_drake.report.discrepancy_tables import findings_table
 
 INPUTS = reports.Inputs("a_walk", "paper_walk", ("walk.npz",), "out/a_walk")
@@ -266,6 +267,29 @@ def test_study_that_finds_nothing_says_so(walk: tuple[Predictor, Comparison], tm
     text = page_text(tmp_path / "report.html")
     assert "Nothing is missing" in text
     assert "completed" not in text
+
+
+def test_short_and_exact_logs_have_reports(
+    walk: tuple[Predictor, Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """One has no bins, the other no noise."""
+    drawn = []
+    monkeypatch.setattr(html, "_png_uri", lambda draw: drawn.append(draw()) or "data:image/png,")
+    predictor, comparison = walk
+    channels = [
+        dataclasses.replace(channel, bins={}, noise_floor=0.0) for channel in comparison.channels
+    ]
+    bare = dataclasses.replace(comparison, channels=tuple(channels))
+    reports.write_compare_report(tmp_path / "compare.html", bare, predictor, INPUTS)
+    steps = (StudyStep((), 4.2, 4.2, None), StudyStep((FRICTION,), 1.01, 1.0, None))
+    ended = "the noise floor is reached"
+    study = Study(steps, (made_diagnosis(), NOTHING), ended, predictor.scenario)
+    reports.write_study_report(tmp_path / "study.html", study, walk, (predictor, bare), INPUTS)
+    for name in ("compare", "study"):
+        text = page_text(tmp_path / f"{name}.html")
+        assert ">nan<" not in text
+        assert ">inf<" not in text
+    assert len(drawn) > 10
 
 
 def test_falling_error_shows_both_errors_and_the_noise():

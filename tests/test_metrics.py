@@ -153,6 +153,12 @@ def log_with_law(torque: np.ndarray, law: np.ndarray) -> Log:
     return made_log(**channels)
 
 
+def test_a_log_that_does_not_say_how_it_ended_is_a_recording():
+    log = made_log()
+    for meta in (log.meta, log.meta | {"outcome": None}):
+        assert run_metrics(Log(log.channels, meta), 1.0)["outcome"] == "recorded"
+
+
 def test_law_error_is_the_difference_over_the_law():
     law = made_log()["truth/joint/friction_torque"]
     torque = law * [1.0, 0.9, 1.005, 3.0]

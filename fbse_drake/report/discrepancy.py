@@ -468,13 +468,14 @@ def _fall(
                 partial(figures.position_errors, first, last, robot.torque_units),
             )
         )
-    if worst := _worst(after[1]):
+    # A short log has no bins.
+    if binned := list(filter(figures.binned_variables, _worst(after[1]))):
         caption = "Mean error of the completed model in bins of what it may depend on."
         blocks.append(
             FigureBlock(
                 "What is left, against what it may depend on",
                 caption,
-                partial(figures.error_bins, worst),
+                partial(figures.error_bins, binned),
             )
         )
     left = all_failure_tables(

@@ -18,7 +18,13 @@ from matplotlib.ticker import LogLocator
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame
 
-from fbse_drake.discrepancy.diagnosis.compare import Bin, Channel, Comparison, words
+from fbse_drake.discrepancy.diagnosis.compare import (
+    Bin,
+    Channel,
+    Comparison,
+    error_over_noise,
+    words,
+)
 from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus, Estimate, Finding
 from fbse_drake.discrepancy.diagnosis.study import StudyStep
 from fbse_drake.discrepancy.residual.residual import Residual, Row
@@ -88,7 +94,7 @@ def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> F
     _draw_robot(
         body,
         robot,
-        {channel.row.name: _ratio(channel.rmse, channel.noise_floor) for channel in joints},
+        {channel.row.name: channel.ratio for channel in joints},
         posture,
     )
     for axes, channels in zip(maps, groups, strict=True):
@@ -100,10 +106,6 @@ def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> F
     bar.set_ticks([1, 2, 5, 10, 30], labels=["1", "2", "5", "10", "30"], fontsize=9)
     bar.ax.minorticks_off()
     return figure
-
-
-def _ratio(error: float, noise: float) -> float:
-    return error / noise if noise > 0 else np.nan
 
 
 def _draw_robot(axes: Axes, robot: Robot, ratios: Mapping[str, float], posture: np.ndarray) -> None:
@@ -232,7 +234,9 @@ def _draw_phases(axes: Axes, channels: Sequence[Channel]) -> None:
     )
     parts = [c.by_phase if phases else {"whole log": (c.rmse, c.noise_floor)} for c in channels]
     names = list(phases) or ["whole log"]
-    ratios = np.array([[_ratio(*of.get(name, (np.nan, np.nan))) for name in names] for of in parts])
+    ratios = np.array(
+        [[error_over_noise(*of.get(name, (np.nan, np.nan))) for name in names] for of in parts]
+    )
     axes.imshow(ratios, cmap=_RATIO_COLORS, norm=_RATIO_NORM, aspect="auto")
     for (row, column), ratio in np.ndenumerate(ratios):
         text = "-" if np.isnan(ratio) else number(float(ratio), 2)
@@ -253,10 +257,7 @@ def channel_errors(before: Sequence[Channel], after: Sequence[Channel] = ()) -> 
     what is left of it."""
     figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * len(before)), layout="constrained")
     axes = figure.subplots()
-    ratios = [
-        [_ratio(channel.rmse, channel.noise_floor) for channel in channels]
-        for channels in (before, after or before)
-    ]
+    ratios = [[channel.ratio for channel in channels] for channels in (before, after or before)]
     label = "the model as given"
     _draw_falls(
         axes,

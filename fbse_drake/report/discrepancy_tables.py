@@ -186,7 +186,7 @@ def channel_table(channels: Sequence[Channel]) -> Table:
             c.rmse,
             c.noise_floor,
             c.row.unit,
-            c.rmse / c.noise_floor,
+            "" if np.isnan(c.ratio) else c.ratio,
             "" if np.isnan(c.nrmse) else 100 * c.nrmse,
         )
         for c in channels

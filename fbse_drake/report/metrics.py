@@ -49,7 +49,7 @@ def run_metrics(log: Log, wall_time: float, tick_time: np.ndarray | None = None)
     """
     joints = log.joints
     simulated = float(log.time[-1] - log.time[0])
-    outcome = log.meta.get("outcome", {"fell": None, "reason": "recorded"})
+    outcome = log.meta.get("outcome") or {"fell": None, "reason": "recorded"}
     return {
         "fell": outcome["fell"],
         "outcome": outcome["reason"],

@@ -73,6 +73,11 @@ class Bin:
         )
 
 
+def error_over_noise(error: float, noise: float) -> float:
+    """Of root mean squares; NaN without noise."""
+    return error / noise if noise > 0 else float(np.nan)
+
+
 @dataclass(frozen=True)
 class Channel:
     """Error of one row of the residual."""
@@ -88,6 +93,11 @@ class Channel:
     by_phase: dict[str, tuple[float, float]]
     # Mean errors by variable, over all phases.
     bins: dict[str, tuple[Bin, ...]]
+
+    @property
+    def ratio(self) -> float:
+        """Error over noise; NaN without noise."""
+        return error_over_noise(self.rmse, self.noise_floor)
 
     @property
     def worst(self) -> Bin | None:
