@@ -28,7 +28,7 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
 from fbse_drake.station import Station, build_station
-from fbse_drake.walking.reference import Reference
+from fbse_drake.walking.reference import RecordedReference, Reference
 from fbse_drake.wiring import release
 
 # Why a run failed that was stopped by Ctrl-C.
@@ -308,7 +308,9 @@ def _make_log(scenario: Scenario, name: str, run: RecordedRun) -> Log:
     forces = (ticks["net_actuation"], ticks["explicit_force"])
     ticks["torque_loss"] = loss_over_time(robot, velocity, *forces)
     # Of the plant steps those that ended are known.
-    rows = np.arange(0, steps, round(scenario.log.period / time_step))
+    period = scenario.log.period
+    assert period is not None  # The scenario has filled it in.
+    rows = np.arange(0, steps, round(period / time_step))
     raw = {
         port: values[np.minimum(rows + signals.is_late(port), len(values) - 1)]
         for port, values in ticks.items()
@@ -396,7 +398,9 @@ def _port_channels(
     return channels
 
 
-def _reference_channels(reference: Reference, time: np.ndarray) -> dict[str, np.ndarray]:
+def _reference_channels(
+    reference: Reference | RecordedReference, time: np.ndarray
+) -> dict[str, np.ndarray]:
     rows = np.clip(np.searchsorted(reference.time, time + 1e-9) - 1, 0, len(reference.time) - 1)
     channels = {
         "reference/joint/position": reference.joint_position[rows],

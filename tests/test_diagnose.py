@@ -541,7 +541,7 @@ def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
         ),
     )
     base, wider = (
-        SimpleNamespace(deviance=d, sse=np.array([d]), fit=fit, start=lambda _: 0, candidates=())
+        SimpleNamespace(deviance=d, sse=np.array([d]), solved=fit, start=lambda _: 0, candidates=())
         for d in (1e4, 1e2)
     )
     assert is_significant(fits, base, wider, candidate) is can_be

@@ -153,6 +153,11 @@ class Effect(ABC):
         """Standard deviations of what is believed of its linear parameters, (p,)."""
         return np.array([p.belief for p in cls.parameters.values() if p.linear])
 
+    @staticmethod
+    def suspected_bodies(robot: Robot) -> list[str]:  # noqa: ARG004
+        """Bodies that the diagnosis tries it on, of an effect that acts on bodies."""
+        return []
+
     @classmethod
     def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:  # noqa: ARG003
         """Smallest possible values of its linear parameters on a target, (p,); a fit does not go

@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.residual.residual import joint_velocity_noise
 from fbse_drake.effects.effect import library
 from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures
+from fbse_drake.report.chart import Chart
 from fbse_drake.report.discrepancy_figures import (
     finding_name,
     small_motions,
@@ -276,20 +277,14 @@ def _where(
     """
     robot, residual, motion = predictor.robot, predictor.residual, predictor.motion
     known = [channel for channel in comparison.channels if not np.isnan(channel.rmse)]
+    blocks: list[FigureBlock | Chart] = []
     if robot.description.legs:
         posture = motion.blocks.joint_position.mean(axis=0)
         drawn = partial(figures.robot_errors, robot, comparison, posture)
-        blocks = [FigureBlock("Error over noise, by joint and by phase", _BY_PHASE, drawn)]
-    else:
-        blocks = (
-            [
-                FigureBlock(
-                    "Error over noise, by joint", _RATIOS, partial(figures.channel_errors, known)
-                )
-            ]
-            if len(known) > 1
-            else []
-        )
+        blocks.append(FigureBlock("Error over noise, by joint and by phase", _BY_PHASE, drawn))
+    elif len(known) > 1:
+        drawn = partial(figures.channel_errors, known)
+        blocks.append(FigureBlock("Error over noise, by joint", _RATIOS, drawn))
     worst = _worst(comparison)
     # A short log has no bins.
     if binned := [channel for channel in worst if figures.binned_variables(channel)]:
@@ -418,7 +413,7 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
     order = [words(verdict) for verdict in figures.VERDICT_COLORS]
     table = Table(
         header,
-        tuple(sorted(rows, key=lambda row: order.index(row[1]))),
+        tuple(sorted(rows, key=lambda row: order.index(str(row[1])))),
         "All effects of the library, one by one",
         folded=True,
     )
@@ -432,7 +427,7 @@ def _fall(
     tests: Mapping[str, Log],
 ) -> Section:
     """What the completed model brings: step by step, by channel, over time; and what it leaves."""
-    robot, (first, last) = before[0].robot, (study.steps[index].rollout for index in (0, -1))
+    robot, first, last = before[0].robot, study.steps[0].rollout, study.steps[-1].rollout
     rolled = first is not None and last is not None
     simulated = (
         " Below: the model with everything added so far is simulated in the place of the robot; "
@@ -455,7 +450,7 @@ def _fall(
         drawn = partial(figures.channel_errors, *map(list, zip(*known, strict=True)))
         blocks.append(FigureBlock("Every channel, before and after", _RATIOS, drawn))
     blocks += _measured_torque(study.scenario, before[0], tests)
-    if rolled and len(first.sample_time) and len(last.sample_time):
+    if first is not None and last is not None and len(first.sample_time) and len(last.sample_time):
         caption = (
             "Simulated less recorded position of the joints that the model as given misses most, "
             "over the whole log. replay.html, which is saved beside this report, shows the log "
@@ -549,7 +544,8 @@ def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
     """How the error falls on the way to a diagnosis."""
     if len(diagnosis.path) < 2:
         return []
-    steps, taken = [], frozenset()
+    steps: list[StudyStep] = []
+    taken: frozenset[tuple[str, tuple[str, ...]]] = frozenset()
     for step in diagnosis.path:
         added = tuple(
             Finding(*member, np.nan, np.nan, {}, (), chosen=True)

@@ -75,6 +75,12 @@ class Explanation:
     # Of held-out data, with the charge for every parameter; smaller is better.
     deviance: float
 
+    @property
+    def solved(self) -> Fit:
+        """The fit, of an explanation with effects."""
+        assert self.fit is not None
+        return self.fit
+
     def start(self, candidate: Candidate) -> int:
         """Place of a candidate's first parameter."""
         return sum(
@@ -91,7 +97,7 @@ class Explanation:
         offsets = np.concatenate([np.zeros(len(candidate.linear_names)), candidate.nonlinear])
         start = self.start(candidate)
         part = slice(start, start + len(names))
-        return names, self.fit.parameters[part] + offsets[: len(names)], part
+        return names, self.solved.parameters[part] + offsets[: len(names)], part
 
     def values(
         self, candidate: Candidate
@@ -102,7 +108,7 @@ class Explanation:
         A nonlinear parameter that was not searched for has its plausible range as interval.
         """
         fitted, values, part = self.fitted(candidate)
-        intervals = self.fit.interval()[part] + (values - self.fit.parameters[part])[:, None]
+        intervals = self.solved.interval()[part] + (values - self.solved.parameters[part])[:, None]
         found, between = {}, {}
         for name, value, interval in zip(fitted, values, intervals, strict=True):
             bounds = candidate.parameters[name].bounds

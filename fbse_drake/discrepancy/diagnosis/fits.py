@@ -199,7 +199,8 @@ class Fits:
         if self.dictionary.per_step or not taking:
             return 1.0
         torque = self.dictionary.predictor.motion.blocks.torque_command
-        taken, start = {}, 0
+        taken: dict[int, np.ndarray] = {}
+        start = 0
         for c in candidates:
             stop = start + c.signature.values.shape[2]
             if c in taking:
@@ -207,7 +208,7 @@ class Fits:
                 for row, values in zip(c.raw.rows, added.T, strict=True):
                     if row >= torque.shape[1]:
                         continue
-                    taken[row] = taken.get(row, 0.0) + values
+                    taken[row] = taken[row] + values if row in taken else values
             start = stop
         factor = np.ones(self.white.y.shape[1])
         for row, values in taken.items():

@@ -277,7 +277,8 @@ def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]
     one parameter and no amount, the interval of that, if zero is neutral. (With several, that they
     are not all neutral is not said by intervals of a law made linear.)
     """
-    at, values = [], []
+    at: list[int] = []
+    parts = []
     for member in members:
         start, names = explanation.start(member), member.linear_names
         offset = np.zeros(len(names))
@@ -286,8 +287,8 @@ def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]
                 return True
             offset = member.nonlinear
         at += range(start, start + len(offset))
-        values += list(explanation.fit.parameters[start : start + len(offset)] + offset)
-    values, spread = np.array(values), explanation.fit.spread
+        parts.append(explanation.solved.parameters[start : start + len(offset)] + offset)
+    values, spread = np.concatenate(parts), explanation.solved.spread
     deviation, freedom = spread.deviation[at], np.minimum(spread.freedom[at], 1e6)
     level = 1 - (1 - _CONFIDENCE) / len(members)
     if np.any(np.abs(values) > student.ppf((1 + level) / 2, freedom) * deviation):

@@ -109,8 +109,8 @@ class Proposals:
                 if dictionary.per_step or not dictionary.takes_torque(effect)
             )
             least = max(enough, 0.4 * max(honest, default=0.0))
-            for gain, effect, best in found:
-                if gain > least:
+            for size, effect, best in found:
+                if size > least:
                     dictionary.progress(LOOKING, 0.3)
                     result.append(self._best_on(effect, group, best, beside))
         return result
@@ -126,7 +126,7 @@ class Proposals:
             for _ in range(_EXPANSIONS):
                 wider = self.fits.explain([*base.candidates, settled])
                 start = wider.start(settled)
-                values = wider.fit.parameters[start : start + len(settled.linear_names)]
+                values = wider.solved.parameters[start : start + len(settled.linear_names)]
                 settled = self.fits.about(settled, values)
             return settled
 
@@ -173,7 +173,7 @@ class Proposals:
         )
 
     def _grid_moments(
-        self, effect: type[JointTorqueEffect], places: Sequence[int], beside: Remainder
+        self, effect: type[JointTorqueEffect], places: Sequence[int] | np.ndarray, beside: Remainder
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Inner products of the sets of an effect's first grid, in each of some rows."""
         grid, moments = self.fits.grid(effect), []
@@ -187,7 +187,11 @@ class Proposals:
         return moments
 
     def _may_reach(
-        self, wanted: float, base: Explanation, rows: Sequence[int], alone: Iterable[float]
+        self,
+        wanted: float,
+        base: Explanation,
+        rows: Sequence[int] | np.ndarray,
+        alone: Iterable[float],
     ) -> bool:
         """May a candidate lower the deviance as much as is wanted?
 
@@ -220,7 +224,7 @@ class Proposals:
     def _narrowed(
         self,
         effect: type[JointTorqueEffect],
-        places: Sequence[int],
+        places: Sequence[int] | np.ndarray,
         best: int,
         beside: Remainder,
     ) -> np.ndarray:
@@ -262,7 +266,10 @@ def _weighted(
 
 
 def largest_drop(
-    white: WhitenedResidual, sse: np.ndarray, rows: Sequence[int], alone: Sequence[float]
+    white: WhitenedResidual,
+    sse: np.ndarray,
+    rows: Sequence[int] | np.ndarray,
+    alone: Sequence[float],
 ) -> float:
     """More than this no effect lowers the deviance, whatever its values are.
 

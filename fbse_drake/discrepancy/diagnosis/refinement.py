@@ -49,10 +49,10 @@ def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
     moved, start = [], 0
     for candidate in members:
         size, m = candidate.signature.values.shape[2], len(candidate.nonlinear)
-        shift = explanation.fit.parameters[start + size - m : start + size]
+        shift = explanation.solved.parameters[start + size - m : start + size]
         start += size
         if not issubclass(candidate.effect, JointTorqueEffect):
-            values = explanation.fit.parameters[start - size : start]
+            values = explanation.solved.parameters[start - size : start]
             try:
                 moved.append(fits.about(candidate, values))
             except InputError:
@@ -127,12 +127,12 @@ def consistent(
         explanation.candidates, parameters
     )
     fit = replace(
-        explanation.fit,
+        explanation.solved,
         parameters=np.concatenate([parameters[:-bodies], fits.dictionary.directions.T @ z]),
         sse=sse,
     )
     identified = identified_inertia(
-        fits.dictionary.inertia, fits.white, explanation.fit, z, fits.dictionary.directions
+        fits.dictionary.inertia, fits.white, explanation.solved, z, fits.dictionary.directions
     )
     return replace(explanation, fit=fit, sse=sse), identified
 
@@ -147,6 +147,7 @@ def remeasured(fits: Fits) -> Fits:
         if fits.dictionary.inertia is None:
             break
         _, found = consistent(fits, Proposals(fits).plain_friction())
+        assert found is not None
         inertia = fits.dictionary.inertia.measured_by(found.change)
         if inertia is fits.dictionary.inertia:
             break
@@ -177,7 +178,11 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
     )
     # As many squares as before; what is held out exceeds them by as much as it did.
     share = fits.white.count / np.maximum(white.count, 1)
-    sse = white.sse * share * fits.torque_factor(explanation.candidates, explanation.fit.parameters)
+    sse = (
+        white.sse
+        * share
+        * fits.torque_factor(explanation.candidates, explanation.solved.parameters)
+    )
     return (
         replace(
             explanation, sse=sse, held_out_sse=sse + explanation.held_out_sse - explanation.sse

@@ -78,7 +78,7 @@ def indistinguishable(
     judge = Judge(fits, final)
 
     def equals(rival: Explanation) -> bool:
-        more = len(final.fit.parameters) - len(rival.fit.parameters)
+        more = len(final.solved.parameters) - len(rival.solved.parameters)
         least = fits.threshold[min(12, more)] if more > 0 else MARGIN
         lost = rival.deviance - final.deviance
         return lost < least or judge.independent_share(rival, final) * lost < least
@@ -147,7 +147,7 @@ def _with_nonlinear(fits: Fits, explanation: Explanation, k: int, value: float) 
     nonlinear = member.nonlinear.copy()
     nonlinear[k] = value
     start = explanation.start(member)
-    linear = explanation.fit.parameters[start : start + len(member.linear_names)]
+    linear = explanation.solved.parameters[start : start + len(member.linear_names)]
     try:
         raw = fits.dictionary.predictor.signature_near(
             member.effect, member.targets[0], linear, nonlinear, member.raw

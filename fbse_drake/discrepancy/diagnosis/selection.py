@@ -122,7 +122,7 @@ def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
     base = fits.explain([])
     tried = proposals.promising(base, rows, share=0.0)
     found = sorted((fits.explain([candidate]) for candidate in tried), key=left)
-    return [e for e in found if left(e) < left(base) - COMPLEXITY * len(e.fit.parameters)]
+    return [e for e in found if left(e) < left(base) - COMPLEXITY * len(e.solved.parameters)]
 
 
 def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -137,8 +137,8 @@ def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]
     result = []
     for effect in dict.fromkeys(c.effect for c in candidates):
         for targets in alike:
-            members = [found.get((effect, (target,))) for target in targets]
-            if len(members) > 1 and None not in members:
+            members = [found[effect, (t,)] for t in targets if (effect, (t,)) in found]
+            if 1 < len(members) == len(targets):
                 result.append(members)
     return result
 
@@ -180,7 +180,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     names = added.linear_names if added.has_linear else added.nonlinear_names
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
     part = slice(start, start + len(names))
-    values = wider.fit.parameters[part] + offsets
+    values = wider.solved.parameters[part] + offsets
     for k, (name, value) in enumerate(zip(names, values, strict=True)):
         low, high = added.parameters[name].bounds
         plausible = added.parameters[name].plausible
@@ -190,7 +190,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         # What is believed beforehand to be this small is not so large, however sure a fit is.
         if abs(value) > max(widest, _DISBELIEVED * added.parameters[name].belief):
             return False
-        deviation, (least, most) = wider.fit.deviation[part][k], wider.fit.interval()[part][k]
+        deviation, (least, most) = wider.solved.deviation[part][k], wider.solved.interval()[part][k]
         allowed = 3 * deviation
         if not issubclass(added.effect, JointTorqueEffect):
             # Masses, places and offsets have sizes that a bad fit does not widen.
@@ -263,7 +263,7 @@ def _simplest(additions: list[Explanation]) -> Explanation:
     """The best addition; among those that are told apart by nobody, the one with the fewest
     parameters."""
     equal = [e for e in additions if e.deviance < additions[0].deviance + MARGIN]
-    return min(equal, key=lambda e: len(e.fit.parameters))
+    return min(equal, key=lambda e: len(e.solved.parameters))
 
 
 def _revise(

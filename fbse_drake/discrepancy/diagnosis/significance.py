@@ -53,7 +53,7 @@ class Significance:
         """Largest root mean square of what a member of an explanation adds to a row, as a share of
         its size; NaN if no row has one."""
         start, raw = explanation.start(candidate), candidate.raw
-        parameters = explanation.fit.parameters[start : start + raw.values.shape[2]]
+        parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
         added = rms(raw.values @ parameters + raw.offset, self._known[:, raw.rows])
         sizes = self._sizes[raw.rows]
         measured = np.isfinite(sizes) & np.isfinite(added) & (sizes > 0)

@@ -90,8 +90,7 @@ def _told(explanation: Explanation, member: Candidate) -> tuple[np.ndarray, np.n
     """Values of a member's parameters, their standard deviations and degrees of freedom, (m,)
     each."""
     _, values, part = explanation.fitted(member)
-    assert explanation.fit is not None
-    spread = explanation.fit.spread
+    spread = explanation.solved.spread
     # What does not move a row of these blocks is not told by them.
     seen = (member.signature.values**2).sum(axis=(0, 1))[: len(values)] > 0
     return np.where(seen, values, np.nan), spread.deviation[part], spread.freedom[part]

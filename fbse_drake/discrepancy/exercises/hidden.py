@@ -652,7 +652,8 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
     )
 
     statuses = diagnoses[0].get("effects", {})
-    visible, found, confusable, targets, covered = {}, {}, {}, {}, {}
+    visible, found, confusable, targets = {}, {}, {}, {}
+    covered: dict[str, bool] = {}
     for name, effect in hidden.items():
         named = [finding for finding in [*chosen, *small] if finding["effect"] == name]
         found[name] = bool(named)
