@@ -112,6 +112,8 @@ _THRESHOLDS = {
     "EncoderOffset": ("right_ankle_pitch", "offset"),
     "GyroscopeBias": ("robot", "x"),
 }
+# For what can only be hidden in second encoders.
+_SECOND_ENCODERS = ("sensors.motor_encoders={resolution: 4.8e-5}",)
 # Logs without a hidden effect whose model is simulated: they show what the sensors' noise alone
 # makes of two walks.
 _ROLLED_DECOYS = 4
@@ -141,7 +143,7 @@ class Case:
 
 def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
     """All cases but those at the smallest size that can be found, see `threshold_cases`."""
-    names = [name for name, effect in library().items() if not effect.composite]
+    effects = {name: effect for name, effect in library().items() if not effect.composite}
     result = [
         Case(f"decoy-{seed}", "decoy", "decoy", rollout=seed < _ROLLED_DECOYS)
         for seed in range(4 if quick else 30)
@@ -150,8 +152,15 @@ def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
         for size in sizes:
             rollout = size == "large" and seed == 0
             result += [
-                Case(f"effect-{name}-{size}-{seed}", "effect", name, size, rollout=rollout)
-                for name in names
+                Case(
+                    f"effect-{name}-{size}-{seed}",
+                    "effect",
+                    name,
+                    size,
+                    overrides=_SECOND_ENCODERS if effect.needs_motor_encoder else (),
+                    rollout=rollout,
+                )
+                for name, effect in effects.items()
             ]
     for seed in range(1 if quick else 2):
         result += [
@@ -566,14 +575,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print_table(console, title, table)
     failures = "\n".join([*figures.failures(), *errors])
     console.print(failures, highlight=False, soft_wrap=True)
-    confusion = figures.confusion()
-    confusion.savefig(options.out / "confusion.png", dpi=130)
+    figures.confusion().savefig(options.out / "confusion.png", dpi=130)
     caption = "Hidden effects large enough to be found, decoys and strangers; numbers count cases."
     sections = (
         *(Section(title, tables=(table,)) for title, table in made.items()),
         Section(
             "Confusion",
-            figures=(FigureBlock("What was hidden and what was ranked first", caption, confusion),),
+            figures=(
+                FigureBlock(
+                    "What was hidden and what was ranked first", caption, figures.confusion
+                ),
+            ),
         ),
         Section("Cases that went wrong", details=(Details("One line each", failures or "none"),)),
     )

@@ -11,6 +11,9 @@ from scipy.signal import lfilter
 
 from fbse_drake import Log, Scenario, simulate
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
@@ -232,6 +235,22 @@ def test_an_elastic_joint_whose_encoders_have_two_zeros():
     assert values["MotorEncoderOffset"]["offset"].value == pytest.approx(-0.05, abs=2e-5)
     compliance = values["TransmissionElasticity"]["compliance"].value
     assert compliance == pytest.approx(COMPLIANCE, rel=0.05)
+
+
+def test_what_rounding_leaves_takes_nothing_from_an_offset():
+    """Two encoders that round alike differ by their zeros and by numbers' last digits, which may be
+    correlated over the whole log."""
+    log, offset = log_of(), 1e-4
+    read = log["joint/position"].copy()
+    read[:, log.joints.index(KNEE)] += offset + 1e-9 * np.sin(0.5 * log.time)
+    predictor = Predictor(swinging(), Log({**log.channels, "joint/motor_position": read}, log.meta))
+    fits = Fits(Dictionary(predictor, [MotorEncoderOffset]))
+    (knee,) = (c for c in fits.fixed_candidates if c.targets == (KNEE,))
+    nothing, found = fits.explain([]), fits.explain([knee])
+    judge, row = Judge(fits, found), knee.signature.rows
+    drop, gain = (f(nothing, found)[row] for f in (judge.drop_by_row, judge.gain_by_row))
+    assert drop > 1000
+    assert gain == pytest.approx(drop)
 
 
 def test_which_of_two_encoders_is_off():

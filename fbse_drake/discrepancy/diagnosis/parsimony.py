@@ -40,6 +40,9 @@ _AT_THE_END = 0.98
 # A finding takes off a row at least this share of what then is left there beyond the noise: what
 # explains a large rest would also change what is small beside it.
 _LEAST_OF_REST = 0.1
+# Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
+# of two that round alike.
+_ROUNDING = 1e-3
 
 
 def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
@@ -129,7 +132,10 @@ class Judge:
             known = scores[inside] != 0
             mean = scores[inside].sum(axis=0) / np.maximum(known.sum(axis=0), 1)
             scores[inside] -= np.where(known, mean, 0.0)
-        gain[changed] /= blocks_per_sample(scores)
+        # What is left far below the noise is rounding, whose correlation tells nothing of it.
+        count = np.maximum(self._fits.white.count[changed], 1)
+        is_noise = (self._left[:, changed] ** 2).sum(axis=0) > _ROUNDING * count
+        gain[changed] /= np.where(is_noise, blocks_per_sample(scores), 1.0)
         return gain
 
     def gain(self, base: Explanation, wider: Explanation) -> float:
