@@ -349,6 +349,7 @@ def test_faulty_sensor_reads_what_its_answer_says(name: str) -> None:
     joints = dict.fromkeys(
         ("joint_position", "joint_velocity", "torque_command"), np.zeros((4, 12))
     )
+    joints["motor_position"] = np.zeros((4, 0))
     effect = physics.answers[0].make()
     values = effect.resolve(robot.description, key="hidden")
     expected = effect.reading(SensorSignals(**joints, **true), np.zeros((0, 1)), values, robot)
