@@ -279,10 +279,11 @@ def check_recorded(log: Log) -> None:
         InputError: numbers that nothing measurable has, or a period that is not that of the rows.
     """
     for name, values in log.items():
-        if (largest := float(np.abs(values).max(initial=0.0))) > schema.LARGEST_NUMBER:
+        # What is believed of a sensor may be as large, and its variance is the square of that.
+        most = schema.LARGEST_NUMBER ** (2 if name.endswith("_variance") else 1)
+        if (largest := float(np.abs(values).max(initial=0.0))) > most:
             raise InputError(
-                f"channel {name}: expected numbers of size at most {schema.LARGEST_NUMBER:g}, "
-                f"found {largest:g}"
+                f"channel {name}: expected numbers of size at most {most:g}, found {largest:g}"
             )
     periods = float(log.time[-1] - log.time[0]) / float(log.meta["period"])
     if periods > _MOST_GAPS * len(log.time):

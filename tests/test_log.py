@@ -100,6 +100,18 @@ def test_foreign_files_get_one_line(tmp_path: Path):
         Log.load(tmp_path / "text.npz")
 
 
+def test_a_run_with_sensors_that_say_nothing_can_be_read_again(tmp_path: Path):
+    """Noise may be as large as a number may, and a variance is its square."""
+    deaf = ("duration=0.01", "sensors.foot_force.noise=1e15", "estimator=!Fbse {}")
+    simulate(scenario("squat", *deaf)).log.save(tmp_path / "log.npz")
+    variance = Log.load(tmp_path / "log.npz")["estimate/base_state/force_innovation_variance"]
+    assert variance.max() > 1e15
+    large = channels() | {"joint/position": np.full((5, 2), 1e16)}
+    Log(large, {"joints": ["a", "b"], "period": 0.01}).save(tmp_path / "large.npz")
+    with pytest.raises(InputError, match="joint/position: expected numbers of size at most"):
+        Log.load(tmp_path / "large.npz")
+
+
 def test_same_scenario_and_seed_give_the_same_bytes(tmp_path: Path):
     for name in ("first", "second"):
         simulate(scenario("paper_walk", "duration=0.8"), name="paper_walk").log.save(
