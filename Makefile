@@ -37,11 +37,12 @@ lint: $(INSTALLED)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-# Compiles the estimators of two legs and of four, which nearly all tests need, once for all
-# workers; in one process, for they share much.
+# Compiles the estimators of two legs, by both methods, of four and of an arm, which many tests need,
+# once for all workers, which grow by it; in one process, for they share much.
 kernels: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
-		[simulate(load(walk, overrides=['duration=0.01'])) for walk in ('paper_walk_fbse', 'quadruped_trot')]"
+		[simulate(load(*walk, overrides=['duration=0.01'])) for walk in (['paper_walk_fbse'], \
+		['paper_walk_fbse', 'paper_method'], ['quadruped_trot'], ['bsc_arm'])]"
 
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .

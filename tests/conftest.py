@@ -37,12 +37,12 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
         trim(0)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Log]:
     """Simulates a shipped scenario: run("squat", "duration=2", noise=False).
 
-    Logs are files, so that the workers of a session share them; each keeps its last ones in memory
-    as well, some 3 MiB for each second.
+    Logs are files, so that the files of tests and the workers of a session share them; the last
+    ones of a file of tests are in memory as well, some 3 MiB for each second.
     """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
