@@ -497,12 +497,12 @@ class Tether(Physics):
     anchor: tuple[float, float, float]
     stiffness: float
     length: float
-    # Joints that it loads; none where the base floats.
+    # Joints that it loads; where the base floats, the body itself.
     joints: tuple[str, ...] = ()
 
     @property
     def targets(self) -> tuple[str, ...]:
-        return self.joints
+        return self.joints or (self.body,)
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_site(name="anchor", pos=self.anchor)
