@@ -2,7 +2,7 @@
 nothing of noise."""
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -74,7 +74,7 @@ class Dictionary:
             # that half.
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
             self._look_at(self.inertia)
-        self._grids: dict[type[JointTorqueEffect], np.ndarray] = {}
+        self._grids: dict[tuple[type[JointTorqueEffect], int], np.ndarray] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
 
     def _look_at(self, inertia: UntrustedInertia) -> None:
@@ -210,24 +210,26 @@ class Dictionary:
         factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
         return points[:, :, None] * factors[:, None]
 
-    def grid(self, effect: type[JointTorqueEffect]) -> np.ndarray:
-        """Columns of an effect's first grid in the rows of all joints, (B, r, p, G)."""
-        if effect in self._grids:
-            return self._grids[effect]
+    def grid(self, effect: type[JointTorqueEffect]) -> Iterator[tuple[int, np.ndarray]]:
+        """Columns of an effect's first grid, (B, p, G), row by row of all joints."""
         self.progress("predicting what each joint effect would do", self._predicted)
-        rows = self.rows_of(effect, self.joints)
-        points = self.points(effect)[..., self.predictor.joints_of(rows)]
-        columns = self.predictor.joint_columns(effect, points, rows)
-        columns = np.transpose(columns, (2, 3, 0, 1))
-        # Where no law is doubted, nothing is weighed anew, and nobody asks again.
-        if self.per_step:
-            self._grids[effect] = columns
-        return columns
+        points = self.points(effect)
+        for row in self.rows_of(effect, self.joints):
+            key = (effect, int(row))
+            columns = self._grids.get(key)
+            if columns is None:
+                joints = self.predictor.joints_of(np.array([row]))
+                made = self.predictor.joint_columns(effect, points[..., joints], np.array([row]))
+                columns = np.transpose(made[..., 0], (2, 0, 1))
+            # Where no law is doubted, nothing is weighed anew, and nobody asks again.
+            if self.per_step:
+                self._grids[key] = columns
+            yield int(row), columns
 
     @property
     def _predicted(self) -> float:
         """Share of the joint effects whose grids are there."""
-        return len(self._grids) / max(1, len(self.joint_effects))
+        return len({effect for effect, _ in self._grids}) / max(1, len(self.joint_effects))
 
     def _factors(self, effect: type[Effect], target: str) -> np.ndarray:
         """What values of the nonlinear parameters at a revolute joint are multiplied with for a

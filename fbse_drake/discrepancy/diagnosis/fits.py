@@ -236,10 +236,9 @@ class Fits:
     def grid(self, effect: type[JointTorqueEffect]) -> Grid:
         """First grid of an effect's nonlinear values, in all joints."""
         if effect.__name__ not in self._grids:
-            points, columns = self.dictionary.points(effect), self.dictionary.grid(effect)
-            rows = self.dictionary.rows_of(effect, self.dictionary.joints).tolist()
-            sets = {row: self._whitened(columns[:, k], row) for k, row in enumerate(rows)}
-            self._grids[effect.__name__] = Grid(points, sets)
+            grid = self.dictionary.grid(effect)
+            sets = {row: self._whitened(columns, row) for row, columns in grid}
+            self._grids[effect.__name__] = Grid(self.dictionary.points(effect), sets)
         return self._grids[effect.__name__]
 
     def sets(
