@@ -25,7 +25,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basi
 from fbse_drake.progress import Progress, silent
 
 # So many numbers are kept in columns, at most.
-_MOST_NUMBERS = 20_000_000
+_MOST_NUMBERS = 4_000_000
 
 
 @dataclass(frozen=True)

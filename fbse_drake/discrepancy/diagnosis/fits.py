@@ -39,7 +39,7 @@ _SPURIOUS = 3.0
 _SLOPE_STEP = 0.02
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
-_MOST_NUMBERS = 30_000_000
+_MOST_NUMBERS = 5_000_000
 _MOST_POLISHED = 5_000_000
 
 

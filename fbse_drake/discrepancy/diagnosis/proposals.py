@@ -26,7 +26,7 @@ _CATCHES_UP = 0.4
 # What takes off this share of the sum of squares that is required is worth a fit.
 _ENOUGH = 0.5
 # So many numbers are kept in columns of candidates.
-_MOST_NUMBERS = 15_000_000
+_MOST_NUMBERS = 3_000_000
 # How often friction of all joints is fitted in turn.
 _SWEEPS = 3
 

@@ -32,7 +32,7 @@ _COLLINEAR = 1e-4
 # rounding.
 _ROUNDING, _NEGLIGIBLE = 1e-15, 1e-7
 # So many numbers are kept of columns by fold, and of inner products; and so many fits.
-_MOST_NUMBERS, _KEPT_FITS = 15_000_000, 500
+_MOST_NUMBERS, _KEPT_FITS = 3_000_000, 500
 
 
 @dataclass(frozen=True, eq=False)
