@@ -143,9 +143,9 @@ def _calc_steady(
     tick: np.ndarray,
     last: np.ndarray,
     joint_state: np.ndarray,
+    is_solved: bool,
     offset: np.ndarray,
     velocities: int,
-    is_solved: bool,
     unit: np.ndarray,
     rate: np.ndarray,
     velocity: np.ndarray,
@@ -254,6 +254,8 @@ class ExplicitTorque(LeafSystem):
             if effect.effect.has_memory:
                 rows += len(effect.effect.start(still, effect.nonlinear))
             self._others.append((k, effect, slice(start, rows)))
+        # What a tick takes of these; to put it together costs a tick as much as to read a port.
+        self._known = (torque.offset, self._velocities, *self._table, *self._solver)
         self._trial = None if self._is_solved and not self._others else trial
         self._joint_state = self.DeclareVectorInputPort("joint_state", 2 * n)
         actuators = robot.plant.num_actuators()
@@ -313,13 +315,11 @@ class ExplicitTorque(LeafSystem):
         vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
         joint_state = self._joint_state.Eval(context)
         if not self._others:
-            sizes = (self._law.torque.offset, self._velocities)
-            known = (*self._table, *self._solver)
-            _calc_steady(*vectors, joint_state, *sizes, self._is_solved, *known)
+            _calc_steady(*vectors, joint_state, self._is_solved, *self._known)
             if self._trial is not None:
                 tick = _parts(vectors[0], self._joints, self._velocities)
                 end = self._tried(self._trial, context, tick)
-                _correct_steady(vectors[0], end, *sizes, *known)
+                _correct_steady(vectors[0], end, *self._known)
             return
         tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
         motion = self._motion(context, tick, last, _begin(tick, last, joint_state))

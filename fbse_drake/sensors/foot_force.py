@@ -171,9 +171,9 @@ class PadForces(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         reactions = self._reaction_forces.Eval(context)
         # A joint's reaction acts on the pad, against the ground's force.
-        output.SetFromVector(
-            -np.concatenate([reactions[joint].translational() for joint in self._joints])
-        )
+        force = output.get_mutable_value()
+        np.concatenate([reactions[joint].translational() for joint in self._joints], out=force)
+        np.negative(force, out=force)
 
 
 class NoFeet(Diagram):
