@@ -312,16 +312,15 @@ class ExplicitTorque(LeafSystem):
         return effect.effect.advance(JointMotion(velocity, *ended, before[rows]), effect.nonlinear)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        vectors = (output.get_mutable_value(), context.get_discrete_state().value(0))
+        vector, before = output.get_mutable_value(), context.get_discrete_state().value(0)
         joint_state = self._joint_state.Eval(context)
         if not self._others:
-            _calc_steady(*vectors, joint_state, self._is_solved, *self._known)
+            _calc_steady(vector, before, joint_state, self._is_solved, *self._known)
             if self._trial is not None:
-                tick = _parts(vectors[0], self._joints, self._velocities)
-                end = self._tried(self._trial, context, tick)
-                _correct_steady(vectors[0], end, *self._known)
+                tick = _parts(vector, self._joints, self._velocities)
+                _correct_steady(vector, self._tried(self._trial, context, tick), *self._known)
             return
-        tick, last = (_parts(vector, self._joints, self._velocities) for vector in vectors)
+        tick, last = (_parts(each, self._joints, self._velocities) for each in (vector, before))
         motion = self._motion(context, tick, last, _begin(tick, last, joint_state))
         self._put_force(tick, motion)
         if self._trial is not None:
