@@ -294,7 +294,7 @@ class Scenario:
     # Drake's settings of the robot's plant, whose time_step must be > 0.
     plant: MultibodyPlantConfig = field(default_factory=_plant_config)
     # Solve every step of the plant twice, so that joint torques follow their laws ten times as
-    # closely, through impacts too; the simulation takes half as long again.
+    # closely, through impacts too; the simulation takes twice as long.
     solve_twice: bool = False
     ground: Ground = field(default_factory=Ground)
     # The motion: !Walk, !Trot, !Squat, !Sway, !JointSines or !Recorded.

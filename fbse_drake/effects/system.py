@@ -174,29 +174,6 @@ def _calc_steady(
         parts.force[:] = 0.0
 
 
-@njit(cache=True)
-def _correct_steady(
-    tick: np.ndarray,
-    end: np.ndarray,
-    offset: np.ndarray,
-    velocities: int,
-    unit: np.ndarray,
-    rate: np.ndarray,
-    velocity: np.ndarray,
-    torque: np.ndarray,
-    slope: np.ndarray,
-    damping: np.ndarray,
-    clamp_slope: np.ndarray,
-    clamp_limit: np.ndarray,
-    clamp: np.ndarray,
-    velocity_index: np.ndarray,
-) -> None:
-    """Fills the force of a tick of `_calc_steady` anew, for velocities (n,) [rad/s] at its end."""
-    table = LawTable(unit, rate, velocity, torque, slope)
-    solver = _Solver(damping, clamp_slope, clamp_limit, clamp, velocity_index)
-    _finish(_parts(tick, len(end), velocities), end, look_up(table, end), offset, solver)
-
-
 class ExplicitTorque(LeafSystem):
     """What Drake's solver does not take of joint torque effects, and their loss as a whole.
 
@@ -318,7 +295,7 @@ class ExplicitTorque(LeafSystem):
             _calc_steady(vector, before, joint_state, self._is_solved, *self._known)
             if self._trial is not None:
                 tick = _parts(vector, self._joints, self._velocities)
-                _correct_steady(vector, self._tried(self._trial, context, tick), *self._known)
+                self._put_force(tick, JointMotion(self._tried(self._trial, context, tick)))
             return
         tick, last = (_parts(each, self._joints, self._velocities) for each in (vector, before))
         motion = self._motion(context, tick, last, _begin(tick, last, joint_state))
