@@ -457,6 +457,22 @@ def test_elastic_transmission_follows_the_command_as_a_low_pass():
     )
 
 
+@pytest.mark.parametrize("effect", [e for e in SENSOR_EFFECTS if e.memory_size])
+def test_memory_over_a_log_is_that_of_its_ticks(plain: Robot, effect: SensorEffect):
+    random, ticks = np.random.default_rng(0), 40
+    shapes = {"specific_force": (3,), "angular_velocity": (3,), "motor_position": (0,)}
+    shapes["pad_force"] = (sum(len(G[0]) // 3 for G in plain.grasp_maps), 3)
+    channels = {f.name: (ticks, *shapes.get(f.name, (12,))) for f in dataclasses.fields(SensorSignals)}
+    signals = SensorSignals(**{name: random.normal(size=s) for name, s in channels.items()})
+    resolved = effect.resolve(plain.description)
+    memory = effect.memory_over_time(signals, resolved, plain, TICK)
+    assert np.abs(memory).max(axis=(1, 2)).min() > 0.0
+    for k in range(1, ticks - 1):
+        tick = SensorSignals(*(channel[k] for channel in vars(signals).values()))
+        after = effect.remembered(tick, memory[:, k], resolved, plain, TICK)
+        np.testing.assert_allclose(memory[:, k + 1], after, rtol=1e-12, atol=1e-14)
+
+
 def test_unknown_foot_is_refused():
     with pytest.raises(
         InputError,

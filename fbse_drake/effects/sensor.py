@@ -648,6 +648,21 @@ class TransmissionElasticity(SensorEffect):
             [command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command]
         )
 
+    @classmethod
+    def memory_over_time(
+        cls,
+        signals: SensorSignals,
+        values: ResolvedEffect,
+        robot: Robot,  # noqa: ARG003
+        period: float,
+    ) -> np.ndarray:
+        command, stays = signals.torque_command, np.exp(-period / values.nonlinear[0])
+        memory = np.zeros((cls.memory_size, *command.shape))
+        memory[1, 1:] = command[:-1]
+        for joint, share in enumerate(stays):
+            memory[0, 1:, joint] = lfilter([1.0 - share], [1.0, -share], command[:-1, joint])
+        return memory
+
 
 class SensorEffects(LeafSystem):
     """Distorts the readings of the sensors by effects, one after the other.
