@@ -462,8 +462,10 @@ def test_memory_over_a_log_is_that_of_its_ticks(plain: Robot, effect: SensorEffe
     random, ticks = np.random.default_rng(0), 40
     shapes = {"specific_force": (3,), "angular_velocity": (3,), "motor_position": (0,)}
     shapes["pad_force"] = (sum(len(G[0]) // 3 for G in plain.grasp_maps), 3)
-    channels = {f.name: (ticks, *shapes.get(f.name, (12,))) for f in dataclasses.fields(SensorSignals)}
-    signals = SensorSignals(**{name: random.normal(size=s) for name, s in channels.items()})
+    names = [field.name for field in dataclasses.fields(SensorSignals)]
+    signals = SensorSignals(
+        *(random.normal(size=(ticks, *shapes.get(name, (12,)))) for name in names)
+    )
     resolved = effect.resolve(plain.description)
     memory = effect.memory_over_time(signals, resolved, plain, TICK)
     assert np.abs(memory).max(axis=(1, 2)).min() > 0.0
