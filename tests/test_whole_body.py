@@ -21,9 +21,10 @@ from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
-from fbse_drake.estimators.link_torque import LinkTorqueEstimator, wrench_variance
+from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.report.metrics import friction_error, joint_sides, stance
+from fbse_drake.robot.plant import grasp_map
 
 Run = Callable[..., Log]
 WALK = scenario("paper_walk_fbse", "duration=3")
@@ -49,8 +50,11 @@ LINK = LinkTorqueEstimator(
 LAW = CoulombViscousFriction(coulomb={"all": 2.0}, viscous={"all": 3.0}, transition={"all": 2.0})
 
 
-def seen_from_imu(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass matrix (18, 18), bias (18,) and Jacobians of the soles (2, 6, 18) of Drake's plant.
+def seen_from_imu(
+    velocity: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mass matrix (18, 18), bias (18,), Jacobians of the soles (2, 6, 18) and what their own change
+    makes of the soles' turning (2, 3) of Drake's plant.
 
     The base's velocities are its angular velocity and the velocity of the IMU.
 
@@ -74,14 +78,21 @@ def seen_from_imu(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
         plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole) @ from_ours
         for sole in map(robot.sole, robot.description.sides)
     ]
-    return from_ours.T @ M @ from_ours, bias, np.array(soles)
+    sole_turning = [
+        plant.CalcBiasSpatialAcceleration(context, wrt, sole, origin, world, sole).rotational()
+        for sole in map(robot.sole, robot.description.sides)
+    ]
+    return from_ours.T @ M @ from_ours, bias, np.array(soles), np.array(sole_turning)
 
 
 def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
     """A tick's mean and covariance: the plant's rows of turning and joints, the row of the IMU's
-    acceleration known but for the accelerometer's noise, friction at the velocity that results."""
+    acceleration known but for the accelerometer's noise, friction at the velocity that results.
+
+    Pads that show nothing but noise have no force; the foot that stands does not turn.
+    """
     generator, T, n = np.random.default_rng(1), TICK, 12
-    config = WholeBody(model=LAW, factors=[])
+    config = WholeBody(model=LAW, factors=[], foot_turning=0.05)
     rig = Rig(
         config.system(
             USUAL_SENSORS,
@@ -99,18 +110,27 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
     sigma = np.repeat(
         [USUAL_SENSORS.angular_velocity_noise, USUAL_SENSORS.joint_velocity_noise], [3, n]
     )
-    velocity, wrench = 0.3 * generator.standard_normal(15), np.zeros((2, 6))
-    # The left foot swings.
-    wrench[0] = [2.0, -3.0, 1.0, 20.0, -15.0, 800.0]
+    velocity = 0.3 * generator.standard_normal(15)
+    turn = seen_from_imu(velocity)[2][0][2, rows]
+    velocity -= turn * (turn @ velocity) / (turn @ turn)
+    # The left foot stands on three of its pads, the right one swings.
+    touches, noise = np.zeros(8, dtype=bool), USUAL_SENSORS.force_noise
+    touches[:3] = True
+    pad_force = noise * generator.uniform(-2.0, 2.0, size=(8, 3))
+    pad_force[:3] = [[20.0, -15.0, 300.0], [5.0, 8.0, 250.0], [-9.0, 4.0, 10.0]]
+    wrenches = np.zeros((2, 6))
+    wrenches[0, 5] = 560.0
+    G = grasp_map(BASE.robot.pad_positions("left"))[:, :9]
 
     def read(velocity: np.ndarray, force: np.ndarray | None = None) -> dict[str, np.ndarray]:
         rates = {"angular_velocity": mount.R_BI.T @ velocity[:3], "joint_velocity": velocity[3:]}
-        return rates if force is None else {**rates, "specific_force": force}
+        forces = {"pad_force": pad_force, "support": np.array([1.0, 0.0])}
+        return rates if force is None else {**rates, **forces, "specific_force": force}
 
     def tick(start: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> np.ndarray:
         return rig.tick(
             measurements=BASE.measurements(**read(velocity, force)),
-            link_torque=pack(LINK, wrench=wrench, force_noise=np.ones(2)),
+            link_torque=pack(LINK, wrench=wrenches, force_noise=np.ones(2)),
             model_over_step=BASE.model_of(**read(start)),
             attitude=pack(ATTITUDE, rotation=np.eye(3)),
             torque_command=command,
@@ -120,12 +140,11 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
     last = tick(velocity, velocity, np.array([0.0, 0.0, 9.8]))
     for _ in range(6):
         start, force = velocity, np.array([0.3, -0.2, 9.7]) + generator.normal(scale=0.1, size=3)
-        M, bias, J = seen_from_imu(start)
+        M, bias, J, turning = seen_from_imu(start)
         push = -bias - M[:, 3:6] @ (mount.R_BI @ force)
         push[6:] += command
-        R_W = np.diag(wrench_variance(USUAL_SENSORS, BASE.robot, "right"))
-        push += J[0].T @ wrench[0]
-        Q = J[0].T @ R_W @ J[0]
+        push += J[0].T @ G @ pad_force[touches].ravel()
+        Q = noise**2 * J[0].T @ G @ G.T @ J[0]
         Q += USUAL_SENSORS.acceleration_noise**2 * M[:, 3:6] @ M[3:6]
         A, push, Q = M[np.ix_(rows, rows)], push[rows], Q[np.ix_(rows, rows)]
 
@@ -141,9 +160,10 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         command = 2 * generator.standard_normal(n)
         posterior = tick(start, velocity, force)
 
-        v = V[joints]
+        # Linearised where the tick ends.
+        v, ends = posterior["velocity"][joints], posterior["weights"]
         phi = np.stack([np.tanh(v / 2.0), v], axis=1)
-        slope = law[:, 0] * (1 - phi[:, 0] ** 2) / 2.0 + law[:, 1]
+        slope = ends[:, 0] * (1 - phi[:, 0] ** 2) / 2.0 + ends[:, 1]
         B = np.linalg.inv(A + T * np.diag(np.concatenate([np.zeros(3), slope])))
         F = np.eye(54)
         F[:15, :15], F[:15, 15:30] = B @ A, -T * B
@@ -162,6 +182,13 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         assert np.all(np.abs(innovation) < 5 * np.sqrt(np.diag(S)))
         X = np.concatenate([V, last["lacking"], law.ravel()]) + K @ innovation
         P = P - K @ P[:15]
+        # The foot's normal does not turn the sole.
+        H = np.zeros(54)
+        H[:15] = J[0][2, rows]
+        S = H @ P @ H + last["foot_noise"][0] * config.foot_turning**2
+        assert abs(H @ X) < 5 * np.sqrt(S)
+        X += P @ H / S * (-H @ X - T * turning[0, 2])
+        P = P - np.outer(P @ H, P @ H) / S
         scale = np.sqrt(np.diag(P))
         found = [posterior[name].ravel() for name in ("velocity", "lacking", "weights")]
         np.testing.assert_allclose((np.concatenate(found) - X) / scale, 0.0, atol=5e-3)
@@ -197,8 +224,8 @@ ROLES = ("hip_yaw", "hip_roll", "hip_pitch", "knee_pitch", "ankle_pitch", "ankle
 
 @pytest.mark.parametrize("changes", [(), ("ground.stiffness=1.0e5",), ("seed=3",)])
 def test_friction_in_swing_is_not_the_noise_of_the_encoders(run: Run, changes: tuple[str, ...]):
-    """Measured in swing, over the filter joint by joint: 0.45 to 0.65 in the hip yaws, and less
-    over all."""
+    """Measured over the filter joint by joint: the hip yaws at a quarter to a half, in stance at
+    half, and less over all."""
     log = run("paper_walk_fbse", "duration=3", *changes)
     result = estimated(log, WALK, WHOLE_BODY)
     ratios = {
@@ -207,7 +234,8 @@ def test_friction_in_swing_is_not_the_noise_of_the_encoders(run: Run, changes: t
         for role in ROLES
         for swings in (False, True)
     }
-    assert ratios["hip_yaw", True] < 0.75
+    assert ratios["hip_yaw", True] < 0.6
+    assert ratios["hip_yaw", False] < 0.8
     assert np.exp(np.mean(np.log(list(ratios.values())))) < 0.9
     assert coverage(result) > 0.98
 

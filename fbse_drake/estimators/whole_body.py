@@ -19,7 +19,7 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
-from fbse_drake.estimators.link_torque import is_loaded, wrench_variance
+from fbse_drake.estimators.link_torque import wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import measurements_type
@@ -33,11 +33,21 @@ from fbse_drake.estimators.spatial import (
     vector,
 )
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.foot_pads import FootPads
 
+# A wrench, or the force on a pad, is beyond its sensors' noise above these quantiles of chi^2 with
+# six and three degrees of freedom (one in 3000).
+_WRENCH_GATE, _PAD_GATE = 25.1, 18.5
 # An innovation counts as little as makes it just likely beyond so many standard deviations, ...
 _GATE = 5.0
 # ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
+# A foot that carries less than the first of these shares of the load does not stand, and below the
+# second it moves more easily the less it carries.
+_LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
+# The law is linearised where a tick is expected to end, then where the measurements say that it
+# ended.
+_ITERATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -47,8 +57,10 @@ class WholeBody:
     Its states are the angular velocity of the base, the velocities of the joints, the linear
     parameters of each joint's friction law, and what the equation of motion lacks in each of its
     rows (wrong masses, friction that follows no law), a random walk. It takes command, foot forces
-    and accelerometer for granted but for their noise; gyro and encoders are measurements. Friction
-    that rises steeply with the velocity is solved implicitly.
+    and accelerometer for granted but for their noise; gyro and encoders are measurements, and flat
+    feet that stand do not turn. Friction that rises steeply with the velocity is solved implicitly,
+    and linearised where the measurements say that a tick ended: velocity and law are learned
+    together, and one that does not fit the other would be learned wrong.
 
     Foot forces and commands have to be right: a delay of theirs is not allowed for, and what is
     wrong with them makes the laws wrong.
@@ -79,11 +91,14 @@ class WholeBody:
     disturbance_uncertainty: float = 0.1
     moment_walk: float = 0.5
     moment_uncertainty: float = 0.5
+    # How fast a flat foot turns about its normal while it stands, in spite of all [rad/s]; more is
+    # learned.
+    foot_turning: float = 1.0e-4
 
     def __post_init__(self) -> None:
         require_not_negative(self, "parameter_uncertainty", "shape_uncertainty")
         require_not_negative(self, "disturbance_walk", "disturbance_uncertainty")
-        require_not_negative(self, "moment_walk", "moment_uncertainty")
+        require_not_negative(self, "moment_walk", "moment_uncertainty", "foot_turning")
 
     def system(self, sensors: SensorBeliefs, robot: Robot, **arguments: Any) -> "WholeBodyFilter":
         """The estimator with these settings; arguments as of its class."""
@@ -129,15 +144,57 @@ def _equation_of_motion(
     push[3:] = torque_command - model.bias
     push -= of_linear @ linear
     variance = noise**2 * (of_linear @ of_linear.T)
-    for foot in range(len(link.wrench)):
-        wrench, of_wrench = link.wrench[foot], link.force_noise[foot] * known.wrench_variance[foot]
-        if is_loaded(wrench, of_wrench):
-            J, lever = model.foot_jacobian[foot], np.empty((6, r))
-            lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
-            lever[:, 3:] = J[:, 6:]
+    for foot in range(len(known.has_pads)):
+        J, lever = model.foot_jacobian[foot], np.empty((6, r))
+        lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
+        lever[:, 3:] = J[:, 6:]
+        wrench, excess = link.wrench[foot], link.force_noise[foot]
+        of_wrench = excess * known.wrench_variance[foot]
+        if not known.has_pads[foot] and _pushes(wrench, of_wrench, _WRENCH_GATE):
             push += lever.T @ wrench
             variance += (lever.T * of_wrench) @ lever
+        if known.has_pads[foot]:
+            _add_pads(push, variance, lever, measured.mean.pad_force, foot, excess, known)
     return A, push, variance
+
+
+@njit(cache=True)
+def _pushes(force: np.ndarray, variance: np.ndarray, gate: float) -> bool:
+    """Does a sensor show more than its noise? What does not touch the ground has no force."""
+    distance = 0.0
+    for i in range(len(force)):
+        # A point foot has no moment.
+        if variance[i] > 0.0:
+            distance += force[i] ** 2 / variance[i]
+    return distance > gate
+
+
+@njit(cache=True)
+def _add_pads(
+    push: np.ndarray,
+    variance: np.ndarray,
+    lever: np.ndarray,
+    force: np.ndarray,
+    foot: int,
+    excess: float,
+    known: Record,
+) -> None:
+    """Adds what the pads of a foot that touch the ground push, (r,), and its variance, (r, r).
+
+    Args:
+        lever: of the wrench on the sole, (6, r).
+        force: of all pads, (P, 3) [N].
+        excess: by how much the variance of the forces is larger than believed.
+    """
+    pads, of_force = known.pads, np.full(3, excess * known.sensors.force_noise**2)
+    for pad in range(len(force)):
+        if pads.foot[pad] == foot and _pushes(force[pad], of_force, _PAD_GATE):
+            arm = np.empty((3, 3))
+            put(arm, skew(vector(pads.position[pad])))
+            # A force f at p has the moment p x f.
+            of_pad = lever[3:] + arm.T @ lever[:3]
+            push += of_pad.T @ force[pad]
+            variance += of_force[0] * (of_pad.T @ of_pad)
 
 
 @njit(cache=True)
@@ -174,11 +231,12 @@ def _implicit_step(
 def _linearise(
     x: Record,
     velocity: np.ndarray,
+    weights: np.ndarray,
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
 ) -> None:
-    """Fills the linearisation of the friction at velocities of the joints (n,).
+    """Fills the linearisation of the friction at velocities of the joints (n,) and weights (n, m).
 
     Args:
         phi, slopes, shaped: see `FrictionRegressor`.
@@ -189,7 +247,7 @@ def _linearise(
         put_regressor(row, slopes, shaped, joint, n)
         slope = 0.0
         for k in range(m):
-            slope += row[k] * x.weights[joint, k]
+            slope += row[k] * weights[joint, k]
         put_regressor(row, phi, shaped, joint, n)
         there = 0.0
         for k in range(m):
@@ -285,6 +343,37 @@ def _listen(x: Record, last: Record, predicted: np.ndarray, elapsed: float, know
 
 
 @njit(cache=True)
+def _listen_to_feet(
+    x: Record, last: Record, measured: Record, model: Record, link: Record, T: float, known: Record
+) -> None:
+    """Kalman updates with flat feet that stand: they do not turn about their normals."""
+    P, r, state, load = x.covariance, len(x.velocity), _state(x), 0.0
+    row = np.empty(r)
+    for foot in range(len(known.is_flat)):
+        load += max(0.0, link.wrench[foot, 5])
+    for foot in range(len(known.is_flat)):
+        share = link.wrench[foot, 5] / max(load, 1.0)
+        if not known.is_flat[foot] or not measured.support[foot] > 0 or share < _LEAST_LOAD:
+            continue
+        # Where the tick ends, of which the model knows where it began.
+        row[:3], row[3:] = model.foot_jacobian[foot, 2, :3], model.foot_jacobian[foot, 2, 6:]
+        column = row @ P[:r]
+        innovation = -(row @ state[:r]) - T * model.foot_bias[foot, 2]
+        believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
+        S = column[:r] @ row + last.foot_noise[foot] * believed
+        surprise = innovation**2 / S
+        x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
+        # A foot that turns is no measurement.
+        if surprise < _GATE**2:
+            state += column * (innovation / S)
+            for j in range(len(P)):
+                gain = column[j] / S
+                for k in range(len(P)):
+                    P[j, k] -= gain * column[k]
+    _put_state(x, state)
+
+
+@njit(cache=True)
 def _forget_motion(posterior: Record, known: Record) -> None:
     """Where a sensor is not trusted, velocities are what was measured, and nothing is lacking."""
     x, known = posterior[()], known[()]
@@ -312,7 +401,7 @@ def _conclude(
         phi, slopes, shaped: see `FrictionRegressor`.
     """
     x, last = posterior[()], last[()]
-    _linearise(x, x.velocity[3:], phi, slopes, shaped)
+    _linearise(x, x.velocity[3:], x.weights, phi, slopes, shaped)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME)
     for joint in range(n):
@@ -401,25 +490,34 @@ def _update(
     posterior: Record,
     last: Record,
     elapsed: float,
+    begun: Record,
+    ahead: tuple[np.ndarray, np.ndarray],
     motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
+    measured: Record,
+    model: Record,
+    link_torque: Record,
     known: Record,
 ) -> None:
     """Covariance and measurements of a tick, the law linearised where it is expected to end.
 
     Args:
+        begun: what `_begin` has made.
+        ahead: velocities of the joints (n,) and weights (n, m) where the law is linearised.
         motion: see `_predict`.
         phi, slopes, shaped: see `FrictionRegressor`.
     """
+    posterior[()] = begun[()]
     x, last, known = posterior[()], last[()], known[()]
-    guess, A, push, variance = motion
-    _linearise(x, guess[3:], phi, slopes, shaped)
+    _, A, push, variance = motion
+    _linearise(x, ahead[0], ahead[1], phi, slopes, shaped)
     predicted, inverse = _implicit_step(x, x.velocity, A, push, elapsed)
     x.velocity[:] = predicted
     _propagate(x, A, inverse, variance, elapsed)
     _listen(x, last, predicted, elapsed, known)
+    _listen_to_feet(x, last, measured[()], model[()], link_torque[()], elapsed, known)
 
 
 class WholeBodyFilter(RecursiveEstimator):
@@ -454,6 +552,7 @@ class WholeBodyFilter(RecursiveEstimator):
                                          is the innovation's running mean
         noise                    (r,)    by how much the variance of these is larger than believed,
                                          at least 1
+        foot_noise               (feet,) the same of standing feet's turning
         reading                  (r,)    what they read, free of the bias [rad/s]
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
                                          since then [Nm]
@@ -479,7 +578,7 @@ class WholeBodyFilter(RecursiveEstimator):
         self._config = config
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
         n, m = len(robot.joint_names), self._regressor.weights
-        r = 3 + n
+        r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         per_row = ("velocity", "lacking", "innovation", "innovation_variance", "agreement")
         per_joint = ("friction", "friction_std", "doubt", "law_velocity", "friction_there", "slope")
         posterior_type = record_type(
@@ -487,6 +586,7 @@ class WholeBodyFilter(RecursiveEstimator):
             status=(),
             **dict.fromkeys((*per_row, "noise", "reading"), (r,)),
             **dict.fromkeys(per_joint, (n,)),
+            foot_noise=(len(legs),),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
             covariance=(2 * r + n * m, 2 * r + n * m),
@@ -498,9 +598,10 @@ class WholeBodyFilter(RecursiveEstimator):
             config=config,
             sensors=sensors,
             mount=record(**vars(ImuMount(robot))),
-            wrench_variance=np.array(
-                [wrench_variance(sensors, robot, side) for side in robot.description.legs]
-            ),
+            pads=record(position=pads.position, foot=pads.foot),
+            is_flat=np.array([float(not leg.is_point) for leg in legs.values()]),
+            has_pads=np.array([float(not leg.has_six_axes) for leg in legs.values()]),
+            wrench_variance=np.array([wrench_variance(sensors, robot, side) for side in legs]),
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -533,8 +634,15 @@ class WholeBodyFilter(RecursiveEstimator):
             motion = _predict(
                 posterior, elapsed, measured, model, link, attitude, torque_command, known
             )
-            phi, slopes = self._regressor(motion[0][3:])
-            _update(posterior, last, elapsed, motion, phi, slopes, shaped, known)
+            # Where the law is steep, velocity and law have to fit each other to be learned.
+            begun, ahead = posterior.copy(), (motion[0][3:], posterior["weights"])
+            for _ in range(_ITERATIONS):
+                phi, slopes = self._regressor(ahead[0])
+                _update(
+                    posterior, last, elapsed, begun, ahead, motion, phi, slopes, shaped,
+                    measured, model, link, known,
+                )  # fmt: skip
+                ahead = posterior["velocity"][3:].copy(), posterior["weights"].copy()
         else:
             _forget_motion(posterior, known)
         phi, slopes = self._regressor(posterior["velocity"][3:])
@@ -546,6 +654,7 @@ class WholeBodyFilter(RecursiveEstimator):
         n, m = start["weights"].shape
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"], start["noise"] = start["weights"], 1.0
+        start["foot_noise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.full(m, config.shape_uncertainty)
         weights[: regressor.parameters] = config.parameter_uncertainty
