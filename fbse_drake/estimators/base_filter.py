@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 from numba import njit
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
 from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.estimators.attitude import AttitudeConfig
@@ -39,7 +39,7 @@ from fbse_drake.estimators.innovations import (
     LOG_OF_ONE,
     SMALLEST_SHARE,
 )
-from fbse_drake.estimators.records import as_record, record, record_type
+from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
@@ -69,7 +69,6 @@ from fbse_drake.estimators.spatial import (
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
-from fbse_drake.wiring import weakly
 
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
 # Where three errors each start in the filter's error state; every foot has six, of its position and
@@ -183,8 +182,10 @@ class InvariantFilter:
         make = partial(InvariantBaseFilter, self, chain.sensors, chain.robot, origin=origin)
         chain.add("base_state", make, measurements="sensor_monitor", model="model")
         chain.alias("base_state", "attitude")
-        chain.connect("base_state.last_angular_velocity_bias", "model.angular_velocity_bias")
-        chain.connect("base_state.last_doubt", "sensor_monitor.doubt")
+        chain.connect_field(
+            "base_state.last", "angular_velocity_bias", "model.angular_velocity_bias"
+        )
+        chain.connect_field("base_state.last", "check.doubt", "sensor_monitor.doubt")
 
 
 @njit(cache=True)
@@ -247,6 +248,14 @@ def _scaled(factor: float, A: Rotation) -> Rotation:
 
 
 @njit(cache=True)
+def _put_columns(to: np.ndarray, start: int, A: Rotation) -> None:
+    """Fills three columns of a matrix of three rows."""
+    for i in range(3):
+        for j in range(3):
+            to[i, start + j] = A[3 * i + j]
+
+
+@njit(cache=True)
 def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
     for i in range(start, start + 3):
         P[i, i] += variance
@@ -293,18 +302,17 @@ def _predict(
     # Noise of the gyro turns attitude, and by the group all that turns with it: also feet, or what
     # is known of the legs would depend on how far from the world's origin they are.
     v, p = vector(x.imu_velocity), vector(x.imu_position)
-    G = np.zeros((len(P), 3))
-    put(G[_ATTITUDE:_VELOCITY], _IDENTITY)
-    put(G[_VELOCITY:_POSITION], skew(v))
-    put(G[_POSITION:_GYRO_BIAS], skew(p))
+    G = np.zeros((3, len(P)))
+    _put_columns(G, _ATTITUDE, _IDENTITY)
+    _put_columns(G, _VELOCITY, _transposed(skew(v)))
+    _put_columns(G, _POSITION, _transposed(skew(p)))
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            start = _FEET + 6 * foot
-            put(G[start : start + 3], skew(vector(x.foot_position[foot])))
+            _put_columns(G, _FEET + 6 * foot, _transposed(skew(vector(x.foot_position[foot]))))
     q = rate_variance * T * T
     for i in range(len(P)):
         for j in range(len(P)):
-            P[i, j] += q * (G[i, 0] * G[j, 0] + G[i, 1] * G[j, 1] + G[i, 2] * G[j, 2])
+            P[i, j] += q * (G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j])
     _add_noise(P, _GYRO_BIAS, config.gyro_walk**2 * T)
     _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
     creep, turn, lasts = np.empty(3), np.empty(3), 2.0 * AGREEMENT_TIME
@@ -1062,13 +1070,11 @@ class InvariantBaseFilter(RecursiveEstimator):
         output_ports:
         - posterior
         - (one for each field)
-        - last_angular_velocity_bias
-        - last_doubt
+        - last
 
-    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last_angular_velocity_bias`
-    (3,) [rad/s] is that of the tick before, and so is `last_doubt` (1 + feet,): positive for the
-    IMU and the feet that contradict the rest. World axes unless said. Yaw and place are those of
-    the start, as far as standing feet hold them. Fields of the posterior:
+    Inputs: posteriors of `SensorMonitor` and `FloatingBaseModel`. `last` is the posterior of the
+    tick before, for those that feed it. World axes unless said. Yaw and place are those of the
+    start, as far as standing feet hold them. Fields of the posterior:
 
         orientation            (4,)    quaternion [w, x, y, z] of the base; its sign never jumps
         rotation               (3, 3)  R_WB
@@ -1098,13 +1104,14 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance
         force_habit            (3,)    the same of the forces' error
         foot_age, force_age    (feet,), ()  for how long each has been listened to [s]
-        check                  what `cross_check` remembers: `doubt` (1 + feet,) of the IMU and the
-                               feet; `mean` (2, 3, 3) and `load` (2, feet, 3) of the last 10 ms and
-                               50 ms; `spread`; `rolling` (3,); `habit` (3,), what always
-                               contradicts; `last_rate`, `last_rolling` (3,) and `was_firm` of
-                               the tick before; `stepped`, `age`, `habit_age` and `agreed`, for how
-                               long the gyro is doubted for its step, all is watched, the habit is
-                               learned, and nothing contradicts [s]
+        check                  what `cross_check` remembers: `doubt` (1 + feet,), positive for the
+                               IMU and the feet that contradict the rest; `mean` (2, 3, 3) and
+                               `load` (2, feet, 3) of the last 10 ms and 50 ms; `spread`; `rolling`
+                               (3,); `habit` (3,), what always contradicts; `last_rate`,
+                               `last_rolling` (3,) and `was_firm` of the tick before; `stepped`,
+                               `age`, `habit_age` and `agreed`, for how long the gyro is doubted for
+                               its step, all is watched, the habit is learned, and nothing
+                               contradicts [s]
         force_delay            what `watch_force_delay` remembers: the `delay` of the foot forces
                                [s], and more, see `force_delay_type`
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
@@ -1151,25 +1158,11 @@ class InvariantBaseFilter(RecursiveEstimator):
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model", model)
         self._declare_posterior()
-        self.DeclareVectorOutputPort(
-            "last_angular_velocity_bias", 3, weakly(self._calc_last_bias), {self.xd_ticket()}
-        )
-
-        feet = len(robot.description.sides)
-        state = {self.xd_ticket()}
-        self.DeclareVectorOutputPort("last_doubt", 1 + feet, weakly(self._calc_last_doubt), state)
+        self.DeclareStateOutputPort("last", self._last)
 
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:
         return {"measurements": measurements_type(robot), "model": model_type(robot)}
-
-    def _calc_last_doubt(self, context: Context, output: BasicVector) -> None:
-        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
-        output.SetFromVector(last["check"]["doubt"])
-
-    def _calc_last_bias(self, context: Context, output: BasicVector) -> None:
-        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
-        output.SetFromVector(last["angular_velocity_bias"])
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray

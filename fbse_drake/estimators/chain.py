@@ -1,14 +1,15 @@
 """Estimators wired into one diagram, each fed by what others of it estimate."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TypeVar
 
+import numpy as np
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort, System
 from pydrake.systems.primitives import Demultiplexer
 
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.records import parts
+from fbse_drake.estimators.records import parts, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.plant import Robot
 from fbse_drake.signals import estimates
@@ -63,7 +64,6 @@ class Chain:
         self._suffix = f"_{workshop.chains}" if workshop.chains else ""
         workshop.chains += 1
         self._systems: dict[str, RecursiveEstimator] = {}
-        self._fields: dict[str, Demultiplexer] = {}
 
     @property
     def is_empty(self) -> bool:
@@ -140,6 +140,21 @@ class Chain:
         port = self._system(target).GetInputPort(target.partition(".")[2])
         self.builder.Connect(self._system(source).GetOutputPort(output), port)
 
+    def connect_field(self, source: str, field: str, target: str) -> None:
+        """Connects one field of a record to an input `system.port`.
+
+        Args:
+            source: an output `system.port` that has the record of the system's posterior.
+            field: its name, or `record.field` of one within.
+        """
+        kind, start = self._system(source).posterior_type, 0
+        for name in field.split("."):
+            start, kind = start + parts(kind)[name].start, kind[name]
+        part = {field: slice(start, start + size_of(kind))}
+        output = self._system(source).GetOutputPort(source.partition(".")[2])
+        port = self._system(target).GetInputPort(target.partition(".")[2])
+        self.builder.Connect(self._split(f"{source}_{field}", output, part)[field], port)
+
     def feed(self, signal: str, port: InputPort) -> None:
         """Connects an input port to a signal, an input of the whole diagram."""
         inputs = self._workshop.inputs
@@ -163,18 +178,19 @@ class Chain:
                 if not self.builder.IsConnectedOrExported(port):
                     self.feed(port.get_name(), port)
         n, channels = len(self.robot.joint_names), {}
+        fields = {name: self._fields(name) for name in self._systems}
         if self.knows_friction:
-            if self._sizes("friction").get("friction") != n:
+            friction = fields["friction"].get("friction")
+            if friction is None or friction.size() != n:
                 raise InputError(
                     f"estimator: friction: expected a posterior with a field friction ({n},)"
                 )
-            self.builder.ExportOutput(self._field("friction", "friction"), self.friction_port)
+            self.builder.ExportOutput(friction, self.friction_port)
         for row in estimates():
-            size = self._sizes(row.estimator).get(row.field)
-            if size is not None:
-                name = f"{row.port}{self._suffix}"
-                self.builder.ExportOutput(self._field(row.estimator, row.field), name)
-                channels[row.channel] = row.sample_shape(n, size)
+            field = fields.get(row.estimator, {}).get(row.field)
+            if field is not None:
+                self.builder.ExportOutput(field, f"{row.port}{self._suffix}")
+                channels[row.channel] = row.sample_shape(n, field.size())
         return channels
 
     def _system(self, source: str) -> RecursiveEstimator:
@@ -184,20 +200,27 @@ class Chain:
             raise InputError(f"estimator: there is no system {name} (there are: {known})")
         return self._systems[name]
 
-    def _sizes(self, name: str) -> dict[str, int]:
-        """How many numbers the fields of a posterior have, if any: of a system that is there."""
-        if name not in self._systems:
-            return {}
-        kind = self._systems[name].posterior_type
-        return {field: part.stop - part.start for field, part in parts(kind).items()}
+    def _fields(self, name: str) -> dict[str, OutputPort]:
+        """Output ports for the fields of a posterior that the table of signals has.
 
-    def _field(self, name: str, field: str) -> OutputPort:
-        """The output port of one field of a posterior."""
-        sizes = self._sizes(name)
-        if name not in self._fields:
-            # The estimator has such a port itself, which is Python's and costs more.
-            split = Demultiplexer(list(sizes.values()))
-            self._fields[name] = self.add_plain(f"{name}_fields", split)
-            posterior = self._systems[name].GetOutputPort("posterior")
-            self.builder.Connect(posterior, split.get_input_port())
-        return self._fields[name].get_output_port(list(sizes).index(field))
+        (The estimator has such ports itself, which are Python's and cost more.)
+        """
+        system, told = self._systems[name], {"friction"}
+        told |= {row.field for row in estimates() if row.estimator == name}
+        spans = {
+            field: part for field, part in parts(system.posterior_type).items() if field in told
+        }
+        if not spans:
+            return {}
+        return self._split(f"{name}_fields", system.GetOutputPort("posterior"), spans)
+
+    def _split(
+        self, name: str, output: OutputPort, spans: Mapping[str, slice]
+    ) -> dict[str, OutputPort]:
+        """Output ports for parts of a vector, as few as there must be: each costs every tick."""
+        cuts = sorted({0, output.size(), *(x for s in spans.values() for x in (s.start, s.stop))})
+        split = self.add_plain(name, Demultiplexer(np.diff(cuts).tolist()))
+        self.builder.Connect(output, split.get_input_port())
+        return {
+            field: split.get_output_port(cuts.index(span.start)) for field, span in spans.items()
+        }

@@ -73,17 +73,26 @@ def _delays(period: float) -> int:
     return 1 + math.floor(_LONGEST / period + 1e-6)
 
 
-@njit(cache=True)
-def tick_of(duration: np.ndarray, delay: float) -> int:
-    """Which tick ended so long ago [s], by how long each took, (ticks,) [s], the latest first.
+def remembered_ticks(clock: Clock) -> int:
+    """How many ticks before the present one are remembered, at least one."""
+    return max(1, delays_of(clock) - 1)
 
-    The nearest of those that are remembered; the latest if the delay is no number.
+
+@njit(cache=True)
+def tick_of(elapsed: float, past: np.ndarray, delay: float) -> int:
+    """How many ticks ago one ended that ended so long ago [s].
+
+    The nearest of those that are remembered; the present one if the delay is no number.
+
+    Args:
+        elapsed: how long the present tick took [s].
+        past: records of the ticks before with their `duration` [s], see `History`.
     """
-    age, best, nearest = 0.0, 0, abs(delay)
-    for tick in range(1, len(duration)):
-        age += duration[tick - 1]
+    age, best, nearest = elapsed, 0, abs(delay)
+    for tick in range(1, len(past) + 1):
         if abs(age - delay) <= nearest:
             best, nearest = tick, abs(age - delay)
+        age += past[-tick].duration
     return best
 
 

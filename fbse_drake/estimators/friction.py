@@ -184,6 +184,14 @@ class FrictionRegressor:
     def _all_nonlinear(self) -> np.ndarray:
         return np.hstack([f * self.nonlinear for f in (1.0, *self.factors)])
 
+    @cached_property
+    def _all_joints(self) -> np.ndarray:
+        return np.tile(np.arange(len(self.initial)), 1 + len(self.factors))
+
+    @cached_property
+    def _zero(self) -> np.ndarray:
+        return np.zeros(len(self._all_joints))
+
     def __call__(
         self, velocity: np.ndarray
     ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
@@ -191,10 +199,10 @@ class FrictionRegressor:
 
         Of all joints as adopted, then with each factor.
         """
-        motion = JointMotion(np.concatenate([velocity] * (1 + len(self.factors))))
+        motion = JointMotion(velocity[self._all_joints])
         torques, slopes = self.effect.basis(motion, self._all_nonlinear)
-        zero = np.zeros_like(motion.velocity)
-        return tuple(torques), tuple([slope + zero for slope in slopes])
+        # A slope may be one number for all.
+        return tuple(torques), tuple([slope + self._zero for slope in slopes])
 
 
 def recursive_least_squares(
@@ -456,6 +464,8 @@ def _estimate_friction(
     regressor, rise, x, column = np.ones(m + 1), np.zeros(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
     posterior.covariance[:] = last.covariance
+    posterior.past_velocity[0] = posterior.velocity
+    posterior.past_velocity[1:] = last.past_velocity[:-1]
     keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / NOISE_TIME)
     # Of the tick that was measured.
@@ -636,12 +646,10 @@ class ModelAidedEstimator(FrictionEstimator):
             return
         share = start_share(elapsed, self._reading)
         seen = smooth_velocity(posterior, last, measured, elapsed, share, self._smoothing)
-        past, late = posterior["past_velocity"], float(link_torque["late"])
-        then = int(late) if 0 < late < len(past) else 0
-        past[1:] = last["past_velocity"][:-1]
-        past[0] = posterior["velocity"]
-        phi_now, slopes = self._regressor(past[0])
-        phi, slopes = self._regressor(past[then]) if then else (phi_now, slopes)
+        phi, slopes = phi_now, _ = self._regressor(posterior["velocity"])
+        past, late = last["past_velocity"], float(link_torque["late"])
+        if 0 < late <= len(past):
+            phi, slopes = self._regressor(past[int(late) - 1])
         _estimate_friction(
             posterior,
             last,

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import model_type
-from fbse_drake.estimators.force_delay import delays_of, room_for_delays, tick_of
+from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.innovations import LOG_OF_SIX, LOG_OF_THREE, learned_noise
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
@@ -35,22 +35,15 @@ def _clear(posterior: np.ndarray, status: float) -> None:
     posterior.impulse_variance[:] = 0.0
     posterior.own_inertia[:] = 0.0
     posterior.valid[:] = 0.0
-    past = posterior.past
-    past.valid[:] = 0.0
-    past.duration[:] = 0.0
-    past.torque_command[:] = 0.0
-    past.inertial_torque[:] = 0.0
-    past.torque_variance[:] = 0.0
-    past.impulse_variance[:] = 0.0
-    past.own_inertia[:] = 0.0
-    past.lever[:] = 0.0
-
-
-@njit(cache=True)
-def _shift(now: np.ndarray, before: np.ndarray) -> None:
-    """Moves what was known a tick ago on by one."""
-    for age in range(len(now) - 1, 0, -1):
-        now[age] = before[age - 1]
+    now = posterior.now
+    now.valid[:] = 0.0
+    now.duration = 0.0
+    now.torque_command[:] = 0.0
+    now.inertial_torque[:] = 0.0
+    now.torque_variance[:] = 0.0
+    now.impulse_variance[:] = 0.0
+    now.own_inertia[:] = 0.0
+    now.lever[:] = 0.0
 
 
 @njit(cache=True)
@@ -106,17 +99,19 @@ def _estimate_link_torque(
     acceleration: np.ndarray,
     torque_command: np.ndarray,
     delay: float,
+    past: np.ndarray,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
     Args:
         delay: by how much the forces are late [s].
+        past: the posterior's `now` of the last ticks, see `History`.
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
-            `joint_leg` (n,), which leg each joint belongs to; `delays`, among how many ticks the
-            one of the forces is looked for; and `learns_noise`.
+            `joint_leg` (n,), which leg each joint belongs to; `moved` (levers, 2), joints and the
+            feet that they move; and `learns_noise`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
     model, acceleration, known = model[()], acceleration[()], known[()]
@@ -138,18 +133,10 @@ def _estimate_link_torque(
     a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
     a[6:] = acceleration.joint_acceleration
     # What is known now, forces apart, belongs to the forces that are read so much later.
-    past, before = posterior.past, last.past
-    _shift(past.valid, before.valid)
-    _shift(past.duration, before.duration)
-    _shift(past.torque_command, before.torque_command)
-    _shift(past.inertial_torque, before.inertial_torque)
-    _shift(past.torque_variance, before.torque_variance)
-    _shift(past.impulse_variance, before.impulse_variance)
-    _shift(past.own_inertia, before.own_inertia)
-    _shift(past.lever, before.lever)
-    past.duration[0], past.torque_command[0] = elapsed, torque_command
-    for foot in range(feet):
-        past.lever[0, foot] = model.foot_jacobian[foot, :, 6:]
+    now, moved = posterior.now, known.moved
+    now.duration, now.torque_command[:] = elapsed, torque_command
+    for lever in range(len(moved)):
+        now.lever[lever] = model.foot_jacobian[moved[lever, 1], :, 6 + moved[lever, 0]]
     for i in range(n):
         # Inertia and bias forces, (35) without the wrenches; and what the sensors' noise makes of
         # them.
@@ -169,28 +156,45 @@ def _estimate_link_torque(
                 torque_variance += (to_sensors[j] * noise.acceleration_noise) ** 2
             else:
                 impulse_variance += (to_sensors[j] * noise.joint_velocity_noise) ** 2
-        past.inertial_torque[0, i], past.torque_variance[0, i] = inertial_torque, torque_variance
-        past.impulse_variance[0, i], past.own_inertia[0, i] = impulse_variance, to_sensors[6 + i]
+        now.inertial_torque[i], now.torque_variance[i] = inertial_torque, torque_variance
+        now.impulse_variance[i], now.own_inertia[i] = impulse_variance, to_sensors[6 + i]
         is_known = trust[0] == 0 and trust[1] == 0
-        past.valid[0, i] = acceleration.known[i] if is_known else 0.0
-    then = tick_of(past.duration[: known.delays], delay)
-    posterior.late, posterior.duration = then, past.duration[then]
-    for i in range(n):
-        link_torque, torque_variance = past.inertial_torque[then, i], past.torque_variance[then, i]
-        for foot in range(feet):
-            variance = posterior.force_noise[foot] * known.wrench_variance[foot]
-            if is_loaded(wrench[foot], variance):
+        now.valid[i] = acceleration.known[i] if is_known else 0.0
+    late = tick_of(elapsed, past, delay)
+    then = past[-late] if late > 0 else now
+    posterior.late, posterior.duration = late, then.duration
+    posterior.link_torque[:] = then.inertial_torque
+    posterior.torque_variance[:] = then.torque_variance
+    for foot in range(feet):
+        variance = posterior.force_noise[foot] * known.wrench_variance[foot]
+        if not is_loaded(wrench[foot], variance):
+            continue
+        for at in range(len(moved)):
+            if moved[at, 1] == foot:
+                i = moved[at, 0]
                 for k in range(6):
-                    lever = past.lever[then, foot, k, i]
-                    link_torque -= wrench[foot, k] * lever
-                    torque_variance += variance[k] * lever * lever
-        posterior.link_torque[i] = link_torque
-        posterior.residual[i] = past.torque_command[then, i] - link_torque
-        posterior.torque_variance[i] = torque_variance
-        posterior.impulse_variance[i] = past.impulse_variance[then, i]
-        posterior.own_inertia[i] = past.own_inertia[then, i]
+                    lever = then.lever[at, k]
+                    posterior.link_torque[i] -= wrench[foot, k] * lever
+                    posterior.torque_variance[i] += variance[k] * lever * lever
+    posterior.impulse_variance[:] = then.impulse_variance
+    posterior.own_inertia[:] = then.own_inertia
+    for i in range(n):
+        posterior.residual[i] = then.torque_command[i] - posterior.link_torque[i]
         is_trusted = trust[2 + known.joint_leg[i]] == 0
-        posterior.valid[i] = past.valid[then, i] if is_trusted else 0.0
+        posterior.valid[i] = then.valid[i] if is_trusted else 0.0
+
+
+def moved_feet(robot: Robot) -> np.ndarray:
+    """Which feet each joint moves: pairs of a joint and a foot, (levers, 2)."""
+    plant, soles = robot.plant, [robot.sole(side).body() for side in robot.description.sides]
+    pairs = [
+        (i, foot)
+        for i, name in enumerate(robot.joint_names)
+        for foot, sole in enumerate(soles)
+        if sole.index()
+        in plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name).index()])
+    ]
+    return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def wrench_variance(sensors: SensorBeliefs, robot: Robot, side: str) -> np.ndarray:
@@ -235,10 +239,10 @@ class LinkTorqueEstimator(RecursiveEstimator):
 
     `base_state` is there where somebody knows that foot forces come late: then all this is of the
     tick in which they were what is read now. Further `late`, how many ticks ago that was, and its
-    `duration` [s]; `past`, what is known of these ticks but for the forces: `duration` (room,);
+    `duration` [s]; `now`, what is known of the tick that ends now but for the forces: `duration`;
     `valid`, `torque_command`, `inertial_torque` and the noise's `torque_variance`,
-    `impulse_variance` and `own_inertia`, (room, n); and the `lever` of the wrenches,
-    (room, feet, 6, n), see `room_for_delays`;
+    `impulse_variance` and `own_inertia`, (n,); and the `lever` of a foot's wrench at each joint
+    that moves it, (levers, 6), see `moved_feet`; it is remembered as long as forces may be late;
     and `force_noise` (feet,), by how much the variance of each foot's wrench is larger than
     believed, at least 1; `wrench` (feet, 6) [Nm, N] and its last change `wrench_change`.
 
@@ -262,10 +266,9 @@ class LinkTorqueEstimator(RecursiveEstimator):
             base_state: of that of `InvariantBaseFilter`, where somebody asks how late forces are.
         """
         n, legs = len(robot.joint_names), robot.description.legs
-        room, delays = room_for_delays(clock), 1 if base_state is None else delays_of(clock)
         kept = ("valid", "torque_command", "inertial_torque")
         kept += ("torque_variance", "impulse_variance", "own_inertia")
-        past = dict.fromkeys(kept, (room, n))
+        moved = moved_feet(robot)
         posterior_type = record_type(
             time=(),
             status=(),
@@ -280,7 +283,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             wrench_change=(len(legs), 6),
             late=(),
             duration=(),
-            past=record_type(**past, duration=(room,), lever=(room, len(legs), 6, n)),
+            now=record_type(**dict.fromkeys(kept, (n,)), duration=(), lever=(len(moved), 6)),
         )
         super().__init__(posterior_type, clock)
         pads = FootPads(robot)
@@ -290,7 +293,7 @@ class LinkTorqueEstimator(RecursiveEstimator):
             pads=record(position=pads.position, foot=pads.foot),
             wrench_variance=variance,
             learns_noise=sensors.learns_force_noise,
-            delays=np.array(delays),
+            moved=moved,
             joint_leg=leg_of_joint(robot),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -300,6 +303,8 @@ class LinkTorqueEstimator(RecursiveEstimator):
         if base_state is not None:
             self._base_state = self._declare_record_input("base_state", base_state)
         self._torque_command = self._declare_remembered_input("torque_command", n)
+        ticks = 1 if base_state is None else remembered_ticks(clock)
+        self._past = self._declare_history("now", ticks)
         self._declare_posterior()
 
     @staticmethod
@@ -333,5 +338,6 @@ class LinkTorqueEstimator(RecursiveEstimator):
             self._acceleration.Eval(context),
             self._torque_command.Eval(context),
             delay,
+            self._past.Eval(context),
             self._known,
         )

@@ -11,16 +11,19 @@ from typing import Any, TypeVar
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
     Context,
     DependencyTicket,
     DiagramBuilder,
     DiscreteStateIndex,
+    DiscreteValues,
     InputPort,
     LeafSystem,
     OutputPort,
     State,
+    ValueProducer,
 )
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
@@ -32,6 +35,9 @@ from fbse_drake.wiring import weakly
 # Sensors are compared with each other at ticks of at most this [s]. Between rarer readings healthy
 # ones differ as much as faulty ones, and nothing is said.
 LONGEST_COMPARED_TICK = 0.0025
+
+# Of a cache entry that stands for what it depends on, and has no value.
+_NOTHING = ValueProducer(AbstractValue.Make(None).Clone, ValueProducer.NoopCalc)
 
 
 class Status(IntEnum):
@@ -104,9 +110,33 @@ class RememberedInput:
         """The value a tick ago."""
         return context.get_discrete_state(self.index).value()
 
-    def remember(self, context: Context, state: State) -> None:
+    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:  # noqa: ARG002
         """Keeps the present value for the next tick."""
-        state.get_mutable_discrete_state(self.index).set_value(self.port.Eval(context))
+        state.set_value(self.index, self.port.Eval(context))
+
+
+@dataclass(frozen=True)
+class History:
+    """A field of the posterior as it was in the last ticks."""
+
+    index: DiscreteStateIndex
+    kind: np.dtype
+    # How many ticks are remembered, and where the posterior has the field.
+    ticks: int
+    part: slice
+
+    def Eval(self, context: Context) -> np.ndarray:
+        """The field of every tick, (ticks,), that of `age` ticks ago in [-age]; zero before the
+        first."""
+        values = context.get_discrete_state().value(self.index)
+        return np.ndarray((self.ticks,), self.kind, values)
+
+    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
+        """Adds the present tick, if it is one."""
+        if posterior.item(0) > context.get_discrete_state().value(0).item(0):
+            values, own = state.get_mutable_value(self.index), posterior[self.part]
+            values[: -len(own)] = values[len(own) :]
+            values[-len(own) :] = own
 
 
 T = TypeVar("T", bound="RecursiveEstimator")
@@ -142,7 +172,8 @@ class RecursiveEstimator(LeafSystem):
         self._last = self.DeclareDiscreteState(start)
         # Types of the records on its input ports.
         self.record_inputs: dict[str, np.dtype] = {}
-        self._remembered: list[RememberedInput] = []
+        self._remembered: list[RememberedInput | History] = []
+        self._later: set[str] = set()
         self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, weakly(self._remember))
         self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
 
@@ -203,8 +234,18 @@ class RecursiveEstimator(LeafSystem):
     def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
         """Declares an input port that the posterior of the next tick depends on, not this one's."""
         port = self.DeclareVectorInputPort(name, size)
-        self._remembered.append(RememberedInput(port, self.DeclareDiscreteState(size)))
-        return self._remembered[-1]
+        remembered = RememberedInput(port, self.DeclareDiscreteState(size))
+        self._remembered.append(remembered)
+        self._later.add(name)
+        return remembered
+
+    def _declare_history(self, field: str, ticks: int) -> History:
+        """Declares a state for what a field of the posterior was in the last ticks."""
+        kind, part = self.posterior_type[field], parts(self.posterior_type)[field]
+        index = self.DeclareDiscreteState(ticks * size_of(kind))
+        history = History(index, kind, ticks, part)
+        self._remembered.append(history)
+        return history
 
     def _declare_posterior(self) -> None:
         """Declares the outputs, which depend on the input ports that are declared by now."""
@@ -216,14 +257,15 @@ class RecursiveEstimator(LeafSystem):
             weakly(self._calc_posterior),
             tickets,
         )
+        # Drake tells every port of every ticket that changes; so the fields share one.
+        shared = {self.DeclareCacheEntry("inputs", _NOTHING, tickets).ticket()}
         for name, part in parts(self.posterior_type).items():
             calc = partial(weakly(self._calc_field), part)
-            self.DeclareVectorOutputPort(name, part.stop - part.start, calc, tickets)
+            self.DeclareVectorOutputPort(name, part.stop - part.start, calc, shared)
 
     def _tickets(self) -> set[DependencyTicket]:
         """What the posterior of a tick depends on."""
-        later = [remembered.port.get_name() for remembered in self._remembered]
-        inputs = [port for port in self.input_ports() if port.get_name() not in later]
+        inputs = [port for port in self.input_ports() if port.get_name() not in self._later]
         tickets = {self.input_port_ticket(port.get_index()) for port in inputs}
         return tickets | {self.time_ticket(), self.xd_ticket()}
 
@@ -269,9 +311,10 @@ class RecursiveEstimator(LeafSystem):
         output.SetFromVector(self._posterior.Eval(context)[part])
 
     def _remember(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state().set_value(0, self._posterior.Eval(context))
+        values, posterior = state.get_mutable_discrete_state(), self._posterior.Eval(context)
+        values.set_value(0, posterior)
         for remembered in self._remembered:
-            remembered.remember(context, state)
+            remembered.remember(context, values, posterior)
 
 
 def connect_fields(
