@@ -29,6 +29,7 @@ from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding
 from fbse_drake.discrepancy.diagnosis.identify import Identification
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.reading import Reading
 from fbse_drake.discrepancy.diagnosis.study import Study, train_and_rest
 from fbse_drake.discrepancy.diagnosis.validation import validated
 from fbse_drake.discrepancy.exercises import hidden
@@ -87,6 +88,8 @@ class Case:
     # Which of the tests are rests; and, if several were given that `log` and `train` are of, each.
     rests: tuple[str, ...] = ()
     recordings: dict[str, Log] = field(default_factory=dict)
+    # Of the part that models are fitted to, where another case has read it.
+    reading: Reading | None = None
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -96,7 +99,7 @@ class Case:
             InputError: a log that does not fit the model, or whose sensors cannot be what they are
                 said to be.
         """
-        predictor = Predictor(self.scenario, self.train)
+        predictor = Predictor(self.scenario, self.train, reading=self.reading)
         check_sensors(predictor.motion)
         return predictor
 
@@ -402,15 +405,12 @@ def diagnose(
     'Nm'
     """
     case = Case.divided(scenario, log, tests, name)
-    diagnosis = diagnose_confirmed(
-        Predictor(case.trusted, case.train), effects, case.tests, progress=progress
-    )
+    trusted = case.predictor.of(case.trusted)
+    tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
+    diagnosis = diagnose_confirmed(trusted, effects, tested, progress=progress)
     if diagnosis.chosen:
         completed = addition.add(case.trusted, diagnosis.chosen)
-        set_aside = {
-            test: validated(Predictor(case.trusted, other), Predictor(completed, other))
-            for test, other in case.tests.items()
-        }
+        set_aside = {test: validated(other, other.of(completed)) for test, other in tested.items()}
         diagnosis = replace(diagnosis, set_aside=set_aside)
     return _with_case(DiagnosisResult, diagnosis, case=case)
 
@@ -446,8 +446,10 @@ def study(
         tests=case.tests,
         progress=progress,
         jobs=jobs,
+        reading=case.predictor.reading,
     )
-    after = replace(case, scenario=found.scenario) if found.found else None
+    completed = replace(case, scenario=found.scenario, reading=case.predictor.reading)
+    after = completed if found.found else None
     return _with_case(StudyResult, found, case=case, after=after)
 
 

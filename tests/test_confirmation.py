@@ -61,7 +61,11 @@ def log(*, spring: bool, seed: int, duration: float = 20.0) -> Log:
 
 def found(scenario: Scenario, test: Log) -> Diagnosis:
     predictor = Predictor(scenario, log(spring=True, seed=1))
-    return diagnose_confirmed(predictor, [library()[name] for name in EFFECTS], {"test": test})
+    return diagnose_confirmed(
+        predictor,
+        [library()[name] for name in EFFECTS],
+        {"test": Predictor(predictor.scenario, test)},
+    )
 
 
 def test_what_raises_the_error_of_data_set_aside_is_not_named(scenario: Scenario) -> None:

@@ -510,7 +510,8 @@ def _measured_torque(
     """Measured and modelled torque of the worst joints where the model as given errs most, on a log
     that nothing was fitted to if any."""
     name, log = next(iter(tests.items()), ("train", given.motion.log))
-    given, after = Predictor(given.scenario, log), Predictor(completed, log)
+    given = Predictor(given.scenario, log)
+    after = given.of(completed)
     residual, n = given.residual, len(given.robot.joint_names)
     error = np.where(residual.known, residual.value / np.sqrt(residual.variance), np.nan)[:, :n]
     power = np.nan_to_num(error**2)

@@ -20,9 +20,7 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.validation import LEVEL, validated
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import InertialParameters
-from fbse_drake.log import Log
 from fbse_drake.progress import Interrupted, Progress, silent
-from fbse_drake.scenario import Scenario
 
 # How often it is searched without what was refuted.
 _MOST_SEARCHES = 3
@@ -31,14 +29,14 @@ _MOST_SEARCHES = 3
 def diagnose_confirmed(
     predictor: Predictor,
     effects: Iterable[type[Effect]] | None = None,
-    tests: Mapping[str, Log] | None = None,
+    tests: Mapping[str, Predictor] | None = None,
     *,
     progress: Progress = silent,
 ) -> Diagnosis:
     """A diagnosis as by `diagnose`, without effects that raise the error of data set aside.
 
     Args:
-        tests: logs set aside, by name.
+        tests: the predictor's model over logs set aside, by name.
     """
     tried = plausible_effects(predictor) if effects is None else list(effects)
     diagnosis = diagnose(predictor, tried, progress=progress)
@@ -46,7 +44,7 @@ def diagnose_confirmed(
     statuses: dict[str, EffectStatus] = {}
     for _ in range(_MOST_SEARCHES):
         try:
-            found = refuted_by(predictor.scenario, diagnosis.chosen, tests or {}, progress)
+            found = refuted_by(diagnosis.chosen, tests or {}, progress)
         except Interrupted as stop:
             return replace(diagnosis, partial=str(stop))
         if diagnosis.partial is not None or not found:
@@ -64,9 +62,8 @@ def diagnose_confirmed(
 
 
 def refuted_by(
-    scenario: Scenario,
     findings: Sequence[Finding],
-    tests: Mapping[str, Log],
+    tests: Mapping[str, Predictor],
     progress: Progress = silent,
 ) -> dict[str, tuple[Finding, ...]]:
     """Of several effects those without which the error on a log is smaller beyond doubt, all else
@@ -74,19 +71,22 @@ def refuted_by(
 
     Intervals are simultaneous, over effects and logs (Bonferroni). Inertia is measured, and no
     effect of its own.
+
+    Args:
+        tests: the model without them over these logs, by name.
     """
     names = dict.fromkeys(f.effect for f in findings if f.effect != InertialParameters.__name__)
     if len(names) < 2 or not tests:
         return {}
     level = 1 - (1 - LEVEL) / (len(names) * len(tests))
-    completed = add(scenario, findings)
-    whole = {log: Predictor(completed, of) for log, of in tests.items()}
+    whole = {log: of.of(add(of.scenario, findings)) for log, of in tests.items()}
     refuted: dict[str, tuple[Finding, ...]] = {}
     for k, name in enumerate(names):
         progress("testing what was found on data set aside", k / len(names))
-        fewer = add(scenario, [f for f in findings if f.effect != name])
+        others = [f for f in findings if f.effect != name]
         changes = (
-            validated(Predictor(fewer, of), whole[log], level).change for log, of in tests.items()
+            validated(of.of(add(of.scenario, others)), whole[log], level).change
+            for log, of in tests.items()
         )
         if any(change.interval[0] > 1.0 for change in changes):
             refuted[name] = tuple(f for f in findings if f.effect == name)

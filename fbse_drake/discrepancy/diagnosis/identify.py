@@ -86,9 +86,10 @@ def identify(
     ]
     findings += inertia_findings(fits.white, raw, alone, inertia)
     completed = add(scenario, findings)
-    logs = {"train": log} | dict(tests or {})
+    given = {"train": predictor}
+    given |= {name: Predictor(scenario, other) for name, other in (tests or {}).items()}
     before, after = (
-        {name: model_error(Predictor(one, other)) for name, other in logs.items()}
+        {name: model_error(other.of(one)) for name, other in given.items()}
         for one in (scenario, completed)
     )
     held_out_rmse, train_rmse = (

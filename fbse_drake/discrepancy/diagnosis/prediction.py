@@ -8,24 +8,21 @@ from functools import cache, cached_property, partial
 import numpy as np
 from pydrake.math import RotationMatrix
 from scipy.ndimage import shift
-from scipy.signal import savgol_filter, welch
 
+from fbse_drake.discrepancy.diagnosis.reading import Reading, smoothed
 from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.identification.regression import Signature
-from fbse_drake.discrepancy.residual.noise import Noise, measured_noise, measured_sensors
+from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
 from fbse_drake.discrepancy.residual.residual import (
     EquationOfMotion,
     Instants,
-    RecordedMotion,
     Residual,
     averaged,
     block_means,
     foot_pairs,
     joint_velocity_noise,
     rms,
-    within_steps,
 )
-from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.contact import (
     ContactEffect,
     FootCreep,
@@ -45,27 +42,18 @@ from fbse_drake.effects.joint_torque import (
     deflection_over_time,
 )
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
-from fbse_drake.errors import InputError, located
+from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.sensors.foot_force import force_noise
 
-# Joint velocities are smoothed over this many samples, without delay, where friction laws take
-# them.
-_SMOOTHING = 9
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change
 # within the step, squared.
 _LAW_DOUBT = 8.0
-# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
-# it.
-_SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
 _EVALUATIONS = 8
-# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
-# those that we did.
-_EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
 
@@ -79,36 +67,37 @@ class Predictor:
         log: Log,
         noise: Noise | None = None,
         left_out: Sequence[tuple[float, float]] = (),
+        reading: Reading | None = None,
     ):
         """Reads the log.
 
         Args:
             noise: of the rows, beyond what is believed; by default it is measured.
             left_out: start and end [s] of stretches of which nothing is said.
+            reading: of this log without these stretches; read again if it does not serve the
+                scenario.
 
         Raises:
             InputError: a log that does not fit the model.
         """
-        self.scenario, self.log = scenario, log
-        with located("model: "):
-            self.robot = build_robot(scenario.believed)
-        names = self.robot.description
+        self.scenario, self.log, self.left_out = scenario, log, tuple(left_out)
+        if reading is None or not reading.serves(scenario):
+            reading = Reading(scenario, log, self.left_out)
+        self.reading, self.robot, self.motion = reading, reading.robot, reading.motion
         self._known = [
-            effect.resolve(names, key=f"model.effects.{key}")
+            effect.resolve(self.robot.description, key=f"model.effects.{key}")
             for key, effect in scenario.believed.effects.items()
         ]
-        log = with_command(scenario, log, names)
-        sensors, self._noisier_channels = measured_sensors(
-            scenario.sensors, scenario.recording, log
-        )
-        self.left_out = tuple(left_out)
-        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
-        for known in self._known:
-            if issubclass(known.effect, SensorEffect):
-                self.motion.signals = self._undone(known, self._remembered(known))
         self._given_noise = noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
+
+    def of(self, scenario: Scenario) -> "Predictor":
+        """Another scenario's model over the same log, which is read again only if need be; its
+        noise is measured anew."""
+        if scenario == self.scenario and self._given_noise is None:
+            return self
+        return Predictor(scenario, self.log, None, self.left_out, self.reading)
 
     def without(self, stretches: Sequence[tuple[float, float]]) -> "Predictor":
         """The same without some stretches [s] of the log."""
@@ -119,7 +108,7 @@ class Predictor:
         """The same where the inertia of all bodies is trusted."""
         identify = replace(self.scenario.identify, inertia=[])
         scenario = replace(self.scenario, identify=identify)
-        return Predictor(scenario, self.log, self._given_noise, self.left_out)
+        return Predictor(scenario, self.log, self._given_noise, self.left_out, self.reading)
 
     @property
     def rows(self) -> int:
@@ -138,7 +127,7 @@ class Predictor:
         """Of the rows, beyond what is believed."""
         if self._given_noise is not None:
             return self._given_noise
-        return measured_noise(self.motion, self._believed_residual, self._noisier_channels)
+        return measured_noise(self.motion, self._believed_residual, self.reading.noisier_channels)
 
     @cached_property
     def _believed_residual(self) -> Residual:
@@ -233,7 +222,7 @@ class Predictor:
     @cached_property
     def joint_motion(self) -> JointMotion:
         """What joint torque effects depend on, step by step: (N - 1, n) each."""
-        return self._joint_motion_of(self.motion.signals)
+        return self._loaded(self.reading.joint_motion)
 
     @cached_property
     def _joint_motions(self) -> Callable[[int], JointMotion]:
@@ -243,53 +232,13 @@ class Predictor:
     @cached_property
     def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
         """The same if the sensors' noise were in it once more."""
-        return cache(partial(_joined, self._joint_motion_of(self._noisier_signals)))
+        noisier = self.reading.joint_motion_of(self._noisier_signals)
+        return cache(partial(_joined, self._loaded(noisier)))
 
-    def _joint_motion_of(self, signals: SensorSignals) -> JointMotion:
-        motion = self.motion
-        velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
-        time = motion.start + np.arange(len(velocity) - 1) * motion.period
-        torque = self._without_noise(signals.torque_command)
-        at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
-        return JointMotion(
-            velocity=within_steps(velocity, motion.law_share),
-            position=at.joint_position,
-            command=at.torque_command,
-            time=time[:, None],
-            time_step=motion.period,
-            # A model whose inertia is not trusted does not know the load.
-            load=at.torque_command - (0.0 if self.scenario.identify.inertia else self._loss),
-        )
-
-    def _without_noise(self, torque: np.ndarray) -> np.ndarray:
-        """Torques (N, n) without frequencies in which the log has little but white noise: in a
-        regressor it would take off the noise of the residual, which is the same (errors in
-        variables). A command of exactly zero stays, for it may be a drive that is off."""
-        result = np.empty_like(torque)
-        for joint, corner in enumerate(self._torque_corners):
-            result[:, joint] = self.motion.low_passed(torque[:, joint], corner)
-        return np.where(torque == 0, 0.0, result)
-
-    @cached_property
-    def _torque_corners(self) -> list[float]:
-        """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
-        motion = self.motion
-        torque = motion.signals.torque_command
-        # What is missing in the model has next to no part in the noise of the rows.
-        noise = measured_noise(motion, motion.residual, ()).white[: torque.shape[1]]
-        variance = motion.torque_variance(torque).mean(axis=0) + noise
-        return noise_corners(torque, variance, motion.period)
-
-    @cached_property
-    def _loss(self) -> np.ndarray:
-        """What the links do not get of the command by the rigid model, smoothed over three blocks,
-        step by step, (N - 1, n)."""
-        motion, n = self.motion, len(self.robot.joint_names)
-        loss = _smooth(motion.residual.value[:, :n])
-        time = (
-            motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
-        )
-        return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
+    def _loaded(self, motion: JointMotion) -> JointMotion:
+        """With the load as far as it is known: a model whose inertia is not trusted does not know
+        it."""
+        return motion._replace(load=motion.command) if self.scenario.identify.inertia else motion
 
     @cached_property
     def is_driven(self) -> np.ndarray:
@@ -445,7 +394,7 @@ class Predictor:
         if self.motion.recording.cutoff > 0:
             return blocks
         smooth = {
-            name: _smooth(getattr(blocks, name))
+            name: smoothed(getattr(blocks, name))
             for name in ("joint_acceleration", "angular_acceleration")
         }
         return replace(blocks, **smooth)
@@ -617,46 +566,17 @@ class Predictor:
             return self._residual_at_blocks - self._with(changed).residual(self._smooth_blocks)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
-        signals = self._undone(resolved, self._memory(effect, resolved))
+        signals = self.reading.undone(resolved, self._memory(effect, resolved))
         blocks = averaged(motion.steps_of(signals), motion.length)
         return self._residual_at_blocks - motion.equation.residual(self._smoothed(blocks))
-
-    def _undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
-        """Signals that the effect turns into those of the log."""
-        return effect.effect.undone(
-            self.motion.signals, memory, effect, self.robot, self.motion.period
-        )
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone,
         where `undone` needs it."""
         key = (effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
-            self._memories[key] = self._remembered(resolved)
+            self._memories[key] = self.reading.remembered(resolved)
         return self._memories[key]
-
-    def _remembered(self, effect: ResolvedEffect) -> np.ndarray:
-        """What an effect remembers over the log, of torques without their white noise: it would
-        become an acceleration.
-
-        A simulation of ours begins with no memory; any other log begins as if it had always been as
-        it is then.
-        """
-        motion, signals = self.motion, self.motion.signals
-        torque = signals.torque_command
-        corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
-        smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]
-        signals = replace(signals, torque_command=np.stack(smooth, axis=1))
-        ours = self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
-        earlier = 0 if ours else round(_EARLIER / motion.period)
-        longer = {
-            name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
-            for name, values in vars(signals).items()
-        }
-        memory = effect.effect.memory_over_time(
-            SensorSignals(**longer), effect, self.robot, motion.period
-        )
-        return memory[:, earlier:]
 
     def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
         """By the motion of the standing soles that the effect predicts, (B, R, p)."""
@@ -778,22 +698,6 @@ class Predictor:
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
 
 
-def noise_corners(torque: np.ndarray, variance: np.ndarray, period: float) -> list[float]:
-    """Frequency above which each joint's torque (N, n) is little but white noise [Hz]; 0 for none.
-
-    Args:
-        variance: of the noise of a sample, (n,).
-    """
-    window = min(len(torque), round(_SPECTRUM / period))
-    frequency, power = welch(torque, 1.0 / period, nperseg=window, axis=0)
-    corners = []
-    for density, white in zip(power.T, 2 * variance * period, strict=True):
-        above = np.flatnonzero(density > _ABOVE_NOISE * white)
-        last = above[-1] + 1 if len(above) else 1
-        corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
-    return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
-
-
 def _joined(motion: JointMotion, steps: int) -> JointMotion:
     """Averages over so many steps."""
     if steps == 1:
@@ -808,12 +712,6 @@ def _joined(motion: JointMotion, steps: int) -> JointMotion:
 def _later(values: np.ndarray, samples: float) -> np.ndarray:
     """Samples (N, 3) so much later, interpolated; the ends are held."""
     return shift(values, (-samples, 0), order=1, mode="nearest")
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """Binomial smoothing over three blocks."""
-    padded = np.concatenate([values[:1], values, values[-1:]])
-    return 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
 
 
 def _without_rounding(values: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, Fits
-from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.identification.inertial import (
     IdentifiedInertia,
@@ -171,11 +170,7 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
     scenario = predictor.scenario
     found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
     believed = replace(scenario.believed, effects=scenario.believed.effects | found)
-    white = WhitenedResidual(
-        Predictor(
-            replace(scenario, model=believed), predictor.log, left_out=predictor.left_out
-        ).residual
-    )
+    white = WhitenedResidual(predictor.of(replace(scenario, model=believed)).residual)
     # As many squares as before; what is held out exceeds them by as much as it did.
     share = fits.white.count / np.maximum(white.count, 1)
     sse = (

@@ -12,6 +12,7 @@ from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.identify import identify
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.reading import Reading
 from fbse_drake.discrepancy.diagnosis.validation import (
     ModelError,
     Validation,
@@ -107,6 +108,7 @@ def study(
     tests: Mapping[str, Log] | None = None,
     progress: Progress = silent,
     jobs: int = 1,
+    reading: Reading | None = None,
 ) -> Study:
     """Diagnoses a log and adds what is found to the model until nothing more is found.
 
@@ -116,12 +118,13 @@ def study(
         tests: logs on which the models are tested, by name; nothing is fitted to them.
         progress: is told what is being done. If it interrupts the work, the study is partial.
         jobs: how many simulations run side by side.
+        reading: of the log, if it was read already.
 
     Raises:
         InputError: a log that does not fit the scenario.
     """
     with Processes(jobs) as processes:
-        return _study(scenario, log, effects, rollouts, tests or {}, progress, processes)
+        return _study(scenario, log, effects, rollouts, tests or {}, progress, processes, reading)
 
 
 def _study(
@@ -132,6 +135,7 @@ def _study(
     tests: Mapping[str, Log],
     progress: Progress,
     processes: Processes,
+    reading: Reading | None,
 ) -> Study:
     steps: list[StudyStep] = []
     diagnoses: list[Diagnosis] = []
@@ -143,17 +147,23 @@ def _study(
     diagnosing = processes.beside(progress)
 
     def step(added: Sequence[Finding], held_out_rmse: float, train_rmse: float) -> None:
-        others = {name: Predictor(scenario, other) for name, other in tests.items()}
+        others = {name: other.of(scenario) for name, other in given.items()}
         tested.append(others)
         errors = {name: model_error(one) for name, one in ({"train": predictor} | others).items()}
         steps.append(StudyStep(tuple(added), held_out_rmse, train_rmse, None, errors))
 
     effects = None if effects is None else list(effects)
-    predictor = Predictor(scenario, log)
+    given = {name: Predictor(scenario, other) for name, other in tests.items()}
+    predictor = Predictor(scenario, log, reading=reading)
     if simulated is not None:
         simulated.begin(scenario)
     while len(diagnoses) < _MOST_ROUNDS and interrupted is None:
-        diagnosis = diagnose_confirmed(predictor, effects, tests, progress=diagnosing)
+        diagnosis = diagnose_confirmed(
+            predictor,
+            effects,
+            {name: other.of(scenario) for name, other in given.items()},
+            progress=diagnosing,
+        )
         diagnoses.append(diagnosis)
         interrupted = diagnosis.partial
         if not steps:
@@ -167,14 +177,14 @@ def _study(
             break
         found, completed = diagnosis.chosen, add(scenario, diagnosis.chosen)
         errors = diagnosis.held_out_after, diagnosis.train_after
-        believed = Predictor(completed, log)
+        believed = predictor.of(completed)
         if len(diagnoses) == 1 and scenario.identify.inertia and interrupted is None:
             try:
                 plain = identify(scenario, log, progress=diagnosing)
             except Interrupted as stop:
                 interrupted = str(stop)
             else:
-                rival = Predictor(plain.scenario, log)
+                rival = predictor.of(plain.scenario)
                 if is_better(rival, believed):
                     found, completed, believed = list(plain.findings), plain.scenario, rival
                     errors = plain.held_out_rmse, plain.train_rmse

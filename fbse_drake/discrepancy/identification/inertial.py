@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from fbse_drake.discrepancy.identification.regression import Fit, Signature, WhitenedResidual
@@ -81,26 +80,15 @@ def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> n
     Returns:
         Shape (M, rows, 10).
     """
-    plant, context, frame = (
-        equation.robot.plant,
-        equation.robot.plant.CreateDefaultContext(),
-        equation.robot.body(body).body_frame(),
-    )
+    plant, frame = equation.robot.plant, equation.robot.body(body).body_frame()
     states, accelerations = equation.plant_motion(at)
-    wrt, world, origin = JacobianWrtVariable.kV, plant.world_frame(), np.zeros(3)
     # The specific force of a floating base stands for gravity.
     gravity = (
         np.zeros(3) if equation.robot.has_floating_base else plant.gravity_field().gravity_vector()
     )
-    J = np.empty((len(states), 6, plant.num_velocities()))
-    bias, g = np.empty((len(states), 6)), np.empty((len(states), 3))
-    for k, state in enumerate(states):
-        plant.SetPositionsAndVelocities(context, state)
-        J[k] = plant.CalcJacobianSpatialVelocity(context, wrt, frame, origin, world, frame)
-        bias[k] = plant.CalcBiasSpatialAcceleration(
-            context, wrt, frame, origin, world, frame
-        ).get_coeffs()
-        g[k] = frame.CalcRotationMatrixInWorld(context).inverse().multiply(gravity)
+    (J,) = equation.dynamics.jacobians([frame], states[:, : plant.num_positions()])
+    (bias,), (R_WB,) = equation.dynamics.bias_accelerations([frame], states)
+    g = gravity @ R_WB
     V = np.einsum("mij,mj->mi", J, states[:, plant.num_positions() :])
     A = np.einsum("mij,mj->mi", J, accelerations) + bias
     return np.swapaxes(J, 1, 2)[:, equation.row_velocities] @ body_wrench(

@@ -27,7 +27,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
@@ -37,6 +37,7 @@ from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.log import Log
+from fbse_drake.robot.body_tree import dynamics_of
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
@@ -335,6 +336,7 @@ class EquationOfMotion:
     def __init__(self, robot: Robot):
         self.robot, plant = robot, robot.plant
         self._context = plant.CreateDefaultContext()
+        self.dynamics = dynamics_of(plant)
         self.pads = FootPads(robot)
         self.weight = plant.CalcTotalMass(self._context) * float(
             np.linalg.norm(plant.gravity_field().gravity_vector())
@@ -365,19 +367,11 @@ class EquationOfMotion:
 
     def sole_rotations(self, joint_position: np.ndarray) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each, in postures (M, n)."""
-        plant, context, soles = (
-            self.robot.plant,
-            self._context,
-            [self.robot.sole(side) for side in self.robot.description.sides],
-        )
-        result = np.empty((len(soles), len(joint_position), 3, 3))
-        positions = self._upright.copy()
-        for k, q in enumerate(joint_position):
-            positions[self.robot.position_index] = q
-            plant.SetPositions(context, positions)
-            for foot, sole in enumerate(soles):
-                result[foot, k] = sole.CalcPoseInWorld(context).rotation().matrix()
-        return list(result)
+        soles = [self.robot.sole(side) for side in self.robot.description.sides]
+        states = np.zeros((len(joint_position), self.robot.plant.num_multibody_states()))
+        states[:, : len(self._upright)] = self._upright
+        states[:, self.robot.position_index] = joint_position
+        return list(self.dynamics.bias_accelerations(soles, states)[1])
 
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
@@ -466,45 +460,16 @@ class EquationOfMotion:
 
     def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Generalized forces without those of the feet, (M, v), in our order."""
-        plant, context, forces = self.robot.plant, self._context, MultibodyForces(self.robot.plant)
-        result = np.empty((len(states), len(self._order)))
-        for k, (state, acceleration) in enumerate(zip(states, accelerations, strict=True)):
-            plant.SetPositionsAndVelocities(context, state)
-            if not self.robot.has_floating_base:
-                plant.CalcForceElementsContribution(context, forces)
-            result[k] = plant.CalcInverseDynamics(context, acceleration, forces)[self._order]
-        return result
+        fixed = not self.robot.has_floating_base
+        return self.dynamics.inverse_dynamics(states, accelerations, forces=fixed)[:, self._order]
 
     def _calc_jacobians(self, positions: np.ndarray) -> np.ndarray:
         """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
-        plant, context, soles = self.robot.plant, self._context, self._soles
-        result = np.empty((len(soles), len(positions), 6, len(self._order)))
-        for k, position in enumerate(positions):
-            plant.SetPositions(context, position)
-            for foot, sole in enumerate(soles):
-                J = plant.CalcJacobianSpatialVelocity(
-                    context, JacobianWrtVariable.kV, sole, np.zeros(3), plant.world_frame(), sole
-                )
-                result[foot, k] = J[:, self._order]
-        return result
+        return self.dynamics.jacobians(self._soles, positions)[..., self._order]
 
     def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
         """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
-        plant, context, soles, world = (
-            self.robot.plant,
-            self._context,
-            self._soles,
-            self.robot.plant.world_frame(),
-        )
-        result = np.empty((len(soles), len(states), 3))
-        for k, state in enumerate(states):
-            plant.SetPositionsAndVelocities(context, state)
-            for foot, sole in enumerate(soles):
-                bias = plant.CalcBiasSpatialAcceleration(
-                    context, JacobianWrtVariable.kV, sole, np.zeros(3), world, sole
-                )
-                result[foot, k] = bias.translational()
-        return result
+        return self.dynamics.bias_accelerations(self._soles, states)[0][..., 3:]
 
     @property
     def row_velocities(self) -> np.ndarray:

@@ -1,0 +1,176 @@
+"""A log as the bodies and sensors of a model read it: what models have in common that differ in
+effects which are taken off the residual."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+from scipy.signal import savgol_filter, welch
+
+from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
+from fbse_drake.discrepancy.residual.residual import RecordedMotion, within_steps
+from fbse_drake.discrepancy.residual.servo import with_command
+from fbse_drake.effects.contact import ContactEffect
+from fbse_drake.effects.effect import ResolvedEffect
+from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect, SensorSignals
+from fbse_drake.errors import located
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario, build_robot
+
+# Joint velocities are smoothed over this many samples, without delay, where friction laws take
+# them.
+_SMOOTHING = 9
+# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
+# it.
+_SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
+# For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
+# those that we did.
+_EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
+
+
+class Reading:
+    """A log, read by the bodies and sensors of a scenario's model."""
+
+    def __init__(self, scenario: Scenario, log: Log, left_out: Sequence[tuple[float, float]] = ()):
+        """Reads it.
+
+        Args:
+            left_out: start and end [s] of stretches of which nothing is said.
+
+        Raises:
+            InputError: a log that does not fit the model.
+        """
+        self.log, self.left_out, self._read_by = log, tuple(left_out), _reader(scenario)
+        with located("model: "):
+            self.robot = build_robot(scenario.believed)
+        log = with_command(scenario, log, self.robot.description)
+        sensors, self.noisier_channels = measured_sensors(scenario.sensors, scenario.recording, log)
+        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
+        for key, effect in scenario.believed.effects.items():
+            if isinstance(effect, SensorEffect):
+                known = effect.resolve(self.robot.description, key=f"model.effects.{key}")
+                self.motion.signals = self.undone(known, self.remembered(known))
+
+    def serves(self, scenario: Scenario) -> bool:
+        """Would another scenario read the log alike?"""
+        return self._read_by == _reader(scenario)
+
+    def undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
+        """Signals that a sensor effect turns into those of the log.
+
+        Args:
+            memory: see `remembered`.
+        """
+        kind = cast(type[SensorEffect], effect.effect)
+        return kind.undone(self.motion.signals, memory, effect, self.robot, self.motion.period)
+
+    def remembered(self, effect: ResolvedEffect) -> np.ndarray:
+        """What a sensor effect remembers over the log, of torques without their white noise: it
+        would become an acceleration.
+
+        A simulation of ours begins with no memory; any other log begins as if it had always been as
+        it is then.
+        """
+        motion, signals = self.motion, self.motion.signals
+        torque = signals.torque_command
+        corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
+        smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]
+        signals = replace(signals, torque_command=np.stack(smooth, axis=1))
+        ours = self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
+        earlier = 0 if ours else round(_EARLIER / motion.period)
+        longer = {
+            name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
+            for name, values in vars(signals).items()
+        }
+        kind = cast(type[SensorEffect], effect.effect)
+        memory = kind.memory_over_time(SensorSignals(**longer), effect, self.robot, motion.period)
+        return memory[:, earlier:]
+
+    @cached_property
+    def joint_motion(self) -> JointMotion:
+        """What joint torque effects depend on, step by step: (N - 1, n) each."""
+        return self.joint_motion_of(self.motion.signals)
+
+    def joint_motion_of(self, signals: SensorSignals) -> JointMotion:
+        """The same of other signals."""
+        motion = self.motion
+        velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
+        time = motion.start + np.arange(len(velocity) - 1) * motion.period
+        torque = self._without_noise(signals.torque_command)
+        at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
+        return JointMotion(
+            velocity=within_steps(velocity, motion.law_share),
+            position=at.joint_position,
+            command=at.torque_command,
+            time=time[:, None],
+            time_step=motion.period,
+            load=at.torque_command - self._loss,
+        )
+
+    def _without_noise(self, torque: np.ndarray) -> np.ndarray:
+        """Torques (N, n) without frequencies in which the log has little but white noise: in a
+        regressor it would take off the noise of the residual, which is the same (errors in
+        variables). A command of exactly zero stays, for it may be a drive that is off."""
+        result = np.empty_like(torque)
+        for joint, corner in enumerate(self._torque_corners):
+            result[:, joint] = self.motion.low_passed(torque[:, joint], corner)
+        return np.where(torque == 0, 0.0, result)
+
+    @cached_property
+    def _torque_corners(self) -> list[float]:
+        """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
+        motion = self.motion
+        torque = motion.signals.torque_command
+        # What is missing in the model has next to no part in the noise of the rows.
+        noise = measured_noise(motion, motion.residual, ()).white[: torque.shape[1]]
+        variance = motion.torque_variance(torque).mean(axis=0) + noise
+        return noise_corners(torque, variance, motion.period)
+
+    @cached_property
+    def _loss(self) -> np.ndarray:
+        """What the links do not get of the command by the rigid model, smoothed over three blocks,
+        step by step, (N - 1, n)."""
+        motion, n = self.motion, len(self.robot.joint_names)
+        loss = smoothed(motion.residual.value[:, :n])
+        time = (
+            motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
+        )
+        return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
+
+
+def _reader(scenario: Scenario) -> tuple[Any, ...]:
+    """What a reading depends on in a scenario."""
+    model = scenario.believed
+    bodies = {
+        name: effect
+        for name, effect in model.effects.items()
+        if not isinstance(effect, JointTorqueEffect | ContactEffect)
+    }
+    recording = scenario.recording
+    model = replace(model, effects=bodies)
+    return model, scenario.sensors, recording, scenario.reference, scenario.control
+
+
+def noise_corners(torque: np.ndarray, variance: np.ndarray, period: float) -> list[float]:
+    """Frequency above which each joint's torque (N, n) is little but white noise [Hz]; 0 for none.
+
+    Args:
+        variance: of the noise of a sample, (n,).
+    """
+    window = min(len(torque), round(_SPECTRUM / period))
+    frequency, power = welch(torque, 1.0 / period, nperseg=window, axis=0)
+    corners = []
+    for density, white in zip(power.T, 2 * variance * period, strict=True):
+        above = np.flatnonzero(density > _ABOVE_NOISE * white)
+        last = above[-1] + 1 if len(above) else 1
+        corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
+    return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
+
+
+def smoothed(values: np.ndarray) -> np.ndarray:
+    """Binomial smoothing over three blocks."""
+    padded = np.concatenate([values[:1], values, values[-1:]])
+    return 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
