@@ -1,10 +1,12 @@
 """Fits by inner products are those of plain least squares, and columns meet the data once."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification import regression
 from fbse_drake.discrepancy.identification.regression import (
@@ -128,6 +130,37 @@ def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool) -> None
     own, y = (values - Q @ (Q.T @ values) for values in (own, y))
     np.testing.assert_allclose(gram, own.T @ own, rtol=1e-9)
     np.testing.assert_allclose(right, own.T @ y, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_columns_that_stay_as_they_are_leave_what_their_whitened_copies_leave(tied: bool) -> None:
+    """With differenced noise, other in every block, and gaps."""
+    rng, blocks = np.random.default_rng(7), 300
+    known, variance = rng.random((blocks, ROWS)) > 0.2, 1.0 + rng.random((blocks, ROWS))
+    white = WhitenedResidual(
+        replace(
+            white_of(rng.normal(size=(blocks, ROWS))).residual,
+            known=known,
+            variance=variance,
+            covariance=-0.49 * np.sqrt(variance * np.roll(variance, -1, axis=0)),
+        )
+    )
+    columns = rng.normal(size=(blocks, 2, 5))
+    grid = GridSets(white, 1, columns)
+    by_set = np.swapaxes(columns, 1, 2).reshape(blocks, 1, -1)
+    copies = white.whiten_signature(Signature(np.array([1]), by_set))
+    signatures = tuple(map(white.whiten_signature, some_signatures(rng, blocks)))
+    found = Regression(white)
+    parameters = found.fit(signatures).parameters
+    beside = Remainder(found, signatures, parameters, np.ones(ROWS), tied=tied)
+    for of_grid, of_copies in zip(
+        beside.moments_of_grid(grid), beside.moments_of_sets(copies, 0, grid.gram), strict=True
+    ):
+        np.testing.assert_allclose(of_grid, of_copies, rtol=1e-9, atol=1e-9)
+    flat = copies.values[:, 0]
+    np.testing.assert_allclose(grid.right, flat.T @ white.y[:, 1], rtol=0, atol=1e-9)
+    together = (flat.T @ flat).reshape(5, 2, 5, 2)
+    np.testing.assert_allclose(grid.gram, np.einsum("gpgq->gpq", together), rtol=1e-9, atol=1e-9)
 
 
 def test_columns_meet_the_data_once_and_twice_as_long_a_log_costs_twice_as_much(

@@ -8,7 +8,6 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.proposals import grid_gain
-from fbse_drake.discrepancy.identification.regression import columns_of
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -62,10 +61,7 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
         )
         rows = fits.dictionary.rows_of(effect, [joint])
         needed = fits.needed(len(effect.parameters)) + fits.systematic(rows)
-        grams = {
-            at: beside.moments_of_sets(grid.sets[at].signature, 0, grid.sets[at].gram)[0]
-            for at in rows.tolist()
-        }
+        grams = {at: beside.moments_of_grid(grid.sets[at])[0] for at in rows.tolist()}
         power = sum(gram[:, 0, 0] / beside.scale[at] for at, gram in grams.items())
         command = fits.dictionary.predictor.motion.signals.torque_command[:, row]
         if not effect.shows_under(command) or not np.all(
@@ -119,10 +115,7 @@ def separation(
             rows = fits.dictionary.rows_of(rival, [joint]).tolist()
             if signal[:, rows].any():
                 sets = [grid.sets[row] for row in rows]
-                rights = [
-                    (columns_of(s.signature)[0].T @ signal[:, row]).reshape(s.gram.shape[:2])
-                    for s, row in zip(sets, rows, strict=True)
-                ]
+                rights = [s.times(signal[:, [s.row]]).reshape(s.gram.shape[:2]) for s in sets]
                 gain = grid_gain(
                     rival, np.sum([s.gram for s in sets], axis=0), np.sum(rights, axis=0)
                 )

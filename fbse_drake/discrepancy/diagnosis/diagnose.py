@@ -265,11 +265,12 @@ class _Search:
 
 
 def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: Progress) -> _Search:
-    dictionary = Dictionary(predictor, effects, progress)
-    first, partial = Fits(dictionary), None
-    path, proposals = [first.explain([])], Proposals(first)
+    dictionary, partial = Dictionary(predictor, effects, progress), None
+    proposals = Proposals(Fits(dictionary))
+    path, before = [proposals.fits.explain([])], proposals.fits.white.sse
     try:
-        for path, proposals in _held(remeasured(first)):  # noqa: B007 - the last one counts.
+        first = remeasured(proposals.fits)
+        for path, proposals in _held(first.dictionary, first.white):  # noqa: B007 - the last one.
             progress("looking for what explains more")
     except Interrupted as stop:
         partial = str(stop)
@@ -290,9 +291,7 @@ def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: P
         if not significance.left_share(structure, remaining) < tolerance
     ]
     disturbed = disturbances(remaining, left, [structure.index for structure in unexplained])
-    return _Search(
-        proposals, path, alternatives, first.white.sse, inertia, unexplained, disturbed, partial
-    )
+    return _Search(proposals, path, alternatives, before, inertia, unexplained, disturbed, partial)
 
 
 def _with_trust(
@@ -310,8 +309,11 @@ def _with_trust(
     return [trusting.explain([]), explanation], frugally
 
 
-def _held(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
-    """As `select`; the last path ends with what pays of its last explanation.
+def _held(
+    dictionary: Dictionary, white: WhitenedResidual
+) -> Iterator[tuple[list[Explanation], Proposals]]:
+    """As `select` from nothing, by fits of its own, which are let go of as soon as the residual is
+    weighed anew; the last path ends with what pays of its last explanation.
 
     Where that explains little of what the search did, the search began with something that does not
     hold, and left the right way: another one goes without it.
@@ -319,13 +321,14 @@ def _held(fits: Fits) -> Iterator[tuple[list[Explanation], Proposals]]:
     barred: frozenset[Name] = frozenset()
     best: tuple[list[Explanation], Proposals] | None = None
     for _ in range(_MOST_WAYS):
-        for path, proposals in select(fits, barred):
+        for path, proposals in select(Fits(dictionary, white), barred):
             yield path, proposals
         nothing, found, kept = path[0], path[-1], frugal(proposals, path[-1])
         if len(kept.candidates) < len(found.candidates):
             # What is doubtful of a law is no noise without it.
             fits, kept = proposals.fits.doubting(kept)
             proposals = proposals if fits is proposals.fits else Proposals(fits, barred)
+            white = fits.white
         if best is None or kept.deviance < best[0][-1].deviance - MARGIN:
             best = [*path[:-1], kept], proposals
         left = {c.key for c in kept.candidates}

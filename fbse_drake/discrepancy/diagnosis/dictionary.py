@@ -220,9 +220,7 @@ class Dictionary:
             if columns is None:
                 joints = self.predictor.joints_of(np.array([row]))
                 made = self.predictor.joint_columns(effect, points[..., joints], np.array([row]))
-                columns = np.transpose(made[..., 0], (2, 0, 1))
-            # Where no law is doubted, nothing is weighed anew, and nobody asks again.
-            if self.per_step:
+                columns = np.ascontiguousarray(np.transpose(made[..., 0], (2, 0, 1)))
                 self._grids[key] = columns
             yield int(row), columns
 

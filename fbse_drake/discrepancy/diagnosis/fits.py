@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import (
     Regression,
@@ -65,7 +66,7 @@ class Grid:
     # (m, G, n).
     points: np.ndarray
     # By row.
-    sets: Mapping[int, ColumnSets]
+    sets: Mapping[int, GridSets]
 
 
 class Fits:
@@ -237,7 +238,7 @@ class Fits:
         """First grid of an effect's nonlinear values, in all joints."""
         if effect.__name__ not in self._grids:
             grid = self.dictionary.grid(effect)
-            sets = {row: self._whitened(columns, row) for row, columns in grid}
+            sets = {row: GridSets(self.white, row, columns) for row, columns in grid}
             self._grids[effect.__name__] = Grid(self.dictionary.points(effect), sets)
         return self._grids[effect.__name__]
 

@@ -181,8 +181,7 @@ class Proposals:
             # Found once for what an explanation has in a row.
             key = (effect, place, *beside.beside(place).key)
             if key not in self._moments:
-                sets = grid.sets[place]
-                self._moments[key] = beside.moments_of_sets(sets.signature, 0, sets.gram)
+                self._moments[key] = beside.moments_of_grid(grid.sets[place])
             moments.append(self._moments[key])
         return moments
 

@@ -1,10 +1,12 @@
 """What an explanation leaves of a residual, and what further columns could take of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
 from fbse_drake.discrepancy.identification.regression import Regression, Signature
 
 # Directions with less than this share of the largest inner product are there by rounding alone.
@@ -90,14 +92,34 @@ class Remainder:
         Returns:
             Shapes (G, p, p) and (G, p).
         """
-        beside = self.beside(int(signature.rows[place]))
         right = self._regression.right(signature)[place]
-        sets = gram.shape[:2]
+        row = int(signature.rows[place])
+        return self._left(row, gram, right, lambda other: self._cross(signature, place, other))
+
+    def moments_of_grid(self, grid: GridSets) -> tuple[np.ndarray, np.ndarray]:
+        """The same for the sets of a grid."""
+
+        def cross(other: Signature) -> np.ndarray:
+            return grid.with_columns(other, int(np.flatnonzero(other.rows == grid.row)[0]))
+
+        return self._left(grid.row, grid.gram, grid.right, cross)
+
+    def _left(
+        self,
+        row: int,
+        gram: np.ndarray,
+        right: np.ndarray,
+        cross_with: Callable[[Signature], np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Inner products of new columns in a row that are left beside the explanation.
+
+        Args:
+            gram, right: with each other and with the residual, (G, p, p) and (G p,).
+            cross_with: with the columns of a signature, (G p, q).
+        """
+        beside, sets = self.beside(row), gram.shape[:2]
         if beside.signatures:
-            cross = np.concatenate(
-                [self._cross(signature, place, other) for other in beside.signatures],
-                axis=1,
-            )
+            cross = np.concatenate([cross_with(other) for other in beside.signatures], axis=1)
             of_fitted = cross[:, beside.fitted]
             right = right - cross @ beside.amounts - of_fitted @ beside.shift
             taken = (of_fitted @ beside.root).reshape(*sets, -1)

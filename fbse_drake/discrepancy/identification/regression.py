@@ -149,6 +149,16 @@ class WhitenedResidual:
         _divide_by_bidiagonal(result, flat, index, diagonal, below)
         return result.reshape(values.shape)
 
+    def whiten_back(self, row: int, values: np.ndarray) -> np.ndarray:
+        """The transpose of `whiten`: inner products of what is whitened with values (B, ...) are
+        those of what is not with this."""
+        index, (diagonal, below) = self._index[row], self._factor[row]
+        flat = np.ascontiguousarray(values).reshape(len(values), -1)
+        result = np.zeros(flat.shape)
+        backwards = (np.ascontiguousarray(v[::-1]) for v in (index, diagonal, below[:-1]))
+        _divide_by_bidiagonal(result, flat, *backwards)
+        return result.reshape(values.shape)
+
     def whiten_signature(self, signature: Signature) -> Signature:
         """A signature, whitened."""
         values = np.empty((len(signature.rows), len(self.y), signature.values.shape[2]))
