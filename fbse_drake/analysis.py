@@ -37,6 +37,7 @@ from fbse_drake.discrepancy.exercises.hidden import Exercise, Revealed
 from fbse_drake.discrepancy.exercises.sizes import Size
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, hygiene_json, inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
+from fbse_drake.discrepancy.residual.evidence import Evidence
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError
@@ -99,13 +100,19 @@ class Case:
             InputError: a log that does not fit the model, or whose sensors cannot be what they are
                 said to be.
         """
+        return self._checked[0]
+
+    @cached_property
+    def _checked(self) -> tuple[Predictor, Evidence]:
         predictor = Predictor(self.scenario, self.train, reading=self.reading)
-        check_sensors(predictor.motion)
-        return predictor
+        evidence = Evidence(predictor.motion)
+        check_sensors(predictor.motion, evidence)
+        return predictor, evidence
 
     @cached_property
     def hygiene(self) -> Hygiene:
-        return inspect(self.predictor.motion, self.predictor.noise)
+        predictor, evidence = self._checked
+        return inspect(predictor.motion, predictor.noise, evidence)
 
     @cached_property
     def comparison(self) -> Comparison:

@@ -82,16 +82,19 @@ class Hygiene:
         )
 
 
-def inspect(motion: RecordedMotion, noise: Noise | None = None) -> Hygiene:
+def inspect(
+    motion: RecordedMotion, noise: Noise | None = None, evidence: Evidence | None = None
+) -> Hygiene:
     """Inspects a recording; no findings for one in which all is well.
 
     Args:
         motion: the log, seen by the model. Works for fixed and floating bases, with and without
             torques.
         noise: what the log shows of the rows' noise, where that is to be said.
+        evidence: of this motion, where there is one already.
     """
-    evidence = Evidence(motion)
-    findings = [finding for check in _CHECKS for finding in check(evidence)]
+    evidence = Evidence(motion) if evidence is None else evidence
+    findings = [finding for check in _CHECKS for finding in evidence.found_by(check)]
     if noise is not None and (noisy := noise_finding(motion, noise)) is not None:
         findings.append(noisy)
     findings.sort(key=lambda finding: _ORDER.index(finding.severity))

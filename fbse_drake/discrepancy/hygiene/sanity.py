@@ -25,8 +25,11 @@ _SMALLEST_MOTION = 0.05
 _SMALLEST_RATE = 0.02
 
 
-def check_sensors(motion: RecordedMotion) -> None:
+def check_sensors(motion: RecordedMotion, evidence: Evidence | None = None) -> None:
     """Checks signs, units and frames of a log against what every robot on the ground shows.
+
+    Args:
+        evidence: of this motion, where there is one already.
 
     Raises:
         InputError: one line on the first channel that cannot be what it is said to be.
@@ -39,7 +42,7 @@ def check_sensors(motion: RecordedMotion) -> None:
         _check_gravity(motion)
         _check_weight(motion)
         _check_gyroscope(motion)
-    _check_torque(motion)
+    _check_torque(Evidence(motion) if evidence is None else evidence)
 
 
 def _check_angles(motion: RecordedMotion) -> None:
@@ -209,9 +212,9 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
         )
 
 
-def _check_torque(motion: RecordedMotion) -> None:
+def _check_torque(evidence: Evidence) -> None:
     """Torques whose sign is wrong, or whose unit is another."""
-    for finding in check_torque(Evidence(motion)):
+    for finding in evidence.found_by(check_torque):
         if finding.kind == "torque_sign":
             raise InputError(f"channel {finding.text}")
         if finding.kind == "torque_scale" and finding.severity == "untrustworthy":

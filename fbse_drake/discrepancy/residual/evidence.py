@@ -1,9 +1,9 @@
 """What the checks of a recording look at, and how they say what they find."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -48,6 +48,9 @@ class NoiseLevel:
     believed: float
 
 
+Check: TypeAlias = Callable[["Evidence"], Iterable[HygieneFinding]]
+
+
 class Evidence:
     """A recording and what several checks need of it."""
 
@@ -55,6 +58,13 @@ class Evidence:
         self.motion, self.log, self.robot = motion, motion.log, motion.robot
         self.joints, self.sides = self.robot.joint_names, self.robot.description.sides
         self.period = motion.period
+        self._found: dict[Check, list[HygieneFinding]] = {}
+
+    def found_by(self, check: Check) -> list[HygieneFinding]:
+        """What a check finds; it looks once."""
+        if check not in self._found:
+            self._found[check] = list(check(self))
+        return self._found[check]
 
     @cached_property
     def channels(self) -> dict[str, tuple[np.ndarray, list[str]]]:
