@@ -46,9 +46,11 @@ from fbse_drake.interop.convert import read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.interop.models import write_mjcf, write_urdf
 from fbse_drake.log import Log, joined
+from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress, silent
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy import (
+    where_it_fails,
     write_compare_report,
     write_diagnosis_report,
     write_study_report,
@@ -59,7 +61,7 @@ from fbse_drake.report.discrepancy_tables import (
     spread_tables,
     steps_table,
 )
-from fbse_drake.report.html import Table
+from fbse_drake.report.html import Section, Table, drawn
 from fbse_drake.report.identification import (
     errors_table,
     identification_outcome,
@@ -262,6 +264,8 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
     """Which effects a model lacks, see `Diagnosis`."""
 
     case: Case = field(kw_only=True, repr=False)
+    # What its report says of where the model fails, if that was drawn beside the diagnosis.
+    where: Section | None = field(default=None, kw_only=True, repr=False)
     file: ClassVar[str] = "diagnosis"
 
     @property
@@ -282,7 +286,8 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
         return diagnosing.diagnosis_json(self)
 
     def _report(self, path: Path, inputs: Inputs) -> None:
-        write_diagnosis_report(path, self, self.case.comparison, self.case.predictor, inputs)
+        case = self.case
+        write_diagnosis_report(path, self, case.comparison, case.predictor, inputs, self.where)
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,6 +392,7 @@ def diagnose(
     tests: Mapping[str, Log] | None = None,
     name: str = "scenario",
     progress: Progress = silent,
+    jobs: int = 1,
 ) -> DiagnosisResult:
     """Finds the physical effects that a scenario's model lacks.
 
@@ -399,6 +405,8 @@ def diagnose(
         name: what the scenario is called in reports.
         progress: is told what is being done, and may end the work with what is known then
             (`ProgressLines(print, limit=60)`).
+        jobs: how many things are done side by side: from two on, pictures of its report are drawn
+            while it searches.
 
     Raises:
         InputError: see `compare`; or no joint is left whose torque can be trusted.
@@ -414,12 +422,17 @@ def diagnose(
     case = Case.divided(scenario, log, tests, name)
     trusted = case.predictor.of(case.trusted)
     tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
-    diagnosis = diagnose_confirmed(trusted, effects, tested, progress=progress)
+    with Processes(jobs) as processes:
+        drawing = processes.begin(lambda _: drawn(where_it_fails(case.comparison, case.predictor)))
+        beside = processes.beside(progress)
+        diagnosis = diagnose_confirmed(trusted, effects, tested, progress=beside)
+        # With one job it is drawn when it is shown.
+        (where,) = processes.results([drawing], silent, "drawing") if jobs > 1 else [None]
     if diagnosis.chosen:
         completed = addition.add(case.trusted, diagnosis.chosen)
         set_aside = {test: validated(other, other.of(completed)) for test, other in tested.items()}
         diagnosis = replace(diagnosis, set_aside=set_aside)
-    return _with_case(DiagnosisResult, diagnosis, case=case)
+    return _with_case(DiagnosisResult, diagnosis, case=case, where=where)
 
 
 def study(

@@ -262,13 +262,13 @@ def _parser() -> argparse.ArgumentParser:
                 type=_positive_number,
                 help="end after this time with what is known then (also: Ctrl-C)",
             )
-        if name == "study":
+        if name in ("diagnose", "study"):
             run.add_argument(
                 "--jobs",
                 metavar="N",
                 type=_positive_whole_number,
                 default=1,
-                help="do so many things side by side: simulate, diagnose (default: 1)",
+                help="do so many things side by side: diagnose, draw, simulate (default: 1)",
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
 

@@ -120,6 +120,7 @@ def _diagnose(options: argparse.Namespace) -> bool:
             tests=_tests(options),
             name=given.inputs.name,
             progress=progress,
+            jobs=options.jobs,
         )
     _conclude(given, result)
     return result.partial is None

@@ -162,6 +162,17 @@ def test_compare_diagnose_add_agree_and_are_saved(rubbing, tmp_path: Path):
     )
 
 
+def test_pictures_that_are_drawn_beside_a_diagnosis_are_those_of_one_job(rubbing, tmp_path: Path):
+    one, two = (fd.diagnose(*rubbing, FEW, jobs=jobs) for jobs in (1, 2))
+    assert one.where is None
+    assert two.where is not None
+    texts = []
+    for found in (one, two):
+        found.report(tmp_path / "report.html")
+        texts.append((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert texts[0] == texts[1]
+
+
 def test_a_folder_that_cannot_be_made_is_refused(rubbing, tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(fd.InputError, match="file/inside: Not a directory"):

@@ -8,7 +8,7 @@ import base64
 import gzip
 import json
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class Chart:
     time: np.ndarray
     views: tuple[View, ...]
 
-    @property
+    @cached_property
     def json(self) -> str:
         """For each view its name and what Plotly draws of it, as JSON that may stand in HTML."""
         # Takes a while to import, and only reports need it.
@@ -85,6 +85,11 @@ class Chart:
             for view, figure in zip(self.views, figures, strict=True)
         ]
         return json.dumps(content).replace("<", "\\u003c")
+
+    def drawn(self) -> "Chart":
+        """The same with its JSON made."""
+        self.json  # noqa: B018 - it is kept.
+        return self
 
 
 @cache

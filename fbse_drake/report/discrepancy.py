@@ -122,7 +122,7 @@ def write_compare_report(
     )
     sections = [
         _summary(rows),
-        _where(comparison, predictor),
+        where_it_fails(comparison, predictor),
         _hygiene(predictor, inputs),
         _reproduce("compare", predictor, inputs),
     ]
@@ -144,11 +144,13 @@ def write_diagnosis_report(
     comparison: Comparison,
     predictor: Predictor,
     inputs: Inputs,
+    where: Section | None = None,
 ) -> None:
     """Writes which effects a model lacks as one HTML file.
 
     Args:
         comparison: of the model as it is.
+        where: what `where_it_fails` says of it, if that was made already.
     """
     outcome, statuses = (
         inputs.hygiene.before(diagnosis_outcome(diagnosis)),
@@ -175,7 +177,7 @@ def write_diagnosis_report(
     )
     sections = [
         _summary(rows),
-        _where(comparison, predictor),
+        where_it_fails(comparison, predictor) if where is None else where,
         *_why([diagnosis.chosen], diagnosis.ranking, diagnosis.unexplained),
         _what_was_looked_for(statuses),
         *_path(diagnosis, predictor.robot),
@@ -235,7 +237,7 @@ def write_study_report(
     completed = dump_scenario(study.scenario, inputs.name) if study.found else None
     sections = [
         _summary(rows),
-        _where(before[1], before[0], after[0] if study.found else None),
+        where_it_fails(before[1], before[0], after[0] if study.found else None),
         *_why(
             [step.added for step in study.steps[1:]],
             study.diagnoses[0].ranking,
@@ -267,7 +269,7 @@ def _summary(rows: Sequence[tuple[str, str]]) -> Section:
     return Section("Summary", tables=(Table(("", ""), tuple(rows)),))
 
 
-def _where(
+def where_it_fails(
     comparison: Comparison, predictor: Predictor, completed: Predictor | None = None
 ) -> Section:
     """Where the model fails: in words, on the robot, against each variable and over time.

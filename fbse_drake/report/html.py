@@ -8,8 +8,10 @@ import base64
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import jinja2
 from matplotlib.backend_bases import FigureCanvasBase
@@ -76,9 +78,12 @@ class FigureBlock:
     draw: Callable[[], Figure]
 
     @property
-    def pictures(self) -> tuple[tuple[str, Callable[[], Figure]], ...]:
+    def pictures(self) -> "Pictures":
         """The only one, without a name of its own."""
-        return (("", self.draw),)
+        return (("", partial(_png_uri, self.draw)),)
+
+    def drawn(self) -> "DrawnBlock":
+        return DrawnBlock(self.title, self.caption, _made(self.pictures))
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,38 @@ class FigureRow:
 
     title: str
     caption: str
-    pictures: tuple[tuple[str, Callable[[], Figure]], ...]
+    drawings: tuple[tuple[str, Callable[[], Figure]], ...]
+
+    @property
+    def pictures(self) -> "Pictures":
+        return tuple((name, partial(_png_uri, draw)) for name, draw in self.drawings)
+
+    def drawn(self) -> "DrawnBlock":
+        return DrawnBlock(self.title, self.caption, _made(self.pictures))
+
+
+@dataclass(frozen=True)
+class DrawnBlock:
+    """Pictures that are drawn already, as data URIs with their names."""
+
+    title: str
+    caption: str
+    uris: tuple[tuple[str, str], ...]
+
+    @property
+    def pictures(self) -> "Pictures":
+        return tuple((name, partial(str, uri)) for name, uri in self.uris)
+
+    def drawn(self) -> "DrawnBlock":
+        return self
+
+
+# What makes each of some pictures, with its name.
+Pictures: TypeAlias = tuple[tuple[str, Callable[[], str]], ...]
+
+
+def _made(pictures: Pictures) -> tuple[tuple[str, str], ...]:
+    return tuple((name, picture()) for name, picture in pictures)
 
 
 @dataclass(frozen=True)
@@ -107,7 +143,7 @@ class Section:
     title: str
     text: str | Step = ""
     tables: tuple[Table, ...] = ()
-    figures: tuple[FigureBlock | FigureRow | Chart, ...] = ()
+    figures: tuple[FigureBlock | FigureRow | DrawnBlock | Chart, ...] = ()
     details: tuple[Details, ...] = ()
 
 
@@ -152,6 +188,11 @@ def numeric_table(
     return (Table(tuple(header), kept),) if kept else ()
 
 
+def drawn(section: Section) -> Section:
+    """The same with its pictures and charts made, for another process."""
+    return replace(section, figures=tuple(block.drawn() for block in section.figures))
+
+
 def render_report(report: Report) -> str:
     """The report as HTML text that refers to nothing outside itself."""
     return _environment().get_template("report.html.j2").render(report=report)
@@ -171,7 +212,6 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
-    environment.filters["png"] = _png_uri
     environment.globals["plotly_gzip"] = plotly_gzip
     environment.tests["chart"] = lambda block: isinstance(block, Chart)
     environment.tests["measure"] = lambda cell: isinstance(cell, Measure)
