@@ -111,10 +111,10 @@ def test_pictures_of_runs_have_the_same_axes(kind: FigureKind, tmp_path: Path):
     runs = read_runs([tmp_path / "a.npz", tmp_path / "b.npz"])
     alone = [kind(run.log).axes for run in runs]
     row = figure_row(kind, runs)
-    assert [name for name, _ in row.pictures] == ["a", "b"]
+    assert [name for name, _ in row.drawings] == ["a", "b"]
     assert row.caption.endswith("The same axes in all runs.")
     for panel, (first, second) in enumerate(
-        zip(*(draw().axes for _, draw in row.pictures), strict=True)
+        zip(*(draw().axes for _, draw in row.drawings), strict=True)
     ):
         assert first.get_xlim() == second.get_xlim()
         assert first.get_ylim() == second.get_ylim()

@@ -77,6 +77,12 @@ def has_body_tree(plant: MultibodyPlant) -> bool:
         plant.num_force_elements() == 1
         and plant.num_constraints() == 0
         and all(joint.type_name() in {*_KINDS, WeldJoint.kTypeName} for joint in joints)
+        # What floats does so in the axes of the world.
+        and all(
+            joint.frame_on_parent().index() == plant.world_frame().index()
+            for joint in joints
+            if joint.type_name() == QuaternionFloatingJoint.kTypeName
+        )
         and not any(np.any(joint.default_damping_vector()) for joint in joints)
     )
 
@@ -119,29 +125,19 @@ class BodyTree:
             else:
                 self._places[child] = len(nodes), RigidTransform()
                 nodes.append(_Node(joint, parent, X_PF, X_MB))
-        self._parent = np.array([node.parent for node in nodes])
-        kinds = [_KINDS[node.joint.type_name()] for node in nodes]
-        self._kind = np.array(kinds)
-        starts = [[n.joint.position_start(), n.joint.velocity_start()] for n in nodes]
-        self._start = np.array(starts)
-        self._axis = np.array([_axis(node.joint) for node in nodes])
-        self._R_PF, self._p_PF = _stacked([node.X_PF for node in nodes])
-        self._R_MN, self._p_MN = _stacked([node.X_MN for node in nodes])
-        self._mass, self._moment, self._inertia = self._inertias(len(nodes))
+        self._tree = (
+            np.array([node.parent for node in nodes]),
+            np.array([_KINDS[node.joint.type_name()] for node in nodes]),
+            np.array([[n.joint.position_start(), n.joint.velocity_start()] for n in nodes]),
+            np.array([_axis(node.joint) for node in nodes]),
+            *_stacked([node.X_PF for node in nodes]),
+            *_stacked([node.X_MN for node in nodes]),
+        )
+        self._inertia = self._inertias(len(nodes))
         self._reflected = np.zeros(plant.num_velocities())
         for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
             inertia = actuator.default_rotor_inertia() * actuator.default_gear_ratio() ** 2
             self._reflected[actuator.joint().velocity_start()] += inertia
-        self._tree = (
-            self._parent,
-            self._kind,
-            self._start,
-            self._axis,
-            self._R_PF,
-            self._p_PF,
-            self._R_MN,
-            self._p_MN,
-        )
 
     def _inertias(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mass, first moment and rotational inertia about the origin of each node, in its axes."""
@@ -173,9 +169,7 @@ class BodyTree:
             self._plant.num_positions(),
             self._plant.gravity_field().gravity_vector() * forces,
             *self._tree,
-            self._mass,
-            self._moment,
-            self._inertia,
+            *self._inertia,
         )
         return result + self._reflected * accelerations
 
