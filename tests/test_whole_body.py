@@ -249,6 +249,22 @@ def test_wrong_masses_are_no_surprise(run: Run):
     assert rms(friction_error(result)[1000:]) < 1.15 * rms(friction_error(log)[1000:])
 
 
+def test_late_forces_belong_to_the_tick_in_which_they_were(run: Run):
+    """Taken for those of the present tick, forces that are 5 ms late make the error ten times as
+    large; so they are stale in the first half second, until they are found to be late."""
+    late, log = (
+        run("paper_walk_fbse", "duration=3", *changes)
+        for changes in (("sensors.foot_force.delay=0.005",), ())
+    )
+    errors = []
+    for of in (late, log):
+        result = estimated(of, WALK, WHOLE_BODY)
+        assert coverage(result) > 0.98
+        yawless = [not joint.endswith("hip_yaw") for joint in of.joints]
+        errors.append(rms(friction_error(result)[1000:, yawless]))
+    assert errors[0] < 1.5 * errors[1]
+
+
 def test_a_sensor_that_fails_leaves_friction_to_its_law(run: Run):
     log = run("paper_walk_fbse", "duration=3")
     rows = slice(1500, 1700)

@@ -17,6 +17,7 @@ from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.errors import require_not_negative, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.floating_base import ImuMount, model_type
+from fbse_drake.estimators.force_delay import room_for_delays
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
 from fbse_drake.estimators.link_torque import wrench_variance
@@ -62,12 +63,13 @@ class WholeBody:
     and linearised where the measurements say that a tick ended: velocity and law are learned
     together, and one that does not fit the other would be learned wrong.
 
-    Foot forces and commands have to be right: a delay of theirs is not allowed for, and what is
-    wrong with them makes the laws wrong.
+    Foot forces that come late belong to the tick in which they were: the filter is then so many
+    ticks behind, and the law is asked for the velocity that is measured now. What else is wrong
+    with forces and commands makes the laws wrong.
     """
 
     # Does it go back to the tick that late forces belong to?
-    allows_for_delay: ClassVar[bool] = False
+    allows_for_delay: ClassVar[bool] = True
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = True
     # What it hears beside measurements and link torque.
@@ -87,7 +89,7 @@ class WholeBody:
     shape_uncertainty: float = 3.0
     # Random walk of the torque that a joint's row lacks [Nm/sqrt(s)], and its initial standard
     # deviation [Nm]; and of the moment that the base's rows lack.
-    disturbance_walk: float = 0.15
+    disturbance_walk: float = 0.1
     disturbance_uncertainty: float = 0.1
     moment_walk: float = 0.5
     moment_uncertainty: float = 0.5
@@ -106,25 +108,25 @@ class WholeBody:
 
 
 @njit(cache=True)
-def _equation_of_motion(
+def _put_equation_of_motion(
+    past: Record,
+    at: int,
     measured: Record,
     model: Record,
-    link: Record,
     attitude: Record,
     torque_command: np.ndarray,
     known: Record,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> None:
     """Rows of base turning and joints, where the base's acceleration is taken at the IMU.
 
     The accelerometer measures there, so what it says is no function of the unknown angular
     acceleration; moments are about the IMU.
 
-    Returns:
-        A (r, r), `push` (r,) and the variance (r, r) of the push, for r = 3 + n, of A a = push -
-        friction, with a the base's angular acceleration and those of the joints.
+    Args:
+        past: filled, see `WholeBodyFilter`: of inertia a = push + what feet push - friction, with a
+            the base's angular acceleration and those of the joints.
+        at: where in it.
     """
-    n = len(torque_command)
-    r, noise = 3 + n, known.sensors.acceleration_noise
     R_BI, p = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     # a_B = a_I - w_dot x p - w x (w x p), of the IMU's origin I seen from the base's.
     w, moved = vector(model.velocity), np.empty((3, 3))
@@ -133,7 +135,7 @@ def _equation_of_motion(
     linear = np.empty(3)
     put(linear, subtract(rotate(R_BI, force), cross(w, cross(w, p))))
     base, joints = model.base_inertia, model.mass_matrix
-    A, of_linear, push = np.empty((r, r)), np.empty((r, 3)), np.empty(r)
+    A, of_linear, push = past.inertia[at], past.of_linear[at], past.push[at]
     of_linear[:3] = base[:3, 3:] + moved.T @ np.ascontiguousarray(base[3:, 3:])
     of_linear[3:] = joints[:, 3:6]
     A[:3, :3] = base[:3, :3] + moved.T @ np.ascontiguousarray(base[3:, :3]) + of_linear[:3] @ moved
@@ -143,19 +145,29 @@ def _equation_of_motion(
     push[:3] = -model.base_bias[:3] - moved.T @ model.base_bias[3:]
     push[3:] = torque_command - model.bias
     push -= of_linear @ linear
-    variance = noise**2 * (of_linear @ of_linear.T)
     for foot in range(len(known.has_pads)):
-        J, lever = model.foot_jacobian[foot], np.empty((6, r))
+        J, lever = model.foot_jacobian[foot], past.lever[at, foot]
         lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
         lever[:, 3:] = J[:, 6:]
-        wrench, excess = link.wrench[foot], link.force_noise[foot]
+        past.turning[at, foot] = model.foot_bias[foot, 2]
+
+
+@njit(cache=True)
+def _pushed(
+    past: Record, at: int, measured: Record, link: Record, known: Record
+) -> tuple[np.ndarray, np.ndarray]:
+    """The push (r,) in an equation of motion, feet included, and its variance (r, r)."""
+    push, of_linear = past.push[at].copy(), past.of_linear[at]
+    variance = known.sensors.acceleration_noise**2 * (of_linear @ of_linear.T)
+    for foot in range(len(known.has_pads)):
+        lever, wrench, excess = past.lever[at, foot], link.wrench[foot], link.force_noise[foot]
         of_wrench = excess * known.wrench_variance[foot]
         if not known.has_pads[foot] and _pushes(wrench, of_wrench, _WRENCH_GATE):
             push += lever.T @ wrench
             variance += (lever.T * of_wrench) @ lever
         if known.has_pads[foot]:
             _add_pads(push, variance, lever, measured.mean.pad_force, foot, excess, known)
-    return A, push, variance
+    return push, variance
 
 
 @njit(cache=True)
@@ -343,12 +355,18 @@ def _listen(x: Record, last: Record, predicted: np.ndarray, elapsed: float, know
 
 
 @njit(cache=True)
+def _tick_of_forces(x: Record) -> int:
+    """Where in the past the tick is to which the forces belong that are read now."""
+    return (int(x.newest) - int(x.late)) % len(x.past.duration)
+
+
+@njit(cache=True)
 def _listen_to_feet(
-    x: Record, last: Record, measured: Record, model: Record, link: Record, T: float, known: Record
+    x: Record, last: Record, measured: Record, link: Record, T: float, known: Record
 ) -> None:
     """Kalman updates with flat feet that stand: they do not turn about their normals."""
     P, r, state, load = x.covariance, len(x.velocity), _state(x), 0.0
-    row = np.empty(r)
+    past, at = x.past, _tick_of_forces(x)
     for foot in range(len(known.is_flat)):
         load += max(0.0, link.wrench[foot, 5])
     for foot in range(len(known.is_flat)):
@@ -356,9 +374,9 @@ def _listen_to_feet(
         if not known.is_flat[foot] or not measured.support[foot] > 0 or share < _LEAST_LOAD:
             continue
         # Where the tick ends, of which the model knows where it began.
-        row[:3], row[3:] = model.foot_jacobian[foot, 2, :3], model.foot_jacobian[foot, 2, 6:]
+        row = past.lever[at, foot, 2]
         column = row @ P[:r]
-        innovation = -(row @ state[:r]) - T * model.foot_bias[foot, 2]
+        innovation = -(row @ state[:r]) - T * past.turning[at, foot]
         believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
         S = column[:r] @ row + last.foot_noise[foot] * believed
         surprise = innovation**2 / S
@@ -391,23 +409,30 @@ def _conclude(
     posterior: Record,
     last: Record,
     elapsed: float,
+    velocity: np.ndarray,
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
+    known: Record,
 ) -> None:
     """Fills friction and its standard deviation, by the law where the tick ends.
 
     Args:
+        velocity: see `_present_velocity`.
         phi, slopes, shaped: see `FrictionRegressor`.
     """
-    x, last = posterior[()], last[()]
-    _linearise(x, x.velocity[3:], x.weights, phi, slopes, shaped)
+    x, last, known = posterior[()], last[()], known[()]
+    _linearise(x, velocity, x.weights, phi, slopes, shaped)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME)
     for joint in range(n):
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
         slope, lacking = x.slope[joint], x.lacking[3 + joint]
-        variance = slope * slope * P[of_velocity, of_velocity] + P[of_lacking, of_lacking]
+        variance = P[of_lacking, of_lacking]
+        if x.late > 0.0:
+            variance += slope * slope * x.noise[of_velocity] * known.variance[of_velocity]
+            slope = 0.0
+        variance += slope * slope * P[of_velocity, of_velocity]
         variance += 2.0 * slope * P[of_velocity, of_lacking]
         unsettled = 0.0
         for j in range(m):
@@ -434,55 +459,75 @@ def _begin(
     elapsed: float,
     measured: Record,
     model: Record,
+    link_torque: Record,
     attitude: Record,
     torque_command: np.ndarray,
     known: Record,
-) -> bool:
-    """Takes over what was known a tick ago, and reads gyro and encoders.
+) -> float:
+    """Takes over what was known a tick ago, and remembers the tick but for its forces.
 
     Args:
         elapsed: of the tick [s], 0 of the first.
 
     Returns:
-        Is all known that the equation of motion needs?
+        Duration of the tick to which the forces belong that are read now [s]; 0 unless all is known
+        that its equation of motion needs.
     """
     x, last, measured = posterior[()], last[()], measured[()]
-    model, attitude, known = model[()], attitude[()], known[()]
+    model, attitude, known, link = model[()], attitude[()], known[()], link_torque[()]
     posterior[()] = last
-    x.status = measured.trust.max()
+    x.status, x.late = measured.trust.max(), min(link.late, len(x.past.duration) - 1.0)
     x.innovation[:] = 0.0
+    ticks, of_past = len(x.past.duration), x.past
+    newest = (int(last.newest) + 1) % ticks
+    x.newest = newest
+    of_past.duration[newest] = elapsed
     rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
-    put(x.reading[:3], rotate(rotation(known.mount.R_BI), rate))
-    x.reading[3:] = measured.joint_velocity
-    for i in range(len(x.lacking)):
-        walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
-        x.covariance[len(x.lacking) + i, len(x.lacking) + i] += walk**2 * elapsed
+    put(of_past.reading[newest, :3], rotate(rotation(known.mount.R_BI), rate))
+    of_past.reading[newest, 3:] = measured.joint_velocity
     is_known = x.status == 0.0 and last.status == 0.0 and np.isfinite(torque_command).all()
-    return bool(elapsed > 0.0 and is_known and model.velocity.any())
+    is_known = elapsed > 0.0 and is_known and model.velocity.any()
+    of_past.known[newest] = 1.0 if is_known else 0.0
+    if is_known:
+        _put_equation_of_motion(of_past, newest, measured, model, attitude, torque_command, known)
+    then = _tick_of_forces(x)
+    x.reading[:] = of_past.reading[then]
+    r = len(x.lacking)
+    for i in range(r):
+        walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
+        x.covariance[r + i, r + i] += walk**2 * elapsed
+    if x.late != last.late:
+        _distrust_laws(x, known)
+        return 0.0
+    return of_past.duration[then] * of_past.known[then] if is_known else 0.0
+
+
+@njit(cache=True)
+def _distrust_laws(x: Record, known: Record) -> None:
+    """What was learned with forces of another time is as uncertain as at the start."""
+    P, r, (n, m) = x.covariance, len(x.velocity), x.weights.shape
+    for joint in range(n):
+        for k in range(m):
+            at = 2 * r + m * joint + k
+            P[at, :] = 0.0
+            P[:, at] = 0.0
+            P[at, at] = known.weight_variance[k]
 
 
 @njit(cache=True)
 def _predict(
-    posterior: Record,
-    elapsed: float,
-    measured: Record,
-    model: Record,
-    link_torque: Record,
-    attitude: Record,
-    torque_command: np.ndarray,
-    known: Record,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    posterior: Record, elapsed: float, measured: Record, link_torque: Record, known: Record
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The velocities at which the tick ends, (r,), with the law linearised where it was last.
 
     Returns:
-        Them and what `_equation_of_motion` returns.
+        Them and what `_pushed` returns.
     """
     x, known = posterior[()], known[()]
-    A, push, variance = _equation_of_motion(
-        measured[()], model[()], link_torque[()], attitude[()], torque_command, known
-    )
-    velocity, _ = _implicit_step(x, x.velocity, A, push, elapsed)
-    return velocity, A, push, variance
+    at = _tick_of_forces(x)
+    push, variance = _pushed(x.past, at, measured[()], link_torque[()], known)
+    velocity, _ = _implicit_step(x, x.velocity, x.past.inertia[at], push, elapsed)
+    return velocity, push, variance
 
 
 @njit(cache=True)
@@ -490,34 +535,50 @@ def _update(
     posterior: Record,
     last: Record,
     elapsed: float,
-    begun: Record,
+    begun: tuple[np.ndarray, np.ndarray],
     ahead: tuple[np.ndarray, np.ndarray],
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
     measured: Record,
-    model: Record,
     link_torque: Record,
     known: Record,
 ) -> None:
     """Covariance and measurements of a tick, the law linearised where it is expected to end.
 
     Args:
-        begun: what `_begin` has made.
+        begun: state and covariance that `_begin` has made.
         ahead: velocities of the joints (n,) and weights (n, m) where the law is linearised.
         motion: see `_predict`.
         phi, slopes, shaped: see `FrictionRegressor`.
     """
-    posterior[()] = begun[()]
     x, last, known = posterior[()], last[()], known[()]
-    _, A, push, variance = motion
+    _, push, variance = motion
+    inertia = x.past.inertia[_tick_of_forces(x)]
+    _put_state(x, begun[0])
+    x.covariance[:] = begun[1]
     _linearise(x, ahead[0], ahead[1], phi, slopes, shaped)
-    predicted, inverse = _implicit_step(x, x.velocity, A, push, elapsed)
+    predicted, inverse = _implicit_step(x, x.velocity, inertia, push, elapsed)
     x.velocity[:] = predicted
-    _propagate(x, A, inverse, variance, elapsed)
+    _propagate(x, inertia, inverse, variance, elapsed)
     _listen(x, last, predicted, elapsed, known)
-    _listen_to_feet(x, last, measured[()], model[()], link_torque[()], elapsed, known)
+    _listen_to_feet(x, last, measured[()], link_torque[()], elapsed, known)
+
+
+@njit(cache=True)
+def _begun(posterior: Record) -> tuple[np.ndarray, np.ndarray]:
+    """State and covariance, copies."""
+    return _state(posterior[()]), posterior[()].covariance.copy()
+
+
+@njit(cache=True)
+def _present_velocity(posterior: Record) -> np.ndarray:
+    """Of the joints, (n,) [rad/s]: of what was long ago nobody knows more than is measured."""
+    x = posterior[()]
+    if x.late == 0.0:
+        return x.velocity[3:].copy()
+    return x.past.reading[int(x.newest), 3:].copy()
 
 
 class WholeBodyFilter(RecursiveEstimator):
@@ -554,6 +615,14 @@ class WholeBodyFilter(RecursiveEstimator):
                                          at least 1
         foot_noise               (feet,) the same of standing feet's turning
         reading                  (r,)    what they read, free of the bias [rad/s]
+        late                     ()      how many ticks ago the forces were what is read now
+        past, newest             what is known of the latest ticks but for the forces, and which is
+                                 the newest of them: `duration` (room,) [s], `known` (room,),
+                                 `reading` (room, r), and of the equation of motion `inertia`
+                                 (room, r, r), `push` (room, r), its part `of_linear` (room, r, 3)
+                                 in the base's linear acceleration, the `lever` (room, feet, 6, r)
+                                 of the wrenches, and how soles turn without accelerations,
+                                 `turning` (room, feet) [rad/s^2]; see `room_for_delays`
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
                                          since then [Nm]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
@@ -581,12 +650,25 @@ class WholeBodyFilter(RecursiveEstimator):
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         per_row = ("velocity", "lacking", "innovation", "innovation_variance", "agreement")
         per_joint = ("friction", "friction_std", "doubt", "law_velocity", "friction_there", "slope")
+        room, feet = room_for_delays(clock), len(legs)
         posterior_type = record_type(
             time=(),
             status=(),
+            late=(),
+            newest=(),
+            past=record_type(
+                duration=(room,),
+                known=(room,),
+                reading=(room, r),
+                inertia=(room, r, r),
+                of_linear=(room, r, 3),
+                push=(room, r),
+                lever=(room, feet, 6, r),
+                turning=(room, feet),
+            ),
             **dict.fromkeys((*per_row, "noise", "reading"), (r,)),
             **dict.fromkeys(per_joint, (n,)),
-            foot_noise=(len(legs),),
+            foot_noise=(feet,),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
             covariance=(2 * r + n * m, 2 * r + n * m),
@@ -602,6 +684,7 @@ class WholeBodyFilter(RecursiveEstimator):
             is_flat=np.array([float(not leg.is_point) for leg in legs.values()]),
             has_pads=np.array([float(not leg.has_six_axes) for leg in legs.values()]),
             wrench_variance=np.array([wrench_variance(sensors, robot, side) for side in legs]),
+            weight_variance=self._weight_deviations() ** 2,
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -616,7 +699,7 @@ class WholeBodyFilter(RecursiveEstimator):
         feet = len(robot.description.legs)
         return {
             "measurements": measurements_type(robot),
-            "link_torque": record_type(wrench=(feet, 6), force_noise=(feet,)),
+            "link_torque": record_type(wrench=(feet, 6), force_noise=(feet,), late=()),
             "model_over_step": model_type(robot),
             "attitude": record_type(acceleration_bias=(3,), angular_velocity_bias=(3,)),
         }
@@ -629,35 +712,43 @@ class WholeBodyFilter(RecursiveEstimator):
         torque_command = self._torque_command.Eval(context)
         if math.isnan(elapsed):
             last, elapsed = self._start(), 0.0
-        if _begin(posterior, last, elapsed, measured, model, attitude, torque_command, known):
-            link = self._link.Eval(context)
-            motion = _predict(
-                posterior, elapsed, measured, model, link, attitude, torque_command, known
-            )
+        link = self._link.Eval(context)
+        duration = _begin(
+            posterior, last, elapsed, measured, model, link, attitude, torque_command, known
+        )
+        if duration > 0.0:
+            motion = _predict(posterior, duration, measured, link, known)
             # Where the law is steep, velocity and law have to fit each other to be learned.
-            begun, ahead = posterior.copy(), (motion[0][3:], posterior["weights"])
+            begun = _begun(posterior)
+            ahead = motion[0][3:], posterior["weights"].copy()
             for _ in range(_ITERATIONS):
                 phi, slopes = self._regressor(ahead[0])
                 _update(
-                    posterior, last, elapsed, begun, ahead, motion, phi, slopes, shaped,
-                    measured, model, link, known,
+                    posterior, last, duration, begun, ahead, motion, phi, slopes, shaped,
+                    measured, link, known,
                 )  # fmt: skip
                 ahead = posterior["velocity"][3:].copy(), posterior["weights"].copy()
         else:
             _forget_motion(posterior, known)
-        phi, slopes = self._regressor(posterior["velocity"][3:])
-        _conclude(posterior, last, elapsed, phi, slopes, shaped)
+        velocity = _present_velocity(posterior)
+        phi, slopes = self._regressor(velocity)
+        _conclude(posterior, last, elapsed, velocity, phi, slopes, shaped, known)
 
     def _start(self) -> np.ndarray:
         """What is known before the first tick."""
         config, regressor, start = self._config, self._regressor, np.zeros((), self.posterior_type)
-        n, m = start["weights"].shape
+        n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"], start["noise"] = start["weights"], 1.0
         start["foot_noise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
-        weights = np.full(m, config.shape_uncertainty)
-        weights[: regressor.parameters] = config.parameter_uncertainty
-        deviations = np.concatenate([np.zeros(3 + n), lacking, np.tile(weights, n)])
+        weights = np.tile(self._weight_deviations(), n)
+        deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
         start["covariance"] = np.diag(deviations**2)
         return start
+
+    def _weight_deviations(self) -> np.ndarray:
+        """Initial standard deviation of the weights of a law, (m,)."""
+        weights = np.full(self._regressor.weights, self._config.shape_uncertainty)
+        weights[: self._regressor.parameters] = self._config.parameter_uncertainty
+        return weights
