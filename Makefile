@@ -14,7 +14,7 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-.PHONY: walk test minimum docs lint kernels format bench fuzz fbse rivals hidden clean
+.PHONY: walk test minimum docs lint kernels kernels-biped kernels-others format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
@@ -37,12 +37,15 @@ lint: $(INSTALLED)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-# Compiles the estimators of two legs, by both methods, of four and of an arm, which many tests need,
-# once for all workers, which grow by it; in one process, for they share much.
-kernels: $(INSTALLED)
+# Compiles estimators that many tests need, once for all workers, which grow by it: those of two legs,
+# and those of four, of an arm and of the whole body, side by side.
+kernels: kernels-biped kernels-others
+
+kernels-biped: WALKS = ('paper_walk_fbse', None), ('paper_walk_fbse', 'paper_method')
+kernels-others: WALKS = ('quadruped_trot', None), ('bsc_arm', None), ('paper_walk_fbse', None, 'estimator.friction=!WholeBody {}')
+kernels-biped kernels-others: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
-		[simulate(load(*walk, overrides=['duration=0.01'])) for walk in (['paper_walk_fbse'], \
-		['paper_walk_fbse', 'paper_method'], ['quadruped_trot'], ['bsc_arm'])]"
+		[simulate(load(file, name, ['duration=0.01', *changes])) for file, name, *changes in ($(WALKS))]"
 
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .

@@ -15,10 +15,14 @@ from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
+# A file that takes long and starts last would keep a single worker busy.
+_FIRST = ("test_notebooks", "test_physics", "test_whole_body", "test_report_browser")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Notebooks come first: one that starts last would keep a single worker busy."""
-    items.sort(key=lambda item: item.path.stem != "test_notebooks")
+    """Files that take longest come first."""
+    places = {name: place for place, name in enumerate(_FIRST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 def pytest_collection_finish() -> None:
@@ -29,12 +33,15 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """What a test has freed is not kept for the next one, where the C library can give it back;
-    nor what a file's tests have left in circles."""
+    """What functions of a file remember for its tests, and what these leave in circles, is not
+    kept for the next file, nor by the C library where it can give it back."""
     if nextitem is None or nextitem.path != item.path:
+        for function in vars(item.getparent(pytest.Module).obj).values():
+            if hasattr(function, "cache_clear") and function.__module__ == item.path.stem:
+                function.cache_clear()
         gc.collect()
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
-        trim(0)
+        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+            trim(0)
 
 
 @pytest.fixture(scope="module")

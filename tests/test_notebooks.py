@@ -3,12 +3,13 @@ stored in them is fit to be read."""
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import nbformat
 import pytest
 from ipykernel.kernelspec import get_kernel_dict
-from jupyter_client import AsyncKernelManager
+from jupyter_client import KernelManager
 from jupyter_client.kernelspec import KernelSpec
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
@@ -18,7 +19,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
-class ThisInterpretersKernel(AsyncKernelManager):
+class ThisInterpretersKernel(KernelManager):
     """Starts kernels with the interpreter that runs the tests, whatever else the machine calls
     python3."""
 
@@ -27,21 +28,27 @@ class ThisInterpretersKernel(AsyncKernelManager):
         return KernelSpec(**get_kernel_dict())
 
 
-def run(notebook: nbformat.NotebookNode, folder: Path, settings: Path) -> None:
-    """Runs all cells in `folder`; fails with the error of the first cell that raises.
-
-    Args:
-        settings: an empty folder instead of the user's own IPython settings.
-    """
-    client = NotebookClient(
-        notebook,
-        timeout=1200,
-        kernel_name="python3",
-        kernel_manager_class=ThisInterpretersKernel,
-        resources={"metadata": {"path": str(folder)}},
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
+    """One kernel for all, for it takes seconds to import what a notebook needs; with an empty
+    folder instead of the user's own IPython settings."""
+    settings = str(tmp_path_factory.mktemp("ipython"))
+    manager = ThisInterpretersKernel()
+    manager.start_kernel(
+        extra_arguments=["--HistoryManager.hist_file=:memory:"],
+        env={**os.environ, "MPLBACKEND": "Agg", "IPYTHONDIR": settings},
     )
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
+def run(notebook: nbformat.NotebookNode, folder: Path, kernel: KernelManager) -> None:
+    """Runs all cells in `folder`, without what ran in the kernel before; fails with the error of
+    the first cell that raises."""
+    forget = nbformat.v4.new_code_cell(f"%reset_selective -f ^[^_]\n%cd -q {folder}")
     try:
-        client.execute(env={**os.environ, "MPLBACKEND": "Agg", "IPYTHONDIR": str(settings)})
+        NotebookClient(nbformat.v4.new_notebook(cells=[forget]), km=kernel).execute()
+        NotebookClient(notebook, km=kernel, timeout=1200).execute()
     except CellExecutionError as error:
         pytest.fail(str(error), pytrace=False)
 
@@ -71,14 +78,14 @@ def test_there_are_notebooks():
 
 
 @each_notebook
-def test_runs(path, tmp_path):
+def test_runs(path, kernel):
     notebook = nbformat.read(path, as_version=4)
     needs = notebook.metadata.get("fbse", {})
     if needs.get("needs_data") and not os.environ.get("FBSE_DATA_DIR"):
         pytest.skip("FBSE_DATA_DIR does not name the folder of the recordings that it shows")
     for module in needs.get("needs_modules", []):
         pytest.importorskip(module)
-    run(shortened(notebook), path.parent, tmp_path)
+    run(shortened(notebook), path.parent, kernel)
     assert errors(notebook) == []
 
 
@@ -94,15 +101,21 @@ def test_stored_content(path):
     assert path.stat().st_size < 1.5e6
 
 
-def test_kernel_is_this_interpreter(tmp_path):
+def test_kernel_is_this_interpreter(tmp_path, kernel):
     source = "import os, sys\nprint(sys.prefix, os.getcwd(), sep='\\n')"
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
-    run(notebook, tmp_path, tmp_path)
+    run(notebook, tmp_path, kernel)
     assert notebook.cells[0].outputs[0].text.splitlines() == [sys.prefix, str(tmp_path.resolve())]
 
 
-def test_error_of_a_cell_is_reported(tmp_path):
+def test_error_of_a_cell_is_reported(tmp_path, kernel):
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
     with pytest.raises(pytest.fail.Exception, match="ZeroDivisionError"):
-        run(notebook, tmp_path, tmp_path)
+        run(notebook, tmp_path, kernel)
     assert errors(notebook) == ["ZeroDivisionError: division by zero"]
+
+
+def test_a_notebook_knows_nothing_of_the_one_before(tmp_path, kernel):
+    for source in ("left_over = 1", "assert 'left_over' not in globals()"):
+        cell = nbformat.v4.new_code_cell(source)
+        run(nbformat.v4.new_notebook(cells=[cell]), tmp_path, kernel)
