@@ -37,7 +37,7 @@ from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.log import Log
-from fbse_drake.robot.body_tree import dynamics_of
+from fbse_drake.robot.dynamics import PlantDynamics
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
@@ -336,7 +336,7 @@ class EquationOfMotion:
     def __init__(self, robot: Robot):
         self.robot, plant = robot, robot.plant
         self._context = plant.CreateDefaultContext()
-        self.dynamics = dynamics_of(plant)
+        self.dynamics = PlantDynamics(plant)
         self.pads = FootPads(robot)
         self.weight = plant.CalcTotalMass(self._context) * float(
             np.linalg.norm(plant.gravity_field().gravity_vector())

@@ -1,0 +1,66 @@
+"""Kinematics and inverse dynamics of a plant at many instants, by Drake."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
+
+
+class PlantDynamics:
+    """What the equation of motion of a plant takes, at M instants."""
+
+    def __init__(self, plant: MultibodyPlant):
+        """Takes a finalized plant, with its default parameters."""
+        self._plant, self._context = plant, plant.CreateDefaultContext()
+
+    def inverse_dynamics(
+        self, states: np.ndarray, accelerations: np.ndarray, *, forces: bool
+    ) -> np.ndarray:
+        """Generalized forces that a motion needs, (M, velocities).
+
+        Args:
+            states: positions and velocities of the plant, (M, positions + velocities).
+            accelerations: (M, velocities).
+            forces: is there what its gravity, springs and dampers give?
+        """
+        plant, context, given = self._plant, self._context, MultibodyForces(self._plant)
+        result = np.empty(accelerations.shape)
+        for k, (state, acceleration) in enumerate(zip(states, accelerations, strict=True)):
+            plant.SetPositionsAndVelocities(context, state)
+            if forces:
+                plant.CalcForceElementsContribution(context, given)
+            result[k] = plant.CalcInverseDynamics(context, acceleration, given)
+        return result
+
+    def jacobians(self, frames: Sequence[Frame], positions: np.ndarray) -> np.ndarray:
+        """Jacobian of the spatial velocity [angular, linear] of some frames of the plant in the
+        world, in their own axes, (frames, M, 6, velocities)."""
+        plant, context, world = self._plant, self._context, self._plant.world_frame()
+        result = np.empty((len(frames), len(positions), 6, plant.num_velocities()))
+        for k, position in enumerate(positions):
+            plant.SetPositions(context, position)
+            for f, frame in enumerate(frames):
+                result[f, k] = plant.CalcJacobianSpatialVelocity(
+                    context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
+                )
+        return result
+
+    def bias_accelerations(
+        self, frames: Sequence[Frame], states: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Spatial acceleration [angular, linear] of some frames S in the world W without any
+        accelerations of joints, in their own axes, (frames, M, 6), and their orientation R_WS,
+        (frames, M, 3, 3)."""
+        plant, context, world = self._plant, self._context, self._plant.world_frame()
+        result = np.empty((len(frames), len(states), 6))
+        rotations = np.empty((len(frames), len(states), 3, 3))
+        for k, state in enumerate(states):
+            plant.SetPositionsAndVelocities(context, state)
+            for f, frame in enumerate(frames):
+                bias = plant.CalcBiasSpatialAcceleration(
+                    context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
+                )
+                result[f, k] = bias.get_coeffs()
+                rotations[f, k] = frame.CalcRotationMatrixInWorld(context).matrix()
+        return result, rotations
