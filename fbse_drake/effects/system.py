@@ -166,7 +166,9 @@ def _calc_steady(
     solver = _Solver(damping, clamp_slope, clamp_limit, clamp, velocity_index)
     n = len(joint_state) // 2
     parts = _parts(tick, n, velocities)
-    parts.memory[_ROWS : _ROWS + len(offset)] = offset
+    for row in range(len(offset)):
+        for j in range(n):
+            parts.memory[_ROWS + row, j] = offset[row, j]
     expected = _begin(parts, _parts(last, n, velocities), joint_state)
     _finish(parts, expected, look_up(table, expected), offset, solver)
     if is_solved:

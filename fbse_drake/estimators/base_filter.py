@@ -224,7 +224,9 @@ def _propagate(P: np.ndarray, x: np.ndarray, gravity: Vector, T: float) -> None:
             if x.foot_standing[foot] > 0:
                 of_foot = matrix_product(skew(vector(x.foot_position[foot])), TR)
                 _add_product(M, _FEET + 6 * foot, of_foot, P, _GYRO_BIAS)
-        P[:] = M.T
+        for i in range(len(P)):
+            for j in range(len(P)):
+                P[i, j] = M[j, i]
 
 
 @njit(cache=True)
@@ -499,9 +501,13 @@ def _land(
     x.foot_agreement[foot] = 0.0
     for part, source in ((0, _POSITION), (3, _ATTITUDE)):
         start = _FEET + 6 * foot + part
-        P[start : start + 3] = P[source : source + 3]
-        P[:, start : start + 3] = P[:, source : source + 3]
-        correction[start : start + 3] = correction[source : source + 3]
+        for i in range(3):
+            correction[start + i] = correction[source + i]
+            for j in range(len(P)):
+                P[start + i, j] = P[source + i, j]
+        for j in range(len(P)):
+            for i in range(3):
+                P[j, start + i] = P[j, source + i]
 
 
 @njit(cache=True)
@@ -728,7 +734,8 @@ def _listen_to_forces(
         P, correction, z, _ACCELEROMETER_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise,
         math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation, explained,
     )  # fmt: skip
-    x.force_innovation_variance[:] = once + explained[0] + explained[1]
+    for i in range(3):
+        x.force_innovation_variance[i] = once[i] + explained[0, i] + explained[1, i]
     # What lasts shows in the mean over that time, once there is one.
     x.force_age += elapsed
     if x.force_age < config.force_time:
@@ -949,7 +956,7 @@ def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray
     x.leashed_for = 0.0 if first else x.leashed_for + elapsed
     if first or x.leashed_for > _LEASH_TIME:
         x.leashed_for = 0.0
-        leash[0] = leash[1]
+        _copy_rows(leash[0], leash[1])
         for i in range(3):
             leash[1, 0, i], leash[1, 1, i] = x.gyro_bias_B[i], x.accelerometer_bias_B[i]
             for sensor in range(2):
@@ -958,7 +965,7 @@ def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray
                 least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
                 leash[1, 2 + sensor, i] = P[at, at] + least**2
         if first:
-            leash[0] = leash[1]
+            _copy_rows(leash[0], leash[1])
     for sensor in range(2):
         bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
         for i in range(3):
@@ -982,15 +989,30 @@ def _set_bias(x: np.ndarray, sensor: int, axis: int, value: float) -> None:
 
 
 @njit(cache=True)
+def _copy_rows(to: np.ndarray, source: np.ndarray) -> None:
+    """Fills a matrix. (numba takes ten times as long to compile `to[:] = source`.)"""
+    for i in range(to.shape[0]):
+        for j in range(to.shape[1]):
+            to[i, j] = source[i, j]
+
+
+@njit(cache=True)
+def _put_biases(to: np.ndarray, x: np.ndarray) -> None:
+    """Fills (2, 3) with the biases of gyro and accelerometer in base axes."""
+    put(to[0], vector(x.gyro_bias_B))
+    put(to[1], vector(x.accelerometer_bias_B))
+
+
+@njit(cache=True)
 def _remember_biases(x: np.ndarray, is_doubtful: bool, first: bool, elapsed: float) -> None:
     """While sensors are doubtful the IMU's biases are those from before they began to fail."""
     kept = x.kept_biases
     if first:
-        for age in range(2):
-            kept[age, 0], kept[age, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+        _put_biases(kept[0], x)
+        _put_biases(kept[1], x)
         x.kept_for = 0.0
     elif is_doubtful:
-        kept[1] = kept[0]
+        _copy_rows(kept[1], kept[0])
         for sensor in range(2):
             for axis in range(3):
                 _set_bias(x, sensor, axis, kept[0, sensor, axis])
@@ -998,8 +1020,8 @@ def _remember_biases(x: np.ndarray, is_doubtful: bool, first: bool, elapsed: flo
     else:
         x.kept_for += elapsed
         if x.kept_for > _MEMORY:
-            kept[0] = kept[1]
-            kept[1, 0], kept[1, 1] = x.gyro_bias_B, x.accelerometer_bias_B
+            _copy_rows(kept[0], kept[1])
+            _put_biases(kept[1], x)
             x.kept_for = 0.0
 
 

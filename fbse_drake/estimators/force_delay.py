@@ -181,23 +181,35 @@ def watch_force_delay(
     # Of the smoothed readings so many are as good as one.
     alike = 1.0 + 2.0 * _SMOOTHING / period
     likelihood, now = x.likelihood[:, :delays], round(x.delay / period)
+    doubled = 2.0 * variance * alike
     for way in range(2):
-        likelihood[way] -= off[way] / (2.0 * variance * alike)
-        likelihood[way] = np.maximum(_LEAST_LIKELY, likelihood[way] - likelihood[way].max())
-    best = np.argmax(likelihood[0] + likelihood[1])
+        largest = -math.inf
+        for late in range(delays):
+            likelihood[way, late] -= off[way, late] / doubled
+            largest = max(largest, likelihood[way, late])
+        for late in range(delays):
+            likelihood[way, late] = max(_LEAST_LIKELY, likelihood[way, late] - largest)
+    best = 0
+    for late in range(1, delays):
+        if likelihood[0, late] + likelihood[1, late] > likelihood[0, best] + likelihood[1, best]:
+            best = late
     # Noise that begins reaches the delays one after the other, in the one way in the opposite order
     # as in the other.
-    is_likelier = (likelihood[:, best] > likelihood[:, now]).all()
-    usual = _usual_delay(x.usual[:delays], mismatch / (2.0 * variance * alike), elapsed, now)
+    is_likelier = likelihood[0, best] > likelihood[0, now]
+    is_likelier = is_likelier and likelihood[1, best] > likelihood[1, now]
+    usual = _usual_delay(x.usual[:delays], mismatch, doubled, elapsed, now)
     if is_likelier and mismatch[best] < (1.0 - _EXPLAINED) * push_square:
         # At the longest delay the true one may be longer, and nobody knows it.
         x.delay = best * period if best < last else 0.0
         if usual >= 0 and abs(best - usual) > 1:
             _begin_with(likelihood, best)
     elif usual >= 0 and abs(now - usual) > 1:
-        lead = likelihood[:, now] - likelihood[:, usual]
-        likelihood[:, usual] += (1.0 - math.exp(-elapsed / _FORGOTTEN)) * lead
-        if lead.max() < _NOTHING_LEFT:
+        longest_lead = -math.inf
+        for way in range(2):
+            lead = likelihood[way, now] - likelihood[way, usual]
+            likelihood[way, usual] += (1.0 - math.exp(-elapsed / _FORGOTTEN)) * lead
+            longest_lead = max(longest_lead, lead)
+        if longest_lead < _NOTHING_LEFT:
             x.delay = usual * period
             _begin_with(likelihood, usual)
 
@@ -210,17 +222,20 @@ def _begin_with(likelihood: np.ndarray, delay: int) -> None:
 
 
 @njit(cache=True)
-def _usual_delay(shown: np.ndarray, unlikely: np.ndarray, elapsed: float, now: int) -> int:
+def _usual_delay(
+    shown: np.ndarray, mismatch: np.ndarray, doubled: float, elapsed: float, now: int
+) -> int:
     """The delay that has shown for the longest time, -1 if none has.
 
     Args:
         shown: for how long each has [s]; filled.
-        unlikely: of each delay by what is counted, minus the logarithm of its likelihood.
+        mismatch, doubled: what each delay does not explain, and twice the variance that it has by
+            noise: by what is counted, their ratio is minus the logarithm of its likelihood.
     """
-    shown *= math.exp(-elapsed / _USUAL_TIME)
-    shows = True
-    for other in range(len(unlikely)):
-        if abs(other - now) > 1 and unlikely[other] - unlikely[now] < _SHOWN:
+    keep, shows = math.exp(-elapsed / _USUAL_TIME), True
+    for other in range(len(mismatch)):
+        shown[other] *= keep
+        if abs(other - now) > 1 and mismatch[other] / doubled - mismatch[now] / doubled < _SHOWN:
             shows = False
     if shows:
         shown[now] += elapsed

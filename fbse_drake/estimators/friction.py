@@ -463,9 +463,6 @@ def _estimate_friction(
     # Of the weights and of the disturbance, whose regressor is one.
     regressor, rise, x, column = np.ones(m + 1), np.zeros(m + 1), np.empty(m + 1), np.empty(size)
     posterior.status = measured.trust.max()
-    posterior.covariance[:] = last.covariance
-    posterior.past_velocity[0] = posterior.velocity
-    posterior.past_velocity[1:] = last.past_velocity[:-1]
     keep, keep_doubt = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
     count, learning = (1.0 + keep) / (1.0 - keep), 1.0 - math.exp(-elapsed / NOISE_TIME)
     # Of the tick that was measured.
@@ -473,8 +470,12 @@ def _estimate_friction(
     for joint in range(n):
         stands = support[known.joint_leg[joint]] > 0
         valid = link.valid[joint] > 0 and (known.measures_swing or stands)
-        x[:m] = last.weights[joint]
+        for k in range(m):
+            x[k] = last.weights[joint, k]
         x[m] = last.disturbance[joint]
+        posterior.past_velocity[0, joint] = posterior.velocity[joint]
+        for age in range(1, len(last.past_velocity)):
+            posterior.past_velocity[age, joint] = last.past_velocity[age - 1, joint]
         # By how much the friction rises with the velocity.
         put_regressor(rise, slopes, shaped, joint, n)
         put_regressor(regressor, phi, shaped, joint, n)
@@ -483,6 +484,9 @@ def _estimate_friction(
             slope += x[k] * rise[k]
         slope = max(0.0, seen * slope)
         P, noise = posterior.covariance[joint], last.noise[joint]
+        for i in range(size):
+            for k in range(size):
+                P[i, k] = last.covariance[joint, i, k]
         impulse_uncertainty = P[0, 0]
         # Prediction: the impulse error grows by the friction's error times the tick ...
         innovation = last.impulse[joint] + T * link.residual[joint]
@@ -509,7 +513,8 @@ def _estimate_friction(
             P[i, i] += config.parameter_walk**2 * elapsed
         P[0, size - 1] = P[size - 1, 0]
         # Update.
-        column[:] = P[:, 0]
+        for i in range(size):
+            column[i] = P[i, 0]
         shared = through_model * through_link * velocity_variance
         column[0] += shared
         S = column[0] + shared + noise * link.impulse_variance[joint]
@@ -550,8 +555,8 @@ def _estimate_friction(
             # A joint that is not measured is left to its model.
             P[size - 1, size - 1] += x[m] ** 2
             x[m] = impulse = posterior.agreement[joint] = 0.0
-            P[0, :] = 0.0
-            P[:, 0] = 0.0
+            for i in range(size):
+                P[0, i] = P[i, 0] = 0.0
         if link.late > 0:
             # What was measured is of some ticks ago, the estimate of now.
             put_regressor(regressor, phi_now, shaped, joint, n)

@@ -96,7 +96,11 @@ def fuse(
     """
     c, v = J.shape
     gain, S, innovation, x = np.empty((c, v)), np.zeros((c, c)), y.copy(), measured.copy()
-    J_T = np.ascontiguousarray(J.T)
+    J_T, innovation_variance, sensitivity = np.empty((v, c)), np.empty(c), np.zeros((v, v))
+    for k in range(v):
+        sensitivity[k, k] = 1.0
+        for i in range(c):
+            J_T[k, i] = J[i, k]
     for i in range(c):
         for k in range(v):
             gain[i, k] = J[i, k] * variance[k]
@@ -104,9 +108,8 @@ def fuse(
             for j in range(i + 1):
                 S[i, j] += gain[i, k] * J_T[k, j]
         S[i, i] += constraint_variance[i]
-    innovation_variance = np.diag(S).copy()
+        innovation_variance[i] = S[i, i]
     solve_positive_definite(S, gain)  # the gain's transpose
-    sensitivity = np.eye(v)
     for i in range(c):
         for k in range(v):
             x[k] += gain[i, k] * innovation[i]
@@ -177,14 +180,14 @@ def no_slip_condition(
     row = 0
     for foot in range(len(stands)):
         if stands[foot]:
-            first = still_from[foot]
-            end = row + 6 - first
-            J[row:end] = model.foot_jacobian[foot, first:]
-            y[row:end] = -model.foot_bias[foot, first:]
             gravity_F = rotate_back(rotation(model.foot_rotation[foot]), gravity_B)
-            for i in range(3):
-                y[end - 3 + i] -= gravity_F[i]
-            row = end
+            for i in range(still_from[foot], 6):
+                for j in range(J.shape[1]):
+                    J[row, j] = model.foot_jacobian[foot, i, j]
+                y[row] = -model.foot_bias[foot, i]
+                if i >= 3:
+                    y[row] -= gravity_F[i - 3]
+                row += 1
     return J, y
 
 
@@ -305,11 +308,15 @@ def _fuse_accelerations(
     J, y = no_slip_condition(model, attitude, stands, known.still_from, known.gravity)
     foot_variance = _foot_variance(posterior, last, raw, J, y, stands, elapsed, known)
     fused, sensitivity, innovation, innovation_variance = fuse(raw, variance, J, y, foot_variance)
-    posterior.base_angular_acceleration[:] = fused[:3]
-    posterior.base_specific_force[:] = fused[3:6]
-    posterior.joint_acceleration[:] = fused[6:]
-    posterior.known[:] = 1.0
-    posterior.sensitivity[:] = sensitivity
+    for i in range(3):
+        posterior.base_angular_acceleration[i] = fused[i]
+        posterior.base_specific_force[i] = fused[3 + i]
+    for i in range(len(posterior.known)):
+        posterior.joint_acceleration[i] = fused[6 + i]
+        posterior.known[i] = 1.0
+    for i in range(len(fused)):
+        for j in range(len(fused)):
+            posterior.sensitivity[i, j] = sensitivity[i, j]
     row = 0
     for foot in range(len(stands)):
         if stands[foot]:

@@ -55,16 +55,18 @@ def _watch_forces(
     It shows in second differences, to which forces that change smoothly add little; one tick does
     not tell much, for a foot may just have landed.
     """
-    posterior.wrench[:] = wrench
-    posterior.wrench_change[:] = wrench - last.wrench
     for foot in range(len(wrench)):
+        for i in range(6):
+            posterior.wrench[foot, i] = wrench[foot, i]
+            posterior.wrench_change[foot, i] = wrench[foot, i] - last.wrench[foot, i]
         excess = last.force_noise[foot]
         if math.isnan(elapsed) or not known.learns_noise or excess == 0.0:
             posterior.force_noise[foot] = 1.0
             continue
-        share, variance = 0.0, known.wrench_variance[foot]
-        # A point foot has no moment.
-        measured = (variance > 0.0).sum()
+        variance, measured = known.wrench_variance[foot], 0
+        for i in range(6):  # A point foot has no moment.
+            measured += variance[i] > 0.0
+        share = 0.0
         for i in range(6):
             if variance[i] > 0.0:
                 bend = posterior.wrench_change[foot, i] - last.wrench_change[foot, i]
@@ -130,14 +132,19 @@ def _estimate_link_torque(
     v = 6 + n
     posterior.status = trust.max()
     a, to_sensors = np.empty(v), np.empty(v)
-    a[:3], a[3:6] = acceleration.base_angular_acceleration, acceleration.base_specific_force
-    a[6:] = acceleration.joint_acceleration
+    for i in range(3):
+        a[i] = acceleration.base_angular_acceleration[i]
+        a[3 + i] = acceleration.base_specific_force[i]
+    for i in range(n):
+        a[6 + i] = acceleration.joint_acceleration[i]
     # What is known now, forces apart, belongs to the forces that are read so much later.
     now, moved = posterior.now, known.moved
-    now.duration, now.torque_command[:] = elapsed, torque_command
-    for lever in range(len(moved)):
-        now.lever[lever] = model.foot_jacobian[moved[lever, 1], :, 6 + moved[lever, 0]]
+    now.duration = elapsed
+    for at in range(len(moved)):
+        for k in range(6):
+            now.lever[at, k] = model.foot_jacobian[moved[at, 1], k, 6 + moved[at, 0]]
     for i in range(n):
+        now.torque_command[i] = torque_command[i]
         # Inertia and bias forces, (35) without the wrenches; and what the sensors' noise makes of
         # them.
         inertial_torque = model.bias[i]
@@ -163,8 +170,11 @@ def _estimate_link_torque(
     late = tick_of(elapsed, past, delay)
     then = past[-late] if late > 0 else now
     posterior.late, posterior.duration = late, then.duration
-    posterior.link_torque[:] = then.inertial_torque
-    posterior.torque_variance[:] = then.torque_variance
+    for i in range(n):
+        posterior.link_torque[i] = then.inertial_torque[i]
+        posterior.torque_variance[i] = then.torque_variance[i]
+        posterior.impulse_variance[i] = then.impulse_variance[i]
+        posterior.own_inertia[i] = then.own_inertia[i]
     for foot in range(feet):
         variance = posterior.force_noise[foot] * known.wrench_variance[foot]
         if not is_loaded(wrench[foot], variance):
@@ -176,8 +186,6 @@ def _estimate_link_torque(
                     lever = then.lever[at, k]
                     posterior.link_torque[i] -= wrench[foot, k] * lever
                     posterior.torque_variance[i] += variance[k] * lever * lever
-    posterior.impulse_variance[:] = then.impulse_variance
-    posterior.own_inertia[:] = then.own_inertia
     for i in range(n):
         posterior.residual[i] = then.torque_command[i] - posterior.link_torque[i]
         is_trusted = trust[2 + known.joint_leg[i]] == 0

@@ -121,7 +121,8 @@ def quantize(angle: np.ndarray, resolution: float) -> np.ndarray:
 @njit(cache=True)
 def _read(measured: np.ndarray, joint_state: np.ndarray, resolution: float) -> None:
     """Fills what is measured, with whole counts of the angles."""
-    measured[:] = joint_state
+    for j in range(len(measured)):
+        measured[j] = joint_state[j]
     if resolution > 0:
         for j in range(len(measured) // 2):
             measured[j] = resolution * np.rint(measured[j] / resolution)
