@@ -22,7 +22,7 @@ from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
 from fbse_drake.estimators.link_torque import wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
     cross,
@@ -321,11 +321,19 @@ def _put_state(x: Record, state: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def _listen(x: Record, last: Record, predicted: np.ndarray, elapsed: float, known: Record) -> None:
+def _listen(
+    x: Record,
+    last: Record,
+    predicted: np.ndarray,
+    missed: np.ndarray,
+    elapsed: float,
+    known: Record,
+) -> None:
     """Kalman updates with gyro and encoders, one after the other.
 
     Args:
         predicted: velocities (r,) before the updates.
+        missed: what is added to their variances, as pushes between rare readings are missed, (r,).
     """
     P, r, state = x.covariance, len(x.velocity), _state(x)
     size, column = len(P), np.empty(len(P))
@@ -334,7 +342,8 @@ def _listen(x: Record, last: Record, predicted: np.ndarray, elapsed: float, know
     for i in range(r):
         # How noisy a sensor is shows in its steps, whatever the model is wrong by.
         step = x.reading[i] - last.reading[i] - (predicted[i] - last.velocity[i])
-        share = step * step / (2.0 * last.noise[i] * known.variance[i])
+        believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
+        share = step * step / believed
         x.noise[i] = learned_noise(last.noise[i], share, LOG_OF_ONE, elapsed)
         innovation, variance = x.reading[i] - state[i], x.noise[i] * known.variance[i]
         S = P[i, i] + variance
@@ -516,18 +525,27 @@ def _distrust_laws(x: Record, known: Record) -> None:
 
 @njit(cache=True)
 def _predict(
-    posterior: Record, elapsed: float, measured: Record, link_torque: Record, known: Record
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    posterior: Record,
+    last: Record,
+    elapsed: float,
+    measured: Record,
+    link_torque: Record,
+    known: Record,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The velocities at which the tick ends, (r,), with the law linearised where it was last.
 
     Returns:
-        Them and what `_pushed` returns.
+        Them, what `_pushed` returns, and the variance (r,) of what pushed between the readings,
+        independent in each row.
     """
-    x, known = posterior[()], known[()]
+    x, last, known = posterior[()], last[()], known[()]
     at = _tick_of_forces(x)
     push, variance = _pushed(x.past, at, measured[()], link_torque[()], known)
     velocity, _ = _implicit_step(x, x.velocity, x.past.inertia[at], push, elapsed)
-    return velocity, push, variance
+    # What rare readings leave out is as large as they differ.
+    missed = (start_share(elapsed, known.reading) * (push - last.pushed)) ** 2
+    x.pushed[:] = push
+    return velocity, push, variance, missed
 
 
 @njit(cache=True)
@@ -537,7 +555,7 @@ def _update(
     elapsed: float,
     begun: tuple[np.ndarray, np.ndarray],
     ahead: tuple[np.ndarray, np.ndarray],
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     phi: tuple[np.ndarray, ...],
     slopes: tuple[np.ndarray, ...],
     shaped: np.ndarray,
@@ -554,15 +572,16 @@ def _update(
         phi, slopes, shaped: see `FrictionRegressor`.
     """
     x, last, known = posterior[()], last[()], known[()]
-    _, push, variance = motion
+    _, push, variance, missed = motion
     inertia = x.past.inertia[_tick_of_forces(x)]
     _put_state(x, begun[0])
     x.covariance[:] = begun[1]
     _linearise(x, ahead[0], ahead[1], phi, slopes, shaped)
     predicted, inverse = _implicit_step(x, x.velocity, inertia, push, elapsed)
     x.velocity[:] = predicted
-    _propagate(x, inertia, inverse, variance, elapsed)
-    _listen(x, last, predicted, elapsed, known)
+    _propagate(x, inertia, inverse, variance + np.diag(missed), elapsed)
+    of_velocity = elapsed * elapsed * (inverse**2 @ missed)
+    _listen(x, last, predicted, of_velocity, elapsed, known)
     _listen_to_feet(x, last, measured[()], link_torque[()], elapsed, known)
 
 
@@ -611,6 +630,7 @@ class WholeBodyFilter(RecursiveEstimator):
         covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
         innovation, innovation_variance, agreement   (r,)  of gyro and encoders [rad/s]; the last
                                          is the innovation's running mean
+        pushed                   (r,)    commands, feet and all that is not friction [Nm]
         noise                    (r,)    by how much the variance of these is larger than believed,
                                          at least 1
         foot_noise               (feet,) the same of standing feet's turning
@@ -666,7 +686,7 @@ class WholeBodyFilter(RecursiveEstimator):
                 lever=(room, feet, 6, r),
                 turning=(room, feet),
             ),
-            **dict.fromkeys((*per_row, "noise", "reading"), (r,)),
+            **dict.fromkeys((*per_row, "noise", "reading", "pushed"), (r,)),
             **dict.fromkeys(per_joint, (n,)),
             foot_noise=(feet,),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
@@ -679,6 +699,7 @@ class WholeBodyFilter(RecursiveEstimator):
         self._known = record(
             config=config,
             sensors=sensors,
+            reading=clock.reading,
             mount=record(**vars(ImuMount(robot))),
             pads=record(position=pads.position, foot=pads.foot),
             is_flat=np.array([float(not leg.is_point) for leg in legs.values()]),
@@ -717,7 +738,7 @@ class WholeBodyFilter(RecursiveEstimator):
             posterior, last, elapsed, measured, model, link, attitude, torque_command, known
         )
         if duration > 0.0:
-            motion = _predict(posterior, duration, measured, link, known)
+            motion = _predict(posterior, last, duration, measured, link, known)
             # Where the law is steep, velocity and law have to fit each other to be learned.
             begun = _begun(posterior)
             ahead = motion[0][3:], posterior["weights"].copy()
