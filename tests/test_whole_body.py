@@ -201,6 +201,15 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         np.testing.assert_allclose(error, 0.0, atol=5e-3)
         last = posterior
 
+    # The friction is not known better than model and measurement agree.
+    jumped = velocity + np.where(np.arange(15) == 10, 1.0, 0.0)
+    posterior = tick(velocity, jumped, force)
+    innovation = posterior["innovation"][10]
+    assert innovation**2 > 25 * posterior["innovation_variance"][10]
+    apart = A[10, 10] * abs(innovation) / T
+    assert posterior["friction_std"][7] > 0.999 * apart
+    assert tick(velocity, velocity, force)["friction_std"][7] > 0.98 * apart
+
 
 def phase_rms(log: Log, error: np.ndarray, role: str, *, swings: bool) -> float:
     """Root mean square over the joints of a role while their legs swing, or stand, from 1 s on."""

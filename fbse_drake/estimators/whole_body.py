@@ -453,8 +453,14 @@ def _conclude(
             x.settled[joint, j] = settled
             unsettled += share * (x.weights[joint, j] - settled)
         x.friction[joint] = x.friction_there[joint] + lacking
-        # What the law does not explain, or learned just now, is not confirmed yet.
-        x.doubt[joint] = max(abs(lacking) + abs(unsettled), keep * last.doubt[joint])
+        # What the law does not explain, or learned just now, is not confirmed yet; and nobody
+        # knows which of model and measurement is wrong that contradict each other.
+        unlikely, innovation = 0.0, x.innovation[of_velocity]
+        if elapsed > 0.0 and innovation**2 > _GATE**2 * x.innovation_variance[of_velocity]:
+            inertia = x.past.inertia[_tick_of_forces(x), of_velocity, of_velocity]
+            unlikely = inertia * abs(innovation) / elapsed
+        doubt = max(abs(lacking) + abs(unsettled), unlikely)
+        x.doubt[joint] = max(doubt, keep * last.doubt[joint])
         x.friction_std[joint] = math.sqrt(max(0.0, variance) + x.doubt[joint] ** 2)
         for k in range(x.parameters.shape[1]):
             x.parameters[joint, k] = x.weights[joint, k]
@@ -644,7 +650,8 @@ class WholeBodyFilter(RecursiveEstimator):
                                  of the wrenches, and how soles turn without accelerations,
                                  `turning` (room, feet) [rad/s^2]; see `room_for_delays`
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
-                                         since then [Nm]
+                                         since then, or torque by which measurements contradict the
+                                         model [Nm]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
     """
 
