@@ -13,7 +13,7 @@ from rig import BENT, CLOCK, TICK, Base, Rig, estimated, pack, rms
 
 from fbse_drake import Log
 from fbse_drake.effects.friction import CoulombViscousFriction
-from fbse_drake.estimators.attitude import AttitudeConfig, AttitudeEstimator
+from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
@@ -31,8 +31,8 @@ WALK = scenario("paper_walk_fbse", "duration=3")
 WHOLE_BODY = Fbse(friction=WholeBody())
 BASE = Base.of()
 READINGS, MODEL = BASE.monitor.posterior_type, BASE.model.posterior_type
-ATTITUDE = AttitudeEstimator(
-    AttitudeConfig(), USUAL_SENSORS, ImuMount(BASE.robot).R_BI, READINGS, MODEL, CLOCK
+ATTITUDE = InvariantBaseFilter(
+    InvariantFilter(), USUAL_SENSORS, BASE.robot, READINGS, MODEL, CLOCK, origin=(0.0, 0.0)
 )
 ACCELERATION = JointAccelerationEstimator(
     JointAccelerationConfig(),
@@ -92,21 +92,25 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
     Pads that show nothing but noise have no force; the foot that stands does not turn.
     """
     generator, T, n = np.random.default_rng(1), TICK, 12
-    config = WholeBody(model=LAW, factors=[], foot_turning=0.05)
-    rig = Rig(
-        config.system(
-            USUAL_SENSORS,
-            BASE.robot,
-            measurements=READINGS,
-            link_torque=LINK.posterior_type,
-            model_over_step=MODEL,
-            attitude=ATTITUDE.posterior_type,
-            clock=CLOCK,
-        )
+    config = WholeBody(model=LAW, shape_uncertainty=0.0, foot_turning=0.05)
+    system = config.system(
+        USUAL_SENSORS,
+        BASE.robot,
+        measurements=READINGS,
+        link_torque=LINK.posterior_type,
+        model_over_step=MODEL,
+        attitude=ATTITUDE.posterior_type,
+        clock=CLOCK,
     )
+    rig = Rig(system)
     mount = ImuMount(BASE.robot)
     rows, joints = np.r_[0:3, 6:18], slice(3, 15)
+    # Without the weights of other shapes, which stay zero.
+    shapes = system.posterior_type["weights"].shape[1]
     weights = slice(30, 54)
+    states = np.concatenate(
+        [np.arange(30), 30 + shapes * np.repeat(range(n), 2) + np.tile([0, 1], n)]
+    )
     sigma = np.repeat(
         [USUAL_SENSORS.angular_velocity_noise, USUAL_SENSORS.joint_velocity_noise], [3, n]
     )
@@ -149,7 +153,7 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         A, push, Q = M[np.ix_(rows, rows)], push[rows], Q[np.ix_(rows, rows)]
 
         # Mean: friction at the velocity that results, by fixed-point iteration.
-        V, law = last["velocity"].copy(), last["weights"]
+        V, law = last["velocity"].copy(), last["weights"][:, :2]
         for _ in range(50):
             v = V[joints]
             friction = law[:, 0] * np.tanh(v / 2.0) + law[:, 1] * v
@@ -170,7 +174,7 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         for j in range(n):
             F[:15, 30 + 2 * j : 32 + 2 * j] = -T * np.outer(B[:, 3 + j], phi[j])
         walk = np.repeat([config.moment_walk, config.disturbance_walk], [3, n])
-        P = last["covariance"].copy()
+        P = last["covariance"][np.ix_(states, states)]
         # What is lacking walks, and then it pushes.
         P[15:30, 15:30] += T * np.diag(walk**2)
         P = F @ P @ F.T
@@ -190,11 +194,14 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         X += P @ H / S * (-H @ X - T * turning[0, 2])
         P = P - np.outer(P @ H, P @ H) / S
         scale = np.sqrt(np.diag(P))
-        found = [posterior[name].ravel() for name in ("velocity", "lacking", "weights")]
+        found = [posterior["velocity"], posterior["lacking"], posterior["weights"][:, :2].ravel()]
         np.testing.assert_allclose((np.concatenate(found) - X) / scale, 0.0, atol=5e-3)
         np.testing.assert_allclose(
-            posterior["covariance"] / np.outer(scale, scale), P / np.outer(scale, scale), atol=0.02
+            posterior["covariance"][np.ix_(states, states)] / np.outer(scale, scale),
+            P / np.outer(scale, scale),
+            atol=0.02,
         )
+        assert not posterior["weights"][:, 2:].any()
         v, law = X[joints], X[weights].reshape(n, 2)
         friction = law[:, 0] * np.tanh(v / 2.0) + law[:, 1] * v + X[18:30]
         error = (posterior["friction"] - friction) / posterior["friction_std"]
