@@ -55,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Log]:
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
 
-    @lru_cache(maxsize=4)
+    @lru_cache(maxsize=2)
     def simulated(name: str, *overrides: str, noise: bool = True) -> Log:
         key = sha256(repr((name, overrides, noise)).encode()).hexdigest()
         path = folder / f"run_{key}.npz"
