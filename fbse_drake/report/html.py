@@ -7,11 +7,11 @@ A report is data (`Report`, made of `Section`s); `write_report` puts it into
 import base64
 import io
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 import jinja2
 from matplotlib.backend_bases import FigureCanvasBase
@@ -69,61 +69,55 @@ class Table:
 
 
 @dataclass(frozen=True)
-class FigureBlock:
-    """A picture with its title and one or two sentences on what to see; drawn when it is shown, so
-    that a report has one figure in memory and not all."""
+class PictureBlock(ABC):
+    """Pictures beside each other with their title and one or two sentences on what to see; drawn
+    when they are shown, so that a report has one figure in memory and not all."""
 
     title: str
     caption: str
+
+    @property
+    @abstractmethod
+    def pictures(self) -> tuple[tuple[str, Callable[[], str]], ...]:
+        """The name of each, and what makes it as a data URI."""
+
+    def drawn(self) -> "DrawnBlock":
+        """The same with its pictures made."""
+        made = tuple((name, picture()) for name, picture in self.pictures)
+        return DrawnBlock(self.title, self.caption, made)
+
+
+@dataclass(frozen=True)
+class FigureBlock(PictureBlock):
+    """A picture without a name of its own."""
+
     draw: Callable[[], Figure]
 
     @property
-    def pictures(self) -> "Pictures":
-        """The only one, without a name of its own."""
+    def pictures(self) -> tuple[tuple[str, Callable[[], str]], ...]:
         return (("", partial(_png_uri, self.draw)),)
-
-    def drawn(self) -> "DrawnBlock":
-        return DrawnBlock(self.title, self.caption, _made(self.pictures))
 
 
 @dataclass(frozen=True)
-class FigureRow:
-    """Pictures of the same thing beside each other, each with its name."""
+class FigureRow(PictureBlock):
+    """Pictures of the same thing, each with its name."""
 
-    title: str
-    caption: str
     drawings: tuple[tuple[str, Callable[[], Figure]], ...]
 
     @property
-    def pictures(self) -> "Pictures":
+    def pictures(self) -> tuple[tuple[str, Callable[[], str]], ...]:
         return tuple((name, partial(_png_uri, draw)) for name, draw in self.drawings)
-
-    def drawn(self) -> "DrawnBlock":
-        return DrawnBlock(self.title, self.caption, _made(self.pictures))
 
 
 @dataclass(frozen=True)
-class DrawnBlock:
+class DrawnBlock(PictureBlock):
     """Pictures that are drawn already, as data URIs with their names."""
 
-    title: str
-    caption: str
     uris: tuple[tuple[str, str], ...]
 
     @property
-    def pictures(self) -> "Pictures":
+    def pictures(self) -> tuple[tuple[str, Callable[[], str]], ...]:
         return tuple((name, partial(str, uri)) for name, uri in self.uris)
-
-    def drawn(self) -> "DrawnBlock":
-        return self
-
-
-# What makes each of some pictures, with its name.
-Pictures: TypeAlias = tuple[tuple[str, Callable[[], str]], ...]
-
-
-def _made(pictures: Pictures) -> tuple[tuple[str, str], ...]:
-    return tuple((name, picture()) for name, picture in pictures)
 
 
 @dataclass(frozen=True)
@@ -143,7 +137,7 @@ class Section:
     title: str
     text: str | Step = ""
     tables: tuple[Table, ...] = ()
-    figures: tuple[FigureBlock | FigureRow | DrawnBlock | Chart, ...] = ()
+    figures: tuple[PictureBlock | Chart, ...] = ()
     details: tuple[Details, ...] = ()
 
 

@@ -46,15 +46,11 @@ class PlantDynamics:
                 )
         return result
 
-    def bias_accelerations(
-        self, frames: Sequence[Frame], states: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Spatial acceleration [angular, linear] of some frames S in the world W without any
-        accelerations of joints, in their own axes, (frames, M, 6), and their orientation R_WS,
-        (frames, M, 3, 3)."""
+    def bias_accelerations(self, frames: Sequence[Frame], states: np.ndarray) -> np.ndarray:
+        """Spatial acceleration [angular, linear] of some frames in the world without any
+        accelerations of joints, in their own axes, (frames, M, 6)."""
         plant, context, world = self._plant, self._context, self._plant.world_frame()
         result = np.empty((len(frames), len(states), 6))
-        rotations = np.empty((len(frames), len(states), 3, 3))
         for k, state in enumerate(states):
             plant.SetPositionsAndVelocities(context, state)
             for f, frame in enumerate(frames):
@@ -62,5 +58,13 @@ class PlantDynamics:
                     context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
                 )
                 result[f, k] = bias.get_coeffs()
-                rotations[f, k] = frame.CalcRotationMatrixInWorld(context).matrix()
-        return result, rotations
+        return result
+
+    def rotations(self, frames: Sequence[Frame], positions: np.ndarray) -> np.ndarray:
+        """Orientation R_WS of some frames S in the world W, (frames, M, 3, 3)."""
+        result = np.empty((len(frames), len(positions), 3, 3))
+        for k, position in enumerate(positions):
+            self._plant.SetPositions(self._context, position)
+            for f, frame in enumerate(frames):
+                result[f, k] = frame.CalcRotationMatrixInWorld(self._context).matrix()
+        return result

@@ -86,8 +86,10 @@ def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> n
     gravity = (
         np.zeros(3) if equation.robot.has_floating_base else plant.gravity_field().gravity_vector()
     )
-    (J,) = equation.dynamics.jacobians([frame], states[:, : plant.num_positions()])
-    (bias,), (R_WB,) = equation.dynamics.bias_accelerations([frame], states)
+    positions = states[:, : plant.num_positions()]
+    (J,) = equation.dynamics.jacobians([frame], positions)
+    (bias,) = equation.dynamics.bias_accelerations([frame], states)
+    (R_WB,) = equation.dynamics.rotations([frame], positions)
     g = gravity @ R_WB
     V = np.einsum("mij,mj->mi", J, states[:, plant.num_positions() :])
     A = np.einsum("mij,mj->mi", J, accelerations) + bias

@@ -368,10 +368,9 @@ class EquationOfMotion:
     def sole_rotations(self, joint_position: np.ndarray) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each, in postures (M, n)."""
         soles = [self.robot.sole(side) for side in self.robot.description.sides]
-        states = np.zeros((len(joint_position), self.robot.plant.num_multibody_states()))
-        states[:, : len(self._upright)] = self._upright
-        states[:, self.robot.position_index] = joint_position
-        return list(self.dynamics.bias_accelerations(soles, states)[1])
+        positions = np.tile(self._upright, (len(joint_position), 1))
+        positions[:, self.robot.position_index] = joint_position
+        return list(self.dynamics.rotations(soles, positions))
 
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
@@ -469,7 +468,7 @@ class EquationOfMotion:
 
     def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
         """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
-        return self.dynamics.bias_accelerations(self._soles, states)[0][..., 3:]
+        return self.dynamics.bias_accelerations(self._soles, states)[..., 3:]
 
     @property
     def row_velocities(self) -> np.ndarray:
