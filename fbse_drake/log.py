@@ -78,8 +78,10 @@ class LogMeta:
 
     def __post_init__(self) -> None:
         require_positive(self, "period")
-        if len(set(self.joints)) != len(self.joints):
-            raise InputError("joints: a name is given twice")
+        for key in ("joints", "sides"):
+            names = getattr(self, key)
+            if len(set(names)) != len(names):
+                raise InputError(f"{key}: a name is given twice")
         for side, places in self.pads.items():
             if any(len(place) != 3 for place in places):
                 raise InputError(f"pads.{side}: expected places of three coordinates")
@@ -219,7 +221,13 @@ class Log(Mapping[str, np.ndarray]):
 
     def save(self, path: str | Path) -> None:
         """Writes an npz file (compressed, no pickles), to a temporary name first. The same log
-        gives the same bytes."""
+        gives the same bytes.
+
+        Raises:
+            InputError: it could not be read again, see `check_recorded`.
+        """
+        with located(f"{path}: "):
+            check_recorded(self)
         meta = {
             "format_version": FORMAT_VERSION,
             **self.meta,
@@ -273,14 +281,14 @@ class Log(Mapping[str, np.ndarray]):
 
 
 def check_recorded(log: Log) -> None:
-    """Checks what only a damaged recording is, however its numbers came about.
+    """Checks what only a damaged recording or a meaningless simulation has, however its numbers
+    came about.
 
     Raises:
         InputError: numbers that nothing measurable has, or a period that is not that of the rows.
     """
     for name, values in log.items():
-        # What is believed of a sensor may be as large, and its variance is the square of that.
-        most = schema.LARGEST_NUMBER ** (2 if name.endswith("_variance") else 1)
+        most = _largest_number(name)
         if (largest := float(np.abs(values).max(initial=0.0))) > most:
             raise InputError(
                 f"channel {name}: expected numbers of size at most {most:g}, found {largest:g}"
@@ -291,6 +299,26 @@ def check_recorded(log: Log) -> None:
             f"meta.period: expected about the time between rows, found {log.meta['period']:g} s, "
             f"{periods:g} times in all for {len(log.time)} rows"
         )
+
+
+def plausible_part(log: Log) -> Log:
+    """The rows before the first with numbers that nothing measurable has.
+
+    Raises:
+        InputError: the first row has such numbers.
+    """
+    end = len(log.time)
+    for name, values in log.items():
+        beyond = np.abs(values[:end].reshape(end, -1)) > _largest_number(name)
+        end = int(np.append(beyond.any(axis=1), True).argmax())
+        if end == 0:
+            check_recorded(log.part(slice(1)))
+    return log.part(slice(end))
+
+
+def _largest_number(channel: str) -> float:
+    # What is believed of a sensor may be as large, and its variance is the square of that.
+    return schema.LARGEST_NUMBER ** (2 if channel.endswith("_variance") else 1)
 
 
 def joined(logs: Mapping[str, "Log"], gap: float = 1.0) -> Log:

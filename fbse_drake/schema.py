@@ -295,6 +295,9 @@ def _build(schema: Any, value: Any, default: Any, file: str, key: str) -> Any:
             str(k): _build(args[1], v, old.get(k), file, f"{key}.{k}") for k, v in value.items()
         }
         return {**old, **items}
+    tag = value.get("_tag") if isinstance(value, dict) else None
+    if tag not in (None, f"!{schema.__name__}"):
+        raise InputError(f"{file}{key or 'top level'}: expected no tag, found {describe(tag)}")
     return _mapping(schema, value, default, file, key)
 
 

@@ -22,7 +22,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_
 from fbse_drake.effects.system import loss_over_time
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.zmp import zero_moment_point
-from fbse_drake.log import Log
+from fbse_drake.log import Log, plausible_part
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
@@ -349,7 +349,8 @@ def _make_log(scenario: Scenario, name: str, run: RecordedRun) -> Log:
             "time": float(time[-1]),
         },
     }
-    return Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
+    log = Log({key: np.ascontiguousarray(values) for key, values in channels.items()}, meta)
+    return plausible_part(log)
 
 
 def _joint_velocity(robot: Robot, state: np.ndarray) -> np.ndarray:

@@ -92,12 +92,13 @@ class Station(Diagram):
         builder = DiagramBuilder()
         with located("model: "):
             self.model = build_robot(scenario.believed)
+        expected = load_description(scenario.robot.description)[0].joint_names
+        if self.model.joint_names != expected:
+            found = self.model.joint_names
+            raise InputError(f"model: expected the robot's joints {expected}, found {found}")
         self.reference = reference or planned_reference(scenario, self.model)
         simulated = add_robot(builder, scenario, self.reference)
         self.robot = simulated.robot
-        if self.model.joint_names != self.robot.joint_names:
-            expected, found = self.robot.joint_names, self.model.joint_names
-            raise InputError(f"model: expected the robot's joints {expected}, found {found}")
         ports = dict(simulated.ports)
         ports |= add_sensors(builder, scenario, self.robot, ports)
         ports |= add_sensor_effects(builder, scenario, self.robot, ports)

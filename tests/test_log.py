@@ -7,6 +7,7 @@ import pytest
 from conftest import scenario
 
 from fbse_drake import InputError, Log, simulate
+from fbse_drake.log import plausible_part
 
 META = {"joints": ["a", "b"], "period": 0.01}
 
@@ -65,6 +66,12 @@ def test_impossible_logs_are_refused(change: dict, message: str):
         Log(content, META)
 
 
+@pytest.mark.parametrize("key", ["joints", "sides"])
+def test_names_are_given_once(key: str):
+    with pytest.raises(InputError, match=f"meta: {key}: a name is given twice"):
+        Log(channels(), META | {key: ["a", "a"]})
+
+
 def test_unknown_channel_names_the_known_ones():
     with pytest.raises(KeyError, match="no channel imu/angular_velocity in this log"):
         Log(channels(), META)["imu/angular_velocity"]
@@ -106,10 +113,25 @@ def test_a_run_with_sensors_that_say_nothing_can_be_read_again(tmp_path: Path):
     simulate(scenario("squat", *deaf)).log.save(tmp_path / "log.npz")
     variance = Log.load(tmp_path / "log.npz")["estimate/base_state/force_innovation_variance"]
     assert variance.max() > 1e15
+
+
+def test_a_log_that_could_not_be_read_again_is_not_written(tmp_path: Path):
     large = channels() | {"joint/position": np.full((5, 2), 1e16)}
-    Log(large, {"joints": ["a", "b"], "period": 0.01}).save(tmp_path / "large.npz")
-    with pytest.raises(InputError, match="joint/position: expected numbers of size at most"):
-        Log.load(tmp_path / "large.npz")
+    with pytest.raises(InputError, match=r"l.npz: channel joint/position: .* size at most 1e\+15"):
+        Log(large, META).save(tmp_path / "l.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_rows_before_the_first_implausible_number_are_kept():
+    growing = channels()
+    growing["joint/position"] = 10.0 ** np.array([[0, 3], [15, 15], [3, 0], [16, 0], [0, 0]])
+    part = plausible_part(Log(growing, META))
+    np.testing.assert_array_equal(part["joint/position"], growing["joint/position"][:3])
+    whole = Log(channels(), META)
+    np.testing.assert_array_equal(plausible_part(whole).time, whole.time)
+    growing["joint/velocity"] = np.full((5, 2), -1e17)
+    with pytest.raises(InputError, match="joint/velocity: expected numbers of size at most"):
+        plausible_part(Log(growing, META))
 
 
 def test_same_scenario_and_seed_give_the_same_bytes(tmp_path: Path):

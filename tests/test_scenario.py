@@ -98,6 +98,7 @@ def bomb(begin: str, end: str) -> str:
                 r"!Recorded, found the tag !Hop"
             ),
         ),
+        ("mine: {robot: !Hop {}}", r"mine\.yaml: mine: robot: expected no tag, found '!Hop'"),
         ("mine: {duration: long}", r"duration: expected a number, found 'long'"),
         ("mine: {duration: .nan}", r"duration: expected a finite number, found nan"),
         ("mine: {duration: -1}", r"duration: expected a number > 0, found -1"),
@@ -201,6 +202,13 @@ def test_bad_input_gets_one_line_with_file_and_key(tmp_path: Path, text: str, me
 def test_bad_override_gets_one_line(override: str, message: str):
     with pytest.raises(InputError, match=message):
         load_scenario("squat", overrides=[override])
+
+
+def test_the_model_has_the_robots_joints():
+    """Also where the robot's effects are then of other joints than the model plans to move."""
+    friction = "robot.effects={f: !ViscousFriction {viscous: {all: 1}}}"
+    with pytest.raises(InputError, match=r"model: expected the robot's joints .*found \['servo'\]"):
+        build_station(load_scenario("squat", None, [friction, "model={description: pendulum}"]))
 
 
 def test_missing_file_lists_what_there_is():
