@@ -321,24 +321,73 @@ def _put_state(x: Record, state: np.ndarray) -> None:
 
 
 @njit(cache=True)
+def _learning(x: Record, last: Record) -> np.ndarray:
+    """Which states are corrected: 1, but 0 for laws of joints whose row is contradicted, (size,).
+
+    What is contradicted may be the law or what the law is learned from, and nobody knows.
+    """
+    learning, r, (n, m) = np.ones(len(x.covariance)), len(x.velocity), x.weights.shape
+    for joint in range(n):
+        if _is_contradicted(last, 3 + joint):
+            learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
+    return learning
+
+
+@njit(cache=True)
+def _is_contradicted(x: Record, row: int) -> bool:
+    """Do the measurements keep saying, beyond chance, that torque is lacking in this row?"""
+    return x.unexplained[row] ** 2 > _GATE**2 * x.unexplained_variance[row]
+
+
+@njit(cache=True)
+def _correct(
+    state: np.ndarray, P: np.ndarray, column: np.ndarray, learning: np.ndarray, S: float, y: float
+) -> None:
+    """Kalman update with an innovation y of variance S, in place.
+
+    States that do not learn are considered, as in a Schmidt-Kalman filter: their uncertainty counts
+    and stays.
+
+    Args:
+        column: covariance of the states with the innovation, overwritten.
+    """
+    size = len(state)
+    corrected = column * learning
+    for j in range(size):
+        gain, others = column[j] / S, column if learning[j] > 0.0 else corrected
+        state[j] += learning[j] * gain * y
+        for k in range(size):
+            P[j, k] -= gain * others[k]
+
+
+@njit(cache=True)
+def _confirmed(now: float, before: float) -> float:
+    """What two ticks say is no outlier: the smaller of them, 0 if they have not the same sign."""
+    return min(abs(now), abs(before)) if now * before > 0.0 else 0.0
+
+
+@njit(cache=True)
 def _listen(
     x: Record,
     last: Record,
     predicted: np.ndarray,
     missed: np.ndarray,
+    learning: np.ndarray,
     elapsed: float,
     known: Record,
-) -> None:
+) -> np.ndarray:
     """Kalman updates with gyro and encoders, one after the other.
+
+    Returns:
+        How they would correct the velocities if no innovation were too large to count, (r,).
 
     Args:
         predicted: velocities (r,) before the updates.
         missed: what is added to their variances, as pushes between rare readings are missed, (r,).
+        learning: see `_learning`.
     """
     P, r, state = x.covariance, len(x.velocity), _state(x)
-    size, column = len(P), np.empty(len(P))
-    keep = math.exp(-elapsed / AGREEMENT_TIME)
-    count = (1.0 + keep) / (1.0 - keep)
+    column, correction = np.empty(len(P)), np.zeros(r)
     for i in range(r):
         # How noisy a sensor is shows in its steps, whatever the model is wrong by.
         step = x.reading[i] - last.reading[i] - (predicted[i] - last.velocity[i])
@@ -347,20 +396,53 @@ def _listen(
         x.noise[i] = learned_noise(last.noise[i], share, LOG_OF_ONE, elapsed)
         innovation, variance = x.reading[i] - state[i], x.noise[i] * known.variance[i]
         S = P[i, i] + variance
+        twice = _confirmed(innovation, last.innovation[i])
+        if twice**2 > _GATE**2 * S:
+            P[i, i] += twice**2
+            S += twice**2
         x.innovation[i], x.innovation_variance[i] = innovation, S
-        # Innovations that agree are no noise: something is lacking that the model does not know.
-        x.agreement[i] = keep * last.agreement[i] + (1.0 - keep) * innovation
-        excess = count * x.agreement[i] ** 2 - AGREEMENT * S
-        if excess > 0.0:
-            P[r + i, r + i] += (1.0 - keep) * excess * (P[r + i, i] / S) ** 2
         S_gate = S * max(1.0, innovation**2 / (_GATE**2 * S))
         column[:] = P[i]
-        for j in range(size):
-            gain = column[j] / S_gate
-            state[j] += gain * innovation
-            for k in range(size):
-                P[j, k] -= gain * column[k]
+        correction += column[:r] * (innovation / S)
+        _correct(state, P, column, learning, S_gate, innovation)
     _put_state(x, state)
+    return correction
+
+
+@njit(cache=True)
+def _watch_corrections(
+    x: Record,
+    last: Record,
+    A: np.ndarray,
+    correction: np.ndarray,
+    covariance: np.ndarray,
+    T: float,
+) -> None:
+    """Learns what is lacking from corrections of the velocities that agree from tick to tick.
+
+    As torques they show the row in which it is. A good filter's corrections are white.
+
+    Args:
+        A: inertia (r, r).
+        correction: of the velocities, had no innovation been too large to count, (r,).
+        covariance: of the velocities before they were corrected, (r, r).
+    """
+    P, r = x.covariance, len(x.velocity)
+    keep = math.exp(-T / AGREEMENT_TIME)
+    torque = A @ correction / T
+    halfway = A @ (covariance - P[:r, :r])
+    for i in range(r):
+        variance, before = max(0.0, halfway[i] @ A[i]) / (T * T), last.correction[i]
+        x.correction[i], x.correction_variance[i] = torque[i], variance
+        x.unexplained[i] = keep * last.unexplained[i] + (1.0 - keep) * torque[i]
+        of_last = last.unexplained_variance[i]
+        x.unexplained_variance[i] = keep**2 * of_last + (1.0 - keep) ** 2 * variance
+        excess = x.unexplained[i] ** 2 - AGREEMENT * x.unexplained_variance[i]
+        if excess > 0.0:
+            P[r + i, r + i] += (1.0 - keep) * excess
+        twice = _confirmed(torque[i], before)
+        if twice**2 > _GATE**2 * variance:
+            P[r + i, r + i] += twice**2
 
 
 @njit(cache=True)
@@ -371,7 +453,13 @@ def _tick_of_forces(x: Record) -> int:
 
 @njit(cache=True)
 def _listen_to_feet(
-    x: Record, last: Record, measured: Record, link: Record, T: float, known: Record
+    x: Record,
+    last: Record,
+    measured: Record,
+    link: Record,
+    learning: np.ndarray,
+    T: float,
+    known: Record,
 ) -> None:
     """Kalman updates with flat feet that stand: they do not turn about their normals."""
     P, r, state, load = x.covariance, len(x.velocity), _state(x), 0.0
@@ -392,11 +480,7 @@ def _listen_to_feet(
         x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
         # A foot that turns is no measurement.
         if surprise < _GATE**2:
-            state += column * (innovation / S)
-            for j in range(len(P)):
-                gain = column[j] / S
-                for k in range(len(P)):
-                    P[j, k] -= gain * column[k]
+            _correct(state, P, column, learning, S, innovation)
     _put_state(x, state)
 
 
@@ -410,7 +494,8 @@ def _forget_motion(posterior: Record, known: Record) -> None:
     for i in range(r):
         P[i, i] = x.noise[i] * known.variance[i]
         P[r + i, r + i] += x.lacking[i] ** 2
-    x.velocity[:], x.lacking[:], x.agreement[:] = x.reading, 0.0, 0.0
+    x.velocity[:], x.lacking[:], x.unexplained[:] = x.reading, 0.0, 0.0
+    x.correction[:] = 0.0
 
 
 @njit(cache=True)
@@ -434,6 +519,11 @@ def _conclude(
     _linearise(x, velocity, x.weights, phi, slopes, shaped)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME)
+    # Where readings contradict the model, all that follows from both is as uncertain as they are
+    # apart (the Birge ratio).
+    share = x.innovation**2 / np.maximum(x.innovation_variance, 1e-300)
+    surprise = share.mean() if share.max() > _GATE**2 else 1.0
+    x.surprise = max(1.0, surprise, 1.0 + keep * (last.surprise - 1.0))
     for joint in range(n):
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
         slope, lacking = x.slope[joint], x.lacking[3 + joint]
@@ -455,13 +545,12 @@ def _conclude(
         x.friction[joint] = x.friction_there[joint] + lacking
         # What the law does not explain, or learned just now, is not confirmed yet; and nobody
         # knows which of model and measurement is wrong that contradict each other.
-        unlikely, innovation = 0.0, x.innovation[of_velocity]
-        if elapsed > 0.0 and innovation**2 > _GATE**2 * x.innovation_variance[of_velocity]:
-            inertia = x.past.inertia[_tick_of_forces(x), of_velocity, of_velocity]
-            unlikely = inertia * abs(innovation) / elapsed
-        doubt = max(abs(lacking) + abs(unsettled), unlikely)
+        contradicted = abs(x.unexplained[of_velocity]) if _is_contradicted(x, of_velocity) else 0.0
+        if x.correction[of_velocity] ** 2 > _GATE**2 * x.correction_variance[of_velocity]:
+            contradicted = max(contradicted, abs(x.correction[of_velocity]))
+        doubt = max(abs(lacking) + abs(unsettled), contradicted)
         x.doubt[joint] = max(doubt, keep * last.doubt[joint])
-        x.friction_std[joint] = math.sqrt(max(0.0, variance) + x.doubt[joint] ** 2)
+        x.friction_std[joint] = math.sqrt(x.surprise * max(0.0, variance) + x.doubt[joint] ** 2)
         for k in range(x.parameters.shape[1]):
             x.parameters[joint, k] = x.weights[joint, k]
             x.parameter_variance[joint, k] = P[first + k, first + k]
@@ -587,8 +676,11 @@ def _update(
     x.velocity[:] = predicted
     _propagate(x, inertia, inverse, variance + np.diag(missed), elapsed)
     of_velocity = elapsed * elapsed * (inverse**2 @ missed)
-    _listen(x, last, predicted, of_velocity, elapsed, known)
-    _listen_to_feet(x, last, measured[()], link_torque[()], elapsed, known)
+    r, learning = len(push), _learning(x, last)
+    expected = x.covariance[:r, :r].copy()
+    correction = _listen(x, last, predicted, of_velocity, learning, elapsed, known)
+    _listen_to_feet(x, last, measured[()], link_torque[()], learning, elapsed, known)
+    _watch_corrections(x, last, inertia, correction, expected, elapsed)
 
 
 @njit(cache=True)
@@ -675,7 +767,8 @@ class WholeBodyFilter(RecursiveEstimator):
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
         n, m = len(robot.joint_names), self._regressor.weights
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
-        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "agreement")
+        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "unexplained")
+        per_row += ("unexplained_variance", "correction", "correction_variance")
         per_joint = ("friction", "friction_std", "doubt", "law_velocity", "friction_there", "slope")
         room, feet = room_for_delays(clock), len(legs)
         posterior_type = record_type(
@@ -683,6 +776,7 @@ class WholeBodyFilter(RecursiveEstimator):
             status=(),
             late=(),
             newest=(),
+            surprise=(),
             past=record_type(
                 duration=(room,),
                 known=(room,),
@@ -768,7 +862,7 @@ class WholeBodyFilter(RecursiveEstimator):
         n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"], start["noise"] = start["weights"], 1.0
-        start["foot_noise"] = 1.0
+        start["foot_noise"] = start["surprise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
