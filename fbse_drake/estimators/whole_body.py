@@ -322,14 +322,12 @@ def _put_state(x: Record, state: np.ndarray) -> None:
 
 @njit(cache=True)
 def _learning(x: Record, last: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for laws of joints whose row is contradicted, (size,).
+    """Which states are corrected: 1, but 0 for the laws of late after a contradiction, (size,).
 
-    What is contradicted may be the law or what the law is learned from, and nobody knows.
+    What is contradicted may be a law or what laws are learned from, and nobody knows.
     """
-    learning, r, (n, m) = np.ones(len(x.covariance)), len(x.velocity), x.weights.shape
-    for joint in range(n):
-        if _is_contradicted(last, 3 + joint):
-            learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
+    learning, of_laws = np.ones(len(x.covariance)), 2 * len(x.velocity)
+    learning[of_laws:] = 1.0 if last.calm >= _DOUBT_TIME else 0.0
     return learning
 
 
@@ -429,6 +427,7 @@ def _watch_corrections(
     """
     P, r = x.covariance, len(x.velocity)
     keep = math.exp(-T / AGREEMENT_TIME)
+    x.calm = last.calm + T
     torque = A @ correction / T
     halfway = A @ (covariance - P[:r, :r])
     for i in range(r):
@@ -443,6 +442,8 @@ def _watch_corrections(
         twice = _confirmed(torque[i], before)
         if twice**2 > _GATE**2 * variance:
             P[r + i, r + i] += twice**2
+        if _is_contradicted(x, i):
+            x.calm = 0.0
 
 
 @njit(cache=True)
@@ -777,6 +778,7 @@ class WholeBodyFilter(RecursiveEstimator):
             late=(),
             newest=(),
             surprise=(),
+            calm=(),
             past=record_type(
                 duration=(room,),
                 known=(room,),
@@ -863,6 +865,7 @@ class WholeBodyFilter(RecursiveEstimator):
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"], start["noise"] = start["weights"], 1.0
         start["foot_noise"] = start["surprise"] = 1.0
+        start["calm"] = _DOUBT_TIME
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
