@@ -80,31 +80,37 @@ class Fbse(Estimator):
 
     def add(self, chain: Chain) -> None:
         self.add_base(chain)
-        robot, sensors = chain.robot, chain.sensors
+        friction = self.friction
+        if not chain.knows_torque or "joint_acceleration" not in friction.stands_for:
+            self._add_joint_acceleration(chain)
+        if not chain.knows_torque:
+            return
+        if "link_torque" not in friction.stands_for:
+            self._add_link_torque(chain)
+        make = partial(friction.system, chain.sensors, chain.robot)
+        chain.add("friction", make, **friction.sources)
+        for stage in friction.stands_for:
+            chain.alias("friction", stage)
+
+    def _add_joint_acceleration(self, chain: Chain) -> None:
+        config, robot = self.joint_acceleration, chain.robot
         chain.add(
             "joint_acceleration",
-            partial(JointAccelerationEstimator, self.joint_acceleration, sensors, robot),
+            partial(JointAccelerationEstimator, config, chain.sensors, robot),
             measurements="sensor_monitor",
             attitude="attitude",
             model_over_step="model.over_step",
         )
-        if not chain.knows_torque:
-            return
+
+    def _add_link_torque(self, chain: Chain) -> None:
         asks_for_delay = self.base_state.feeds_back and self.friction.allows_for_delay
         chain.add(
             "link_torque",
-            partial(LinkTorqueEstimator, sensors, robot),
+            partial(LinkTorqueEstimator, chain.sensors, chain.robot),
             measurements="sensor_monitor",
             model_over_step="model.over_step",
             joint_acceleration="joint_acceleration",
             **({"base_state": "base_state"} if asks_for_delay else {}),
-        )
-        chain.add(
-            "friction",
-            partial(self.friction.system, sensors, robot),
-            measurements="sensor_monitor",
-            link_torque="link_torque",
-            **self.friction.sources,
         )
 
     def add_base(self, chain: Chain) -> None:

@@ -25,6 +25,8 @@ from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_sha
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import leg_of_joint
 
+_MEASURED = {"measurements": "sensor_monitor", "link_torque": "link_torque"}
+
 
 def _adopted_model() -> CoulombViscousFriction:
     return CoulombViscousFriction(transition={"all": 1.0e-6})
@@ -40,8 +42,9 @@ class RecursiveLeastSquares:
     allows_for_delay: ClassVar[bool] = False
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = False
-    # What it hears beside measurements and link torque: by input, the stage that feeds it.
-    sources: ClassVar[dict[str, str]] = {}
+    # What feeds it, by input, and the stages whose work it does as well.
+    sources: ClassVar[dict[str, str]] = _MEASURED
+    stands_for: ClassVar[tuple[str, ...]] = ()
 
     # Adopted friction model, by default (57) with a sharp sign. Its linear parameters are
     # identified, from their values here on; the others stay as they are.
@@ -90,7 +93,8 @@ class ModelAided:
     # Does it go back to the tick that late forces belong to?
     allows_for_delay: ClassVar[bool] = True
     states_variance: ClassVar[bool] = True
-    sources: ClassVar[dict[str, str]] = {}
+    sources: ClassVar[dict[str, str]] = _MEASURED
+    stands_for: ClassVar[tuple[str, ...]] = ()
 
     # Friction model, of which the linear parameters are identified, from their values here on; the
     # others stay as they are.

@@ -14,7 +14,7 @@ from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.innovations import LOG_OF_SIX, LOG_OF_THREE, learned_noise
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive import Clock, Past, RecursiveEstimator, Status, ticks_ago
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
@@ -47,7 +47,7 @@ def _clear(posterior: np.ndarray, status: float) -> None:
 
 
 @njit(cache=True)
-def _watch_forces(
+def watch_forces(
     posterior: np.ndarray, last: np.ndarray, elapsed: float, wrench: np.ndarray, known: np.ndarray
 ) -> None:
     """Fills by how much the variance of each foot's wrench is larger than believed.
@@ -101,14 +101,14 @@ def _estimate_link_torque(
     acceleration: np.ndarray,
     torque_command: np.ndarray,
     delay: float,
-    past: np.ndarray,
+    past: Past,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
     Args:
         delay: by how much the forces are late [s].
-        past: the posterior's `now` of the last ticks, see `History`.
+        past: the posterior's `now` in the last ticks, see `History`.
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
@@ -120,7 +120,7 @@ def _estimate_link_torque(
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     posterior.late = posterior.duration = 0.0
-    _watch_forces(posterior, last, elapsed, wrench, known)
+    watch_forces(posterior, last, elapsed, wrench, known)
     if not np.isfinite(torque_command).all() or not math.isfinite(delay):
         _clear(posterior, _NOT_FINITE)
         return
@@ -168,7 +168,7 @@ def _estimate_link_torque(
         is_known = trust[0] == 0 and trust[1] == 0
         now.valid[i] = acceleration.known[i] if is_known else 0.0
     late = tick_of(elapsed, past, delay)
-    then = past[-late] if late > 0 else now
+    then = ticks_ago(past, late) if late > 0 else now
     posterior.late, posterior.duration = late, then.duration
     for i in range(n):
         posterior.link_torque[i] = then.inertial_torque[i]

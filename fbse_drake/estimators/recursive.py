@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
     DiscreteStateIndex,
     DiscreteValues,
     InputPort,
+    InputPortIndex,
     LeafSystem,
     OutputPort,
     State,
@@ -28,7 +29,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.records import as_record, parts, size_of
+from fbse_drake.estimators.records import Record, as_record, parts, size_of
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
@@ -91,12 +92,13 @@ def start_share(elapsed: float, reading: float) -> float:
 class RecordInput:
     """An input port that gets the posterior of another estimator."""
 
-    port: InputPort
+    system: LeafSystem
+    index: InputPortIndex
     kind: np.dtype
 
     def Eval(self, context: Context) -> np.ndarray:
-        """The posterior as a record."""
-        return np.ndarray((), self.kind, self.port.Eval(context))
+        """The posterior as a record, not to be written. (The port's own `Eval` would copy it.)"""
+        return as_record(self.system.EvalVectorInput(context, self.index).value(), self.kind)
 
 
 @dataclass(frozen=True)
@@ -115,9 +117,27 @@ class RememberedInput:
         state.set_value(self.index, self.port.Eval(context))
 
 
+class Past(NamedTuple):
+    """Records of the last ticks, in a ring."""
+
+    # Where the last tick's is.
+    newest: int
+    # Shape (ticks,).
+    of_tick: np.ndarray
+
+
+@njit(cache=True)
+def ticks_ago(past: Past, age: int) -> Record:
+    """What is remembered of the tick that ended so many ticks ago, 1 for the last one."""
+    return past.of_tick[(past.newest + 1 - age) % len(past.of_tick)]
+
+
 @dataclass(frozen=True)
 class History:
-    """A field of the posterior as it was in the last ticks."""
+    """A field of the posterior, a record, as it was in the last ticks; zero before the first.
+
+    A ring of its own, of which a tick writes one place: what is long need not be copied.
+    """
 
     index: DiscreteStateIndex
     kind: np.dtype
@@ -125,18 +145,18 @@ class History:
     ticks: int
     part: slice
 
-    def Eval(self, context: Context) -> np.ndarray:
-        """The field of every tick, (ticks,), that of `age` ticks ago in [-age]; zero before the
-        first."""
+    def Eval(self, context: Context) -> Past:
+        """All that is remembered."""
         values = context.get_discrete_state().value(self.index)
-        return np.ndarray((self.ticks,), self.kind, values)
+        return Past(int(values.item(0)), np.ndarray((self.ticks,), self.kind, values[1:]))
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
         """Adds the present tick, if it is one."""
         if posterior.item(0) > context.get_discrete_state().value(0).item(0):
             values, own = state.get_mutable_value(self.index), posterior[self.part]
-            values[: -len(own)] = values[len(own) :]
-            values[-len(own) :] = own
+            newest = (int(values.item(0)) + 1) % self.ticks
+            start = 1 + newest * len(own)
+            values[0], values[start : start + len(own)] = newest, own
 
 
 T = TypeVar("T", bound="RecursiveEstimator")
@@ -229,7 +249,8 @@ class RecursiveEstimator(LeafSystem):
     def _declare_record_input(self, name: str, kind: np.dtype) -> RecordInput:
         """Declares an input port for a posterior of this type."""
         self.record_inputs[name] = kind
-        return RecordInput(self.DeclareVectorInputPort(name, size_of(kind)), kind)
+        port = self.DeclareVectorInputPort(name, size_of(kind))
+        return RecordInput(self, port.get_index(), kind)
 
     def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
         """Declares an input port that the posterior of the next tick depends on, not this one's."""
@@ -240,10 +261,10 @@ class RecursiveEstimator(LeafSystem):
         return remembered
 
     def _declare_history(self, field: str, ticks: int) -> History:
-        """Declares a state for what a field of the posterior was in the last ticks."""
-        kind, part = self.posterior_type[field], parts(self.posterior_type)[field]
-        index = self.DeclareDiscreteState(ticks * size_of(kind))
-        history = History(index, kind, ticks, part)
+        """Declares a state for what a record of the posterior was in the last ticks."""
+        kind = self.posterior_type[field]
+        index = self.DeclareDiscreteState(1 + ticks * size_of(kind))
+        history = History(index, kind, ticks, parts(self.posterior_type)[field])
         self._remembered.append(history)
         return history
 

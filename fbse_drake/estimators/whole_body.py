@@ -7,7 +7,7 @@ the torques, not for the one that a noisy encoder shows, and is identified at it
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -16,29 +16,25 @@ from pydrake.systems.framework import Context
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.errors import require_not_negative, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.equation_of_motion import motion_type, pushed, put_equation_of_motion
 from fbse_drake.estimators.floating_base import ImuMount, model_type
-from fbse_drake.estimators.force_delay import room_for_delays
+from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
 from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
-from fbse_drake.estimators.link_torque import wrench_variance
+from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, start_share
-from fbse_drake.estimators.sensor_monitor import measurements_type
-from fbse_drake.estimators.spatial import (
-    cross,
-    put,
-    rotate,
-    rotation,
-    skew,
-    subtract,
-    vector,
+from fbse_drake.estimators.recursive import (
+    Clock,
+    Past,
+    RecursiveEstimator,
+    start_share,
+    ticks_ago,
 )
+from fbse_drake.estimators.sensor_monitor import measurements_type
+from fbse_drake.estimators.spatial import put, rotate, rotation, subtract, vector
 from fbse_drake.robot.plant import Robot
-from fbse_drake.sensors.foot_pads import FootPads
+from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
-# A wrench, or the force on a pad, is beyond its sensors' noise above these quantiles of chi^2 with
-# six and three degrees of freedom (one in 3000).
-_WRENCH_GATE, _PAD_GATE = 25.1, 18.5
 # An innovation counts as little as makes it just likely beyond so many standard deviations, ...
 _GATE = 5.0
 # ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
@@ -46,9 +42,6 @@ _DOUBT_TIME = 0.1
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
-# The law is linearised where a tick is expected to end, then where the measurements say that it
-# ended.
-_ITERATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -64,19 +57,20 @@ class WholeBody:
     together, and one that does not fit the other would be learned wrong.
 
     Foot forces that come late belong to the tick in which they were: the filter is then so many
-    ticks behind, and the law is asked for the velocity that is measured now. What else is wrong
-    with forces and commands makes the laws wrong.
+    ticks behind, and the law is asked for the velocity that is measured now. Where measurements
+    keep contradicting the model, torque is lacking in the rows that their corrections point at, and
+    no law is learned.
     """
 
-    # Does it go back to the tick that late forces belong to?
-    allows_for_delay: ClassVar[bool] = True
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = True
-    # What it hears beside measurements and link torque.
+    # What feeds it, by input, and the stages whose work it does.
     sources: ClassVar[dict[str, str]] = {
+        "measurements": "sensor_monitor",
         "model_over_step": "model.over_step",
         "attitude": "attitude",
     }
+    stands_for: ClassVar[tuple[str, ...]] = ("joint_acceleration", "link_torque")
 
     # Friction model, of which the linear parameters are identified, from their values here on; the
     # others stay as they are.
@@ -105,108 +99,6 @@ class WholeBody:
     def system(self, sensors: SensorBeliefs, robot: Robot, **arguments: Any) -> "WholeBodyFilter":
         """The estimator with these settings; arguments as of its class."""
         return WholeBodyFilter(self, sensors, robot, **arguments)
-
-
-@njit(cache=True)
-def _put_equation_of_motion(
-    past: Record,
-    at: int,
-    measured: Record,
-    model: Record,
-    attitude: Record,
-    torque_command: np.ndarray,
-    known: Record,
-) -> None:
-    """Rows of base turning and joints, where the base's acceleration is taken at the IMU.
-
-    The accelerometer measures there, so what it says is no function of the unknown angular
-    acceleration; moments are about the IMU.
-
-    Args:
-        past: filled, see `WholeBodyFilter`: of inertia a = push + what feet push - friction, with a
-            the base's angular acceleration and those of the joints.
-        at: where in it.
-    """
-    R_BI, p = rotation(known.mount.R_BI), vector(known.mount.p_BI)
-    # a_B = a_I - w_dot x p - w x (w x p), of the IMU's origin I seen from the base's.
-    w, moved = vector(model.velocity), np.empty((3, 3))
-    put(moved, skew(p))
-    force = subtract(vector(measured.mean.specific_force), vector(attitude.acceleration_bias))
-    linear = np.empty(3)
-    put(linear, subtract(rotate(R_BI, force), cross(w, cross(w, p))))
-    base, joints = model.base_inertia, model.mass_matrix
-    A, of_linear, push = past.inertia[at], past.of_linear[at], past.push[at]
-    of_linear[:3] = base[:3, 3:] + moved.T @ np.ascontiguousarray(base[3:, 3:])
-    of_linear[3:] = joints[:, 3:6]
-    A[:3, :3] = base[:3, :3] + moved.T @ np.ascontiguousarray(base[3:, :3]) + of_linear[:3] @ moved
-    A[3:, :3] = joints[:, :3] + of_linear[3:] @ moved
-    A[:3, 3:] = A[3:, :3].T
-    A[3:, 3:] = joints[:, 6:]
-    push[:3] = -model.base_bias[:3] - moved.T @ model.base_bias[3:]
-    push[3:] = torque_command - model.bias
-    push -= of_linear @ linear
-    for foot in range(len(known.has_pads)):
-        J, lever = model.foot_jacobian[foot], past.lever[at, foot]
-        lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
-        lever[:, 3:] = J[:, 6:]
-        past.turning[at, foot] = model.foot_bias[foot, 2]
-
-
-@njit(cache=True)
-def _pushed(
-    past: Record, at: int, measured: Record, link: Record, known: Record
-) -> tuple[np.ndarray, np.ndarray]:
-    """The push (r,) in an equation of motion, feet included, and its variance (r, r)."""
-    push, of_linear = past.push[at].copy(), past.of_linear[at]
-    variance = known.sensors.acceleration_noise**2 * (of_linear @ of_linear.T)
-    for foot in range(len(known.has_pads)):
-        lever, wrench, excess = past.lever[at, foot], link.wrench[foot], link.force_noise[foot]
-        of_wrench = excess * known.wrench_variance[foot]
-        if not known.has_pads[foot] and _pushes(wrench, of_wrench, _WRENCH_GATE):
-            push += lever.T @ wrench
-            variance += (lever.T * of_wrench) @ lever
-        if known.has_pads[foot]:
-            _add_pads(push, variance, lever, measured.mean.pad_force, foot, excess, known)
-    return push, variance
-
-
-@njit(cache=True)
-def _pushes(force: np.ndarray, variance: np.ndarray, gate: float) -> bool:
-    """Does a sensor show more than its noise? What does not touch the ground has no force."""
-    distance = 0.0
-    for i in range(len(force)):
-        # A point foot has no moment.
-        if variance[i] > 0.0:
-            distance += force[i] ** 2 / variance[i]
-    return distance > gate
-
-
-@njit(cache=True)
-def _add_pads(
-    push: np.ndarray,
-    variance: np.ndarray,
-    lever: np.ndarray,
-    force: np.ndarray,
-    foot: int,
-    excess: float,
-    known: Record,
-) -> None:
-    """Adds what the pads of a foot that touch the ground push, (r,), and its variance, (r, r).
-
-    Args:
-        lever: of the wrench on the sole, (6, r).
-        force: of all pads, (P, 3) [N].
-        excess: by how much the variance of the forces is larger than believed.
-    """
-    pads, of_force = known.pads, np.full(3, excess * known.sensors.force_noise**2)
-    for pad in range(len(force)):
-        if pads.foot[pad] == foot and _pushes(force[pad], of_force, _PAD_GATE):
-            arm = np.empty((3, 3))
-            put(arm, skew(vector(pads.position[pad])))
-            # A force f at p has the moment p x f.
-            of_pad = lever[3:] + arm.T @ lever[:3]
-            push += of_pad.T @ force[pad]
-            variance += of_force[0] * (of_pad.T @ of_pad)
 
 
 @njit(cache=True)
@@ -239,29 +131,26 @@ def _implicit_step(
     return velocity + inverse @ impulse, inverse
 
 
+# What `FrictionRegressor` says: the basis torques, and their slopes over the velocity.
+_Law: TypeAlias = tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]
+
+
 @njit(cache=True)
-def _linearise(
-    x: Record,
-    velocity: np.ndarray,
-    weights: np.ndarray,
-    phi: tuple[np.ndarray, ...],
-    slopes: tuple[np.ndarray, ...],
-    shaped: np.ndarray,
-) -> None:
-    """Fills the linearisation of the friction at velocities of the joints (n,) and weights (n, m).
+def _linearise(x: Record, velocity: np.ndarray, law: _Law, shaped: np.ndarray) -> None:
+    """Fills the linearisation of the friction.
 
     Args:
-        phi, slopes, shaped: see `FrictionRegressor`.
+        velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
     """
+    phi, slopes = law
     n, m = x.weights.shape
     row = np.ones(m + 1)
     for joint in range(n):
         put_regressor(row, slopes, shaped, joint, n)
-        slope = 0.0
+        slope = there = 0.0
         for k in range(m):
-            slope += row[k] * weights[joint, k]
+            slope += row[k] * x.weights[joint, k]
         put_regressor(row, phi, shaped, joint, n)
-        there = 0.0
         for k in range(m):
             x.regressor[joint, k] = row[k]
             there += row[k] * x.weights[joint, k]
@@ -270,92 +159,229 @@ def _linearise(
         x.law_velocity[joint] = velocity[joint]
 
 
-@njit(cache=True)
-def _propagate(
-    x: Record, A: np.ndarray, inverse: np.ndarray, variance: np.ndarray, T: float
-) -> None:
-    """Covariance after a step in time, in place: that of the velocities (r,) that come first.
+class _Tick(NamedTuple):
+    """What a tick's forces and equation of motion say, whatever the friction is."""
 
-    The others, `lacking` (r,) and `weights` (n, m), stay.
+    # How long it is [s]; 0 where not all is known that it needs, and the rest means nothing.
+    duration: float
+    # Commands, feet and all that is not friction, (r,) [Nm], and its variance (r, r).
+    push: np.ndarray
+    variance: np.ndarray
+    # What is missed between rare readings: part of that variance, (r,).
+    missed: np.ndarray
+    # Covariance of the tick's impulse, but for the friction's, with the states, (r, size).
+    impulse: np.ndarray
+
+
+@njit(cache=True)
+def _own_covariance(
+    x: Record, A: np.ndarray, inverse: np.ndarray, tick: _Tick
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the velocities after a step in time, with the states (r, size) and each other.
 
     Args:
-        inverse: see `_implicit_step`; variance: of the push, (r, r).
+        x: record with the states before the step and the friction's linearisation.
+        inverse: see `_implicit_step`.
     """
-    P, (n, m) = x.covariance, x.weights.shape
-    r, size = 3 + n, len(x.covariance)
-    moved = A @ P[:r]
-    for i in range(r):
-        for k in range(size):
-            moved[i, k] -= T * P[r + i, k]
+    P, T, (n, m) = x.covariance, tick.duration, x.weights.shape
+    r, size, impulse = 3 + n, len(x.covariance), tick.impulse.copy()
     for joint in range(n):
         for j in range(m):
             at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
             for k in range(size):
-                moved[3 + joint, k] -= share * P[at, k]
-    moved = inverse @ moved
-    own = np.ascontiguousarray(moved[:, :r]) @ A
+                impulse[3 + joint, k] -= share * P[at, k]
+    with_states = inverse @ impulse
+    own = np.ascontiguousarray(with_states[:, :r]) @ A - T * with_states[:, r : 2 * r]
     for i in range(r):
-        for k in range(r):
-            own[i, k] -= T * moved[i, r + k]
         for joint in range(n):
             for j in range(m):
                 at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
-                own[i, 3 + joint] -= share * moved[i, at]
-    own = own @ inverse + T * T * (inverse @ variance @ inverse)
-    P[:r] = moved
-    P[:, :r] = moved.T
-    P[:r, :r] = 0.5 * (own + own.T)
+                own[i, 3 + joint] -= share * with_states[i, at]
+    own = (own + T * T * (inverse @ tick.variance)) @ inverse
+    return with_states, 0.5 * (own + own.T)
 
 
 @njit(cache=True)
-def _state(x: Record) -> np.ndarray:
-    """[velocities, lacking, weights], a copy."""
-    return np.concatenate((x.velocity, x.lacking, x.weights.copy().ravel()))
+def _begin(
+    posterior: Record,
+    last: Record,
+    elapsed: float,
+    measured: Record,
+    model: Record,
+    attitude: Record,
+    torque_command: np.ndarray,
+    past: Past,
+    delay: float,
+    has_shown: bool,
+    known: Record,
+) -> tuple[_Tick, np.ndarray]:
+    """Takes over what was known a tick ago, and reads the sensors.
 
+    Args:
+        elapsed: of the tick [s], NaN of the first.
+        past: of the ticks before, see `motion_type`.
+        delay: by how much the forces are late [s].
+        has_shown: has the delay shown by which the laws were learned?
 
-@njit(cache=True)
-def _put_state(x: Record, state: np.ndarray) -> None:
-    r = len(x.velocity)
-    x.velocity[:], x.lacking[:] = state[:r], state[r : 2 * r]
-    x.weights[:] = state[2 * r :].reshape(x.weights.shape)
-
-
-@njit(cache=True)
-def _learning(x: Record, last: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for the laws of late after a contradiction, (size,).
-
-    What is contradicted may be a law or what laws are learned from, and nobody knows.
+    Returns:
+        The tick to which the forces belong that are read now, and the velocities of the joints (n,)
+        at its end, with the law linearised where it was last.
     """
-    learning, of_laws = np.ones(len(x.covariance)), 2 * len(x.velocity)
-    learning[of_laws:] = 1.0 if last.calm >= _DOUBT_TIME else 0.0
+    x, last, measured, pads = posterior[()], last[()], measured[()], known[()].pads
+    model, attitude, known = model[()], attitude[()], known[()]
+    posterior[()] = last
+    feet = len(known.wrench_variance)
+    wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
+    watch_forces(x, last, elapsed, wrench, known)
+    x.status, now = measured.trust.max(), x.now
+    if math.isnan(elapsed):
+        elapsed = 0.0
+    now.duration = elapsed
+    rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
+    put(now.reading[:3], rotate(rotation(known.mount.R_BI), rate))
+    now.reading[3:] = measured.joint_velocity
+    is_known = x.status == 0.0 and last.status == 0.0 and np.isfinite(torque_command).all()
+    is_known = is_known and elapsed > 0.0 and math.isfinite(delay) and model.velocity.any()
+    now.known = 1.0 if is_known else 0.0
+    if is_known:
+        put_equation_of_motion(now, measured, model, attitude, torque_command, known)
+    x.late = tick_of(elapsed, past, delay) if elapsed > 0.0 else 0.0
+    then = _tick_of_forces(x, past)
+    x.reading[:] = then.reading
+    r = len(x.lacking)
+    for i in range(r):
+        walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
+        x.covariance[r + i, r + i] += walk**2 * elapsed
+    T = then.duration * then.known if is_known else 0.0
+    if x.late != last.late:
+        # The last state is of another tick; and its laws were learned with forces of another time,
+        # unless that was the right one.
+        T = 0.0
+        if not has_shown:
+            _forget_laws(x, known)
+    push, variance = pushed(then, measured.mean.pad_force, wrench, x.force_noise, known)
+    # What rare readings leave out is as large as they differ.
+    missed = (start_share(T, known.reading) * (push - last.pushed)) ** 2 if T > 0.0 else 0.0 * push
+    for i in range(r):
+        variance[i, i] += missed[i]
+    A = np.ascontiguousarray(then.inertia)
+    impulse = A @ x.covariance[:r] - T * x.covariance[r : 2 * r]
+    tick = _Tick(T, push, variance, missed, impulse)
+    if T == 0.0:
+        _forget_motion(x, known)
+        return tick, x.velocity[3:].copy()
+    velocity, _ = _implicit_step(x, x.velocity, A, push, T)
+    return tick, velocity[3:].copy()
+
+
+@njit(cache=True)
+def _tick_of_forces(x: Record, past: Past) -> Record:
+    """What is known of the tick to which the forces belong that are read now, but for them."""
+    return x.now if x.late == 0.0 else ticks_ago(past, int(x.late))
+
+
+@njit(cache=True)
+def _expect(
+    posterior: Record,
+    last: Record,
+    tick: _Tick,
+    velocity: np.ndarray,
+    law: _Law,
+    shaped: np.ndarray,
+    past: Past,
+    known: Record,
+) -> np.ndarray:
+    """Where the measurements let expect that the tick ends: velocities of the joints (n,).
+
+    Where the law is steep, velocity and law have to fit each other to be learned.
+
+    Args:
+        velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
+    """
+    x, last, known = posterior[()], last[()], known[()]
+    A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
+    _linearise(x, velocity, law, shaped)
+    expected, inverse = _implicit_step(x, x.velocity, A, tick.push, tick.duration)
+    _, S = _own_covariance(x, A, inverse, tick)
+    gain, innovation = S.copy(), x.reading - expected
+    for i in range(len(S)):
+        S[i, i] += x.noise[i] * known.variance[i]
+        largest = _GATE * math.sqrt(S[i, i])
+        if _confirmed(innovation[i], last.innovation[i]) < largest:
+            innovation[i] = min(max(innovation[i], -largest), largest)
+    expected += gain @ (_inverse(S) @ innovation)
+    return expected[3:].copy()
+
+
+@njit(cache=True)
+def _update(
+    x: Record,
+    last: Record,
+    then: Record,
+    tick: _Tick,
+    measured: Record,
+    known: Record,
+) -> None:
+    """Prediction and measurements of a tick, by the law as it is linearised.
+
+    Args:
+        then: equation of motion of the tick.
+    """
+    P, r, T = x.covariance, len(x.velocity), tick.duration
+    A = np.ascontiguousarray(then.inertia)
+    predicted, inverse = _implicit_step(x, x.velocity, A, tick.push, T)
+    with_states, expected = _own_covariance(x, A, inverse, tick)
+    P[:r] = with_states
+    P[:, :r] = with_states.T
+    P[:r, :r] = expected
+    x.velocity[:], x.pushed[:] = predicted, tick.push
+    x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
+    learning = _learning(last)
+    correction = _listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
+    _listen_to_feet(x, last, then, measured, learning, T, known)
+    _watch_corrections(x, last, A, correction, expected, T)
+    x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T
+
+
+@njit(cache=True)
+def _learning(last: Record) -> np.ndarray:
+    """Which states are corrected: 1, but 0 for laws of joints whose row is contradicted, (size,).
+
+    What is contradicted may be the law or what the law is learned from, and nobody knows.
+    """
+    learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
+    for joint in range(n):
+        if _is_contradicted(last, 3 + joint):
+            learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
 
 
 @njit(cache=True)
-def _is_contradicted(x: Record, row: int) -> bool:
-    """Do the measurements keep saying, beyond chance, that torque is lacking in this row?"""
-    return x.unexplained[row] ** 2 > _GATE**2 * x.unexplained_variance[row]
-
-
-@njit(cache=True)
 def _correct(
-    state: np.ndarray, P: np.ndarray, column: np.ndarray, learning: np.ndarray, S: float, y: float
+    x: Record, columns: np.ndarray, gain: np.ndarray, innovation: np.ndarray, learning: np.ndarray
 ) -> None:
-    """Kalman update with an innovation y of variance S, in place.
+    """Kalman update, in place.
 
     States that do not learn are considered, as in a Schmidt-Kalman filter: their uncertainty counts
     and stays.
 
     Args:
-        column: covariance of the states with the innovation, overwritten.
+        columns: covariance of the innovations (m,) with the states, (m, size).
+        gain: of the states, transposed, (m, size).
+        learning: see `_learning`.
     """
-    size = len(state)
-    corrected = column * learning
+    P, r, size = x.covariance, len(x.velocity), len(learning)
+    change, less = learning * (innovation @ gain), columns.T @ gain
+    x.velocity += change[:r]
+    x.lacking += change[r : 2 * r]
+    x.weights += change[2 * r :].reshape(x.weights.shape)
     for j in range(size):
-        gain, others = column[j] / S, column if learning[j] > 0.0 else corrected
-        state[j] += learning[j] * gain * y
-        for k in range(size):
-            P[j, k] -= gain * others[k]
+        if learning[j] > 0.0:
+            for k in range(size):
+                P[j, k] -= less[j, k]
+        else:
+            for k in range(size):
+                P[j, k] -= learning[k] * less[j, k]
 
 
 @njit(cache=True)
@@ -365,46 +391,91 @@ def _confirmed(now: float, before: float) -> float:
 
 
 @njit(cache=True)
+def _is_contradicted(x: Record, row: int) -> bool:
+    """Do the measurements keep saying, beyond chance, that torque is lacking in this row?"""
+    return x.unexplained[row] ** 2 > _GATE**2 * x.unexplained_variance[row]
+
+
+@njit(cache=True)
 def _listen(
     x: Record,
     last: Record,
-    predicted: np.ndarray,
     missed: np.ndarray,
     learning: np.ndarray,
     elapsed: float,
     known: Record,
 ) -> np.ndarray:
-    """Kalman updates with gyro and encoders, one after the other.
+    """Kalman update with gyro and encoders.
+
+    Args:
+        x: record whose velocities are those before the update.
+        missed: what is added to their variances, as pushes between rare readings are missed, (r,).
+        learning: see `_learning`.
 
     Returns:
         How they would correct the velocities if no innovation were too large to count, (r,).
-
-    Args:
-        predicted: velocities (r,) before the updates.
-        missed: what is added to their variances, as pushes between rare readings are missed, (r,).
-        learning: see `_learning`.
     """
-    P, r, state = x.covariance, len(x.velocity), _state(x)
-    column, correction = np.empty(len(P)), np.zeros(r)
+    P, r = x.covariance, len(x.velocity)
+    innovation, excess = x.reading - x.velocity, np.zeros(r)
     for i in range(r):
         # How noisy a sensor is shows in its steps, whatever the model is wrong by.
-        step = x.reading[i] - last.reading[i] - (predicted[i] - last.velocity[i])
+        step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
         believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
-        share = step * step / believed
-        x.noise[i] = learned_noise(last.noise[i], share, LOG_OF_ONE, elapsed)
-        innovation, variance = x.reading[i] - state[i], x.noise[i] * known.variance[i]
-        S = P[i, i] + variance
-        twice = _confirmed(innovation, last.innovation[i])
-        if twice**2 > _GATE**2 * S:
-            P[i, i] += twice**2
-            S += twice**2
-        x.innovation[i], x.innovation_variance[i] = innovation, S
-        S_gate = S * max(1.0, innovation**2 / (_GATE**2 * S))
-        column[:] = P[i]
-        correction += column[:r] * (innovation / S)
-        _correct(state, P, column, learning, S_gate, innovation)
-    _put_state(x, state)
+        x.noise[i] = learned_noise(last.noise[i], step * step / believed, LOG_OF_ONE, elapsed)
+        S = P[i, i] + x.noise[i] * known.variance[i]
+        # The velocity is elsewhere, and nobody knows why.
+        twice = _confirmed(innovation[i], last.innovation[i]) ** 2
+        if twice > _GATE**2 * S:
+            P[i, i] += twice
+            S += twice
+        x.innovation[i], x.innovation_variance[i] = innovation[i], S
+        # An innovation counts as little as makes it just likely.
+        excess[i] = max(0.0, (innovation[i] / _GATE) ** 2 - S)
+    columns = P[:r].copy()
+    weight = _inverse(columns[:, :r] + np.diag(x.noise * known.variance))
+    whitened = weight @ innovation
+    correction = columns[:, :r] @ whitened
+    # Mean square, which has the mean 1 and the variance 2 / r.
+    surprise = innovation @ whitened / r
+    if surprise < 1.0 + _GATE * math.sqrt(2.0 / r):
+        surprise = 1.0
+    if excess.max() > 0.0:
+        weight = _inverse(columns[:, :r] + np.diag(x.noise * known.variance + excess))
+    keep = math.exp(-elapsed / _DOUBT_TIME)
+    x.surprise = max(surprise, 1.0 + keep * (last.surprise - 1.0))
+    _correct(x, columns, weight @ columns, innovation, learning)
     return correction
+
+
+@njit(cache=True)
+def _listen_to_feet(
+    x: Record,
+    last: Record,
+    then: Record,
+    measured: Record,
+    learning: np.ndarray,
+    T: float,
+    known: Record,
+) -> None:
+    """Kalman updates with flat feet that stand: they do not turn about their normals."""
+    P, r, load = x.covariance, len(x.velocity), 0.0
+    for foot in range(len(known.is_flat)):
+        load += max(0.0, x.wrench[foot, 5])
+    for foot in range(len(known.is_flat)):
+        share = x.wrench[foot, 5] / max(load, 1.0)
+        if not known.is_flat[foot] or not measured.support[foot] > 0 or share < _LEAST_LOAD:
+            continue
+        # Where the tick ends, of which the model knows where it began.
+        row = then.lever[foot, 2:3]
+        columns = row @ P[:r]
+        innovation = -(row @ x.velocity) - T * then.turning[foot]
+        believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
+        S = (columns[:, :r] @ row[0])[0] + last.foot_noise[foot] * believed
+        surprise = innovation[0] ** 2 / S
+        x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
+        # A foot that turns is no measurement.
+        if surprise < _GATE**2:
+            _correct(x, columns, columns / S, innovation, learning)
 
 
 @njit(cache=True)
@@ -427,11 +498,10 @@ def _watch_corrections(
     """
     P, r = x.covariance, len(x.velocity)
     keep = math.exp(-T / AGREEMENT_TIME)
-    x.calm = last.calm + T
     torque = A @ correction / T
     halfway = A @ (covariance - P[:r, :r])
     for i in range(r):
-        variance, before = max(0.0, halfway[i] @ A[i]) / (T * T), last.correction[i]
+        variance = max(0.0, halfway[i] @ A[i]) / (T * T)
         x.correction[i], x.correction_variance[i] = torque[i], variance
         x.unexplained[i] = keep * last.unexplained[i] + (1.0 - keep) * torque[i]
         of_last = last.unexplained_variance[i]
@@ -439,99 +509,74 @@ def _watch_corrections(
         excess = x.unexplained[i] ** 2 - AGREEMENT * x.unexplained_variance[i]
         if excess > 0.0:
             P[r + i, r + i] += (1.0 - keep) * excess
-        twice = _confirmed(torque[i], before)
-        if twice**2 > _GATE**2 * variance:
-            P[r + i, r + i] += twice**2
-        if _is_contradicted(x, i):
-            x.calm = 0.0
+        twice = _confirmed(torque[i], last.correction[i]) ** 2
+        if twice > _GATE**2 * variance:
+            P[r + i, r + i] += twice
 
 
 @njit(cache=True)
-def _tick_of_forces(x: Record) -> int:
-    """Where in the past the tick is to which the forces belong that are read now."""
-    return (int(x.newest) - int(x.late)) % len(x.past.duration)
+def _forget_laws(x: Record, known: Record) -> None:
+    """What was learned of the laws is as uncertain as at the start."""
+    P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
+    P[of_laws:] = 0.0
+    P[:, of_laws:] = 0.0
+    for joint in range(n):
+        for k in range(m):
+            at = of_laws + m * joint + k
+            P[at, at] = known.weight_variance[k]
 
 
 @njit(cache=True)
-def _listen_to_feet(
-    x: Record,
-    last: Record,
-    measured: Record,
-    link: Record,
-    learning: np.ndarray,
-    T: float,
-    known: Record,
-) -> None:
-    """Kalman updates with flat feet that stand: they do not turn about their normals."""
-    P, r, state, load = x.covariance, len(x.velocity), _state(x), 0.0
-    past, at = x.past, _tick_of_forces(x)
-    for foot in range(len(known.is_flat)):
-        load += max(0.0, link.wrench[foot, 5])
-    for foot in range(len(known.is_flat)):
-        share = link.wrench[foot, 5] / max(load, 1.0)
-        if not known.is_flat[foot] or not measured.support[foot] > 0 or share < _LEAST_LOAD:
-            continue
-        # Where the tick ends, of which the model knows where it began.
-        row = past.lever[at, foot, 2]
-        column = row @ P[:r]
-        innovation = -(row @ state[:r]) - T * past.turning[at, foot]
-        believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
-        S = column[:r] @ row + last.foot_noise[foot] * believed
-        surprise = innovation**2 / S
-        x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
-        # A foot that turns is no measurement.
-        if surprise < _GATE**2:
-            _correct(state, P, column, learning, S, innovation)
-    _put_state(x, state)
-
-
-@njit(cache=True)
-def _forget_motion(posterior: Record, known: Record) -> None:
+def _forget_motion(x: Record, known: Record) -> None:
     """Where a sensor is not trusted, velocities are what was measured, and nothing is lacking."""
-    x, known = posterior[()], known[()]
     P, r = x.covariance, len(x.velocity)
     P[:r] = 0.0
     P[:, :r] = 0.0
     for i in range(r):
         P[i, i] = x.noise[i] * known.variance[i]
         P[r + i, r + i] += x.lacking[i] ** 2
-    x.velocity[:], x.lacking[:], x.unexplained[:] = x.reading, 0.0, 0.0
-    x.correction[:] = 0.0
+    x.velocity[:], x.lacking[:], x.innovation[:] = x.reading, 0.0, 0.0
+    x.unexplained[:], x.correction[:] = 0.0, 0.0
 
 
 @njit(cache=True)
-def _conclude(
+def _finish(
     posterior: Record,
     last: Record,
     elapsed: float,
+    tick: _Tick,
     velocity: np.ndarray,
-    phi: tuple[np.ndarray, ...],
-    slopes: tuple[np.ndarray, ...],
+    law: _Law,
+    velocity_now: np.ndarray,
+    law_now: _Law,
     shaped: np.ndarray,
+    measured: Record,
+    torque_command: np.ndarray,
+    past: Past,
     known: Record,
 ) -> None:
-    """Fills friction and its standard deviation, by the law where the tick ends.
+    """Updates the state; tells friction and its standard deviation by the law where the tick ends.
 
     Args:
-        velocity: see `_present_velocity`.
-        phi, slopes, shaped: see `FrictionRegressor`.
+        velocity, law, shaped: see `_expect`, of where the tick of the forces is expected to end.
+        velocity_now, law_now: the same of the present tick.
     """
-    x, last, known = posterior[()], last[()], known[()]
-    _linearise(x, velocity, x.weights, phi, slopes, shaped)
+    x, last, measured, known = posterior[()], last[()], measured[()], known[()]
+    if tick.duration > 0.0:
+        _linearise(x, velocity, law, shaped)
+        _update(x, last, _tick_of_forces(x, past), tick, measured, known)
+    _linearise(x, velocity_now, law_now, shaped)
     P, (n, m) = x.covariance, x.weights.shape
-    r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME)
-    # Where readings contradict the model, all that follows from both is as uncertain as they are
-    # apart (the Birge ratio).
-    share = x.innovation**2 / np.maximum(x.innovation_variance, 1e-300)
-    surprise = share.mean() if share.max() > _GATE**2 else 1.0
-    x.surprise = max(1.0, surprise, 1.0 + keep * (last.surprise - 1.0))
+    r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME) if elapsed > 0.0 else 1.0
     for joint in range(n):
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
         slope, lacking = x.slope[joint], x.lacking[3 + joint]
-        variance = P[of_lacking, of_lacking]
+        variance, friction = P[of_lacking, of_lacking], x.friction_there[joint] + lacking
         if x.late > 0.0:
+            # Nobody knows more of the velocity now than is measured.
             variance += slope * slope * x.noise[of_velocity] * known.variance[of_velocity]
             slope = 0.0
+        friction += slope * (x.velocity[of_velocity] - velocity_now[joint])
         variance += slope * slope * P[of_velocity, of_velocity]
         variance += 2.0 * slope * P[of_velocity, of_lacking]
         unsettled = 0.0
@@ -543,7 +588,10 @@ def _conclude(
             settled = keep * last.settled[joint, j] + (1.0 - keep) * x.weights[joint, j]
             x.settled[joint, j] = settled
             unsettled += share * (x.weights[joint, j] - settled)
-        x.friction[joint] = x.friction_there[joint] + lacking
+        x.friction[joint] = friction
+        x.link_torque[joint] = torque_command[joint] - friction
+        if tick.duration == 0.0:
+            x.residual[joint] = friction
         # What the law does not explain, or learned just now, is not confirmed yet; and nobody
         # knows which of model and measurement is wrong that contradict each other.
         contradicted = abs(x.unexplained[of_velocity]) if _is_contradicted(x, of_velocity) else 0.0
@@ -551,152 +599,11 @@ def _conclude(
             contradicted = max(contradicted, abs(x.correction[of_velocity]))
         doubt = max(abs(lacking) + abs(unsettled), contradicted)
         x.doubt[joint] = max(doubt, keep * last.doubt[joint])
+        # The Birge ratio widens all that follows from readings that contradict the model.
         x.friction_std[joint] = math.sqrt(x.surprise * max(0.0, variance) + x.doubt[joint] ** 2)
         for k in range(x.parameters.shape[1]):
             x.parameters[joint, k] = x.weights[joint, k]
             x.parameter_variance[joint, k] = P[first + k, first + k]
-
-
-@njit(cache=True)
-def _begin(
-    posterior: Record,
-    last: Record,
-    elapsed: float,
-    measured: Record,
-    model: Record,
-    link_torque: Record,
-    attitude: Record,
-    torque_command: np.ndarray,
-    known: Record,
-) -> float:
-    """Takes over what was known a tick ago, and remembers the tick but for its forces.
-
-    Args:
-        elapsed: of the tick [s], 0 of the first.
-
-    Returns:
-        Duration of the tick to which the forces belong that are read now [s]; 0 unless all is known
-        that its equation of motion needs.
-    """
-    x, last, measured = posterior[()], last[()], measured[()]
-    model, attitude, known, link = model[()], attitude[()], known[()], link_torque[()]
-    posterior[()] = last
-    x.status, x.late = measured.trust.max(), min(link.late, len(x.past.duration) - 1.0)
-    x.innovation[:] = 0.0
-    ticks, of_past = len(x.past.duration), x.past
-    newest = (int(last.newest) + 1) % ticks
-    x.newest = newest
-    of_past.duration[newest] = elapsed
-    rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
-    put(of_past.reading[newest, :3], rotate(rotation(known.mount.R_BI), rate))
-    of_past.reading[newest, 3:] = measured.joint_velocity
-    is_known = x.status == 0.0 and last.status == 0.0 and np.isfinite(torque_command).all()
-    is_known = elapsed > 0.0 and is_known and model.velocity.any()
-    of_past.known[newest] = 1.0 if is_known else 0.0
-    if is_known:
-        _put_equation_of_motion(of_past, newest, measured, model, attitude, torque_command, known)
-    then = _tick_of_forces(x)
-    x.reading[:] = of_past.reading[then]
-    r = len(x.lacking)
-    for i in range(r):
-        walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
-        x.covariance[r + i, r + i] += walk**2 * elapsed
-    if x.late != last.late:
-        _distrust_laws(x, known)
-        return 0.0
-    return of_past.duration[then] * of_past.known[then] if is_known else 0.0
-
-
-@njit(cache=True)
-def _distrust_laws(x: Record, known: Record) -> None:
-    """What was learned with forces of another time is as uncertain as at the start."""
-    P, r, (n, m) = x.covariance, len(x.velocity), x.weights.shape
-    for joint in range(n):
-        for k in range(m):
-            at = 2 * r + m * joint + k
-            P[at, :] = 0.0
-            P[:, at] = 0.0
-            P[at, at] = known.weight_variance[k]
-
-
-@njit(cache=True)
-def _predict(
-    posterior: Record,
-    last: Record,
-    elapsed: float,
-    measured: Record,
-    link_torque: Record,
-    known: Record,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The velocities at which the tick ends, (r,), with the law linearised where it was last.
-
-    Returns:
-        Them, what `_pushed` returns, and the variance (r,) of what pushed between the readings,
-        independent in each row.
-    """
-    x, last, known = posterior[()], last[()], known[()]
-    at = _tick_of_forces(x)
-    push, variance = _pushed(x.past, at, measured[()], link_torque[()], known)
-    velocity, _ = _implicit_step(x, x.velocity, x.past.inertia[at], push, elapsed)
-    # What rare readings leave out is as large as they differ.
-    missed = (start_share(elapsed, known.reading) * (push - last.pushed)) ** 2
-    x.pushed[:] = push
-    return velocity, push, variance, missed
-
-
-@njit(cache=True)
-def _update(
-    posterior: Record,
-    last: Record,
-    elapsed: float,
-    begun: tuple[np.ndarray, np.ndarray],
-    ahead: tuple[np.ndarray, np.ndarray],
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    phi: tuple[np.ndarray, ...],
-    slopes: tuple[np.ndarray, ...],
-    shaped: np.ndarray,
-    measured: Record,
-    link_torque: Record,
-    known: Record,
-) -> None:
-    """Covariance and measurements of a tick, the law linearised where it is expected to end.
-
-    Args:
-        begun: state and covariance that `_begin` has made.
-        ahead: velocities of the joints (n,) and weights (n, m) where the law is linearised.
-        motion: see `_predict`.
-        phi, slopes, shaped: see `FrictionRegressor`.
-    """
-    x, last, known = posterior[()], last[()], known[()]
-    _, push, variance, missed = motion
-    inertia = x.past.inertia[_tick_of_forces(x)]
-    _put_state(x, begun[0])
-    x.covariance[:] = begun[1]
-    _linearise(x, ahead[0], ahead[1], phi, slopes, shaped)
-    predicted, inverse = _implicit_step(x, x.velocity, inertia, push, elapsed)
-    x.velocity[:] = predicted
-    _propagate(x, inertia, inverse, variance + np.diag(missed), elapsed)
-    of_velocity = elapsed * elapsed * (inverse**2 @ missed)
-    r, learning = len(push), _learning(x, last)
-    expected = x.covariance[:r, :r].copy()
-    correction = _listen(x, last, predicted, of_velocity, learning, elapsed, known)
-    _listen_to_feet(x, last, measured[()], link_torque[()], learning, elapsed, known)
-    _watch_corrections(x, last, inertia, correction, expected, elapsed)
-
-
-@njit(cache=True)
-def _begun(posterior: Record) -> tuple[np.ndarray, np.ndarray]:
-    """State and covariance, copies."""
-    return _state(posterior[()]), posterior[()].covariance.copy()
-
-
-@njit(cache=True)
-def _present_velocity(posterior: Record) -> np.ndarray:
-    """Of the joints, (n,) [rad/s]: of what was long ago nobody knows more than is measured."""
-    x = posterior[()]
-    if x.late == 0.0:
-        return x.velocity[3:].copy()
-    return x.past.reading[int(x.newest), 3:].copy()
 
 
 class WholeBodyFilter(RecursiveEstimator):
@@ -707,7 +614,6 @@ class WholeBodyFilter(RecursiveEstimator):
         name: WholeBodyFilter
         input_ports:
         - measurements
-        - link_torque
         - model_over_step
         - attitude
         - torque_command
@@ -715,11 +621,16 @@ class WholeBodyFilter(RecursiveEstimator):
         - posterior
         - (one for each field)
 
-    Inputs: posteriors of `SensorMonitor`, `LinkTorqueEstimator`, `FloatingBaseModel` over the step
-    and `AttitudeEstimator` or `InvariantBaseFilter`; `torque_command` (n,) [Nm] is remembered for
-    the next tick. Fields of the posterior, for n joints, r = 3 + n and m weights of each law:
+    Inputs: posteriors of `SensorMonitor`, `FloatingBaseModel` over the step and
+    `InvariantBaseFilter` (which also tells how late foot forces come) or `AttitudeEstimator`;
+    `torque_command` (n,) [Nm] is remembered for the next tick. Fields of the posterior, for n
+    joints, r = 3 + n and m weights of each law:
 
         friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
+        link_torque              (n,)    command less friction; what passes the joint to its link
+                                         [Nm]
+        residual                 (n,)    friction as it is measured in the tick, unfiltered [Nm]
+        joint_acceleration       (n,)    mean over the tick [rad/s^2]
         parameters, parameter_variance   (n, ...)  linear parameters of the law
         velocity                 (r,)    of the base's turning in its axes, and of the joints
                                          [rad/s]
@@ -727,21 +638,22 @@ class WholeBodyFilter(RecursiveEstimator):
         weights, settled         (n, m)  parameters and those of other shapes; the same some time
                                          ago
         covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
-        innovation, innovation_variance, agreement   (r,)  of gyro and encoders [rad/s]; the last
-                                         is the innovation's running mean
+        innovation, innovation_variance   (r,)  of gyro and encoders [rad/s]
+        correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
+        unexplained, unexplained_variance (r,)  running mean of the corrections [Nm]
+        surprise                 ()      mean square of the innovations as a share of their
+                                         variance, the largest of late that is beyond chance; at
+                                         least 1
         pushed                   (r,)    commands, feet and all that is not friction [Nm]
-        noise                    (r,)    by how much the variance of these is larger than believed,
-                                         at least 1
+        noise                    (r,)    by how much the variance of gyro and encoders is larger
+                                         than believed, at least 1
         foot_noise               (feet,) the same of standing feet's turning
-        reading                  (r,)    what they read, free of the bias [rad/s]
-        late                     ()      how many ticks ago the forces were what is read now
-        past, newest             what is known of the latest ticks but for the forces, and which is
-                                 the newest of them: `duration` (room,) [s], `known` (room,),
-                                 `reading` (room, r), and of the equation of motion `inertia`
-                                 (room, r, r), `push` (room, r), its part `of_linear` (room, r, 3)
-                                 in the base's linear acceleration, the `lever` (room, feet, 6, r)
-                                 of the wrenches, and how soles turn without accelerations,
-                                 `turning` (room, feet) [rad/s^2]; see `room_for_delays`
+        force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
+        reading                  (r,)    what gyro and encoders read, free of the bias [rad/s]
+        late                     ()      how many ticks ago the forces were what is read now: all
+                                         but the friction is of that tick
+        now                      what is known of the present tick but for the forces, see
+                                 `motion_type`; remembered as long as forces may be late
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
                                          since then, or torque by which measurements contradict the
                                          model [Nm]
@@ -754,7 +666,6 @@ class WholeBodyFilter(RecursiveEstimator):
         sensors: SensorBeliefs,
         robot: Robot,
         measurements: np.dtype,
-        link_torque: np.dtype,
         model_over_step: np.dtype,
         attitude: np.dtype,
         clock: Clock,
@@ -762,39 +673,31 @@ class WholeBodyFilter(RecursiveEstimator):
         """Declares ports and state.
 
         Args:
-            measurements, link_torque, model_over_step, attitude: types of the inputs.
+            measurements, model_over_step, attitude: types of the inputs.
         """
         self._config = config
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
         n, m = len(robot.joint_names), self._regressor.weights
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
-        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "unexplained")
-        per_row += ("unexplained_variance", "correction", "correction_variance")
-        per_joint = ("friction", "friction_std", "doubt", "law_velocity", "friction_there", "slope")
-        room, feet = room_for_delays(clock), len(legs)
+        feet = len(legs)
+        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "correction")
+        per_row += ("correction_variance", "unexplained", "unexplained_variance", "noise")
+        per_row += ("reading", "pushed")
+        per_joint = ("friction", "friction_std", "link_torque", "residual", "joint_acceleration")
+        per_joint += ("doubt", "law_velocity", "friction_there", "slope")
         posterior_type = record_type(
             time=(),
             status=(),
             late=(),
-            newest=(),
             surprise=(),
-            calm=(),
-            past=record_type(
-                duration=(room,),
-                known=(room,),
-                reading=(room, r),
-                inertia=(room, r, r),
-                of_linear=(room, r, 3),
-                push=(room, r),
-                lever=(room, feet, 6, r),
-                turning=(room, feet),
-            ),
-            **dict.fromkeys((*per_row, "noise", "reading", "pushed"), (r,)),
+            **dict.fromkeys(per_row, (r,)),
             **dict.fromkeys(per_joint, (n,)),
-            foot_noise=(feet,),
+            **dict.fromkeys(("foot_noise", "force_noise"), (feet,)),
+            **dict.fromkeys(("wrench", "wrench_change"), (feet, 6)),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
             covariance=(2 * r + n * m, 2 * r + n * m),
+            now=motion_type(robot),
         )
         super().__init__(posterior_type, clock)
         gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
@@ -808,22 +711,23 @@ class WholeBodyFilter(RecursiveEstimator):
             is_flat=np.array([float(not leg.is_point) for leg in legs.values()]),
             has_pads=np.array([float(not leg.has_six_axes) for leg in legs.values()]),
             wrench_variance=np.array([wrench_variance(sensors, robot, side) for side in legs]),
+            learns_noise=sensors.learns_force_noise,
             weight_variance=self._weight_deviations() ** 2,
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
-        self._link = self._declare_record_input("link_torque", link_torque)
         self._model = self._declare_record_input("model_over_step", model_over_step)
         self._attitude = self._declare_record_input("attitude", attitude)
+        self._hears_delay = "force_delay" in (attitude.names or ())
         self._torque_command = self._declare_remembered_input("torque_command", n)
+        ticks = remembered_ticks(clock) if self._hears_delay else 1
+        self._past = self._declare_history("now", ticks)
         self._declare_posterior()
 
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:
-        feet = len(robot.description.legs)
         return {
             "measurements": measurements_type(robot),
-            "link_torque": record_type(wrench=(feet, 6), force_noise=(feet,), late=()),
             "model_over_step": model_type(robot),
             "attitude": record_type(acceleration_bias=(3,), angular_velocity_bias=(3,)),
         }
@@ -832,40 +736,38 @@ class WholeBodyFilter(RecursiveEstimator):
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
-        model, known, shaped = self._model.Eval(context), self._known, self._regressor.shaped
-        torque_command = self._torque_command.Eval(context)
+        torque_command, past = self._torque_command.Eval(context), self._past.Eval(context)
+        known, delay, has_shown = self._known, 0.0, False
         if math.isnan(elapsed):
-            last, elapsed = self._start(), 0.0
-        link = self._link.Eval(context)
-        duration = _begin(
-            posterior, last, elapsed, measured, model, link, attitude, torque_command, known
-        )
-        if duration > 0.0:
-            motion = _predict(posterior, last, duration, measured, link, known)
-            # Where the law is steep, velocity and law have to fit each other to be learned.
-            begun = _begun(posterior)
-            ahead = motion[0][3:], posterior["weights"].copy()
-            for _ in range(_ITERATIONS):
-                phi, slopes = self._regressor(ahead[0])
-                _update(
-                    posterior, last, duration, begun, ahead, motion, phi, slopes, shaped,
-                    measured, link, known,
-                )  # fmt: skip
-                ahead = posterior["velocity"][3:].copy(), posterior["weights"].copy()
-        else:
-            _forget_motion(posterior, known)
-        velocity = _present_velocity(posterior)
-        phi, slopes = self._regressor(velocity)
-        _conclude(posterior, last, elapsed, velocity, phi, slopes, shaped, known)
+            last = self._start()
+        if self._hears_delay:
+            delay = float(attitude["force_delay"]["delay"])
+            has_shown = bool(attitude["force_delay"]["usual"][int(last["late"])] > 0.0)
+        model, regressor = self._model.Eval(context), self._regressor
+        tick, velocity = _begin(
+            posterior, last, elapsed, measured, model, attitude, torque_command, past, delay,
+            has_shown, known,
+        )  # fmt: skip
+        law = regressor(velocity)
+        if tick.duration > 0.0:
+            velocity = _expect(posterior, last, tick, velocity, law, regressor.shaped, past, known)
+            law = regressor(velocity)
+        velocity_now, law_now = velocity, law
+        if posterior["late"] > 0.0:
+            velocity_now = measured["joint_velocity"].copy()
+            law_now = regressor(velocity_now)
+        _finish(
+            posterior, last, elapsed, tick, velocity, law, velocity_now, law_now,
+            regressor.shaped, measured, torque_command, past, known,
+        )  # fmt: skip
 
     def _start(self) -> np.ndarray:
         """What is known before the first tick."""
         config, regressor, start = self._config, self._regressor, np.zeros((), self.posterior_type)
         n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
-        start["settled"], start["noise"] = start["weights"], 1.0
-        start["foot_noise"] = start["surprise"] = 1.0
-        start["calm"] = _DOUBT_TIME
+        start["settled"] = start["weights"]
+        start["noise"] = start["foot_noise"] = start["surprise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])

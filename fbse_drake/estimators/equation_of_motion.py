@@ -1,0 +1,165 @@
+"""Rows of the whole robot's equation of motion, seen from its IMU.
+
+They are those of the base's turning and of the joints. The accelerometer says how the IMU
+accelerates, so the base's linear rows are not needed; moments are about the IMU.
+"""
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.records import Record, record_type
+from fbse_drake.estimators.spatial import (
+    cross,
+    put,
+    rotate,
+    rotation,
+    skew,
+    subtract,
+    vector,
+)
+from fbse_drake.robot.plant import Robot
+
+# A wrench, or the force on a pad, is beyond its sensors' noise above these quantiles of chi^2 with
+# six and three degrees of freedom (one in 3000).
+_WRENCH_GATE, _PAD_GATE = 25.1, 18.5
+
+
+def motion_type(robot: Robot) -> np.dtype:
+    """What is known of a tick but for its forces, with r = 3 + n rows.
+
+    `duration` () [s]; `known` (), 1 where all was known; `reading` (r,) of gyro and encoders
+    [rad/s]; of inertia a = push + what feet push - friction, with a the base's angular acceleration
+    and those of the joints, `inertia` (r, r), `push` (r,), its part `of_linear` (r, 3) in the IMU's
+    acceleration, and the `lever` (feet, 6, r) of the wrenches on the soles; and how soles turn
+    about their normals without accelerations, `turning` (feet,) [rad/s^2].
+    """
+    r, feet = 3 + len(robot.joint_names), len(robot.description.legs)
+    return record_type(
+        duration=(),
+        known=(),
+        reading=(r,),
+        inertia=(r, r),
+        of_linear=(r, 3),
+        push=(r,),
+        lever=(feet, 6, r),
+        turning=(feet,),
+    )
+
+
+@njit(cache=True)
+def put_equation_of_motion(
+    now: Record,
+    measured: Record,
+    model: Record,
+    attitude: Record,
+    torque_command: np.ndarray,
+    known: Record,
+) -> None:
+    """Fills the equation of motion of a tick.
+
+    What the accelerometer says is no function of the unknown angular acceleration, for the base's
+    acceleration is taken at the IMU.
+
+    Args:
+        now: of `motion_type`.
+        torque_command: where the tick began, (n,) [Nm].
+        known: record with the IMU's `mount` and `has_pads` (feet,).
+    """
+    R_BI, p = rotation(known.mount.R_BI), vector(known.mount.p_BI)
+    # a_B = a_I - w_dot x p - w x (w x p), of the IMU's origin I seen from the base's.
+    w, moved = vector(model.velocity), np.empty((3, 3))
+    put(moved, skew(p))
+    force = subtract(vector(measured.mean.specific_force), vector(attitude.acceleration_bias))
+    linear = np.empty(3)
+    put(linear, subtract(rotate(R_BI, force), cross(w, cross(w, p))))
+    base, joints = model.base_inertia, model.mass_matrix
+    A, of_linear, push = now.inertia, now.of_linear, now.push
+    of_linear[:3] = base[:3, 3:] + moved.T @ np.ascontiguousarray(base[3:, 3:])
+    of_linear[3:] = joints[:, 3:6]
+    A[:3, :3] = base[:3, :3] + moved.T @ np.ascontiguousarray(base[3:, :3]) + of_linear[:3] @ moved
+    A[3:, :3] = joints[:, :3] + of_linear[3:] @ moved
+    A[:3, 3:] = A[3:, :3].T
+    A[3:, 3:] = joints[:, 6:]
+    push[:3] = -model.base_bias[:3] - moved.T @ model.base_bias[3:]
+    push[3:] = torque_command - model.bias
+    push -= of_linear @ linear
+    for foot in range(len(known.has_pads)):
+        J, lever = model.foot_jacobian[foot], now.lever[foot]
+        lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
+        lever[:, 3:] = J[:, 6:]
+        now.turning[foot] = model.foot_bias[foot, 2]
+
+
+@njit(cache=True)
+def pushed(
+    of_tick: Record,
+    pad_force: np.ndarray,
+    wrench: np.ndarray,
+    force_noise: np.ndarray,
+    known: Record,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The push (r,) in an equation of motion, feet included, and its variance (r, r).
+
+    A foot or pad that shows no more than its sensors' noise touches nothing.
+
+    Args:
+        of_tick: see `motion_type`.
+        pad_force: (P, 3) [N]; wrench: on each sole, (feet, 6) [Nm, N].
+        force_noise: by how much the variance of each foot's forces is larger than believed.
+        known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
+            (feet, 6) of each foot, and `pads`, see `FootPads`.
+    """
+    push, of_linear = of_tick.push.copy(), of_tick.of_linear
+    variance = known.sensors.acceleration_noise**2 * (of_linear @ of_linear.T)
+    for foot in range(len(known.has_pads)):
+        if known.has_pads[foot]:
+            of_foot, of_noise = _pad_wrench(pad_force, foot, force_noise[foot], known)
+        else:
+            diagonal = force_noise[foot] * known.wrench_variance[foot]
+            touches = _pushes(wrench[foot], diagonal, _WRENCH_GATE)
+            of_foot, of_noise = wrench[foot].copy(), np.diag(diagonal)
+            if not touches:
+                continue
+        lever = of_tick.lever[foot]
+        push += lever.T @ of_foot
+        variance += lever.T @ (of_noise @ lever)
+    return push, variance
+
+
+@njit(cache=True)
+def _pushes(force: np.ndarray, variance: np.ndarray, gate: float) -> bool:
+    """Does a sensor show more than its noise? What does not touch the ground has no force."""
+    distance = 0.0
+    for i in range(len(force)):
+        # A point foot has no moment.
+        if variance[i] > 0.0:
+            distance += force[i] ** 2 / variance[i]
+    return distance > gate
+
+
+@njit(cache=True)
+def _pad_wrench(
+    force: np.ndarray, foot: int, excess: float, known: Record
+) -> tuple[np.ndarray, np.ndarray]:
+    """Wrench of a foot's pads that touch the ground, (6,) on the sole, and its variance (6, 6).
+
+    Args:
+        force: of all pads, (P, 3) [N].
+        excess: by how much the variance of the forces is larger than believed.
+    """
+    pads, of_force = known.pads, np.full(3, excess * known.sensors.force_noise**2)
+    wrench, variance, arm = np.zeros(6), np.zeros((6, 6)), np.empty((3, 3))
+    for pad in range(len(force)):
+        if pads.foot[pad] == foot and _pushes(force[pad], of_force, _PAD_GATE):
+            # A force f at p has the moment p x f.
+            put(arm, skew(vector(pads.position[pad])))
+            for i in range(3):
+                wrench[3 + i] += force[pad, i]
+                variance[3 + i, 3 + i] += of_force[0]
+                for k in range(3):
+                    wrench[i] += arm[i, k] * force[pad, k]
+                    variance[i, 3 + k] += of_force[0] * arm[i, k]
+                    variance[3 + k, i] += of_force[0] * arm[i, k]
+                    for j in range(3):
+                        variance[i, k] += of_force[0] * arm[i, j] * arm[k, j]
+    return wrench, variance
