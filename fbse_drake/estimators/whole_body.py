@@ -62,6 +62,8 @@ class WholeBody:
     no law is learned.
     """
 
+    # Does it go back to the tick that late forces belong to?
+    allows_for_delay: ClassVar[bool] = True
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = True
     # What feeds it, by input, and the stages whose work it does.
@@ -417,6 +419,7 @@ def _listen(
     """
     P, r = x.covariance, len(x.velocity)
     innovation, excess = x.reading - x.velocity, np.zeros(r)
+    keep = math.exp(-elapsed / AGREEMENT_TIME)
     for i in range(r):
         # How noisy a sensor is shows in its steps, whatever the model is wrong by.
         step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
@@ -429,18 +432,19 @@ def _listen(
             P[i, i] += twice
             S += twice
         x.innovation[i], x.innovation_variance[i] = innovation[i], S
+        x.agreement[i] += (1.0 - keep) * (innovation[i] ** 2 / S - x.agreement[i])
         # An innovation counts as little as makes it just likely.
         excess[i] = max(0.0, (innovation[i] / _GATE) ** 2 - S)
-    columns = P[:r].copy()
-    weight = _inverse(columns[:, :r] + np.diag(x.noise * known.variance))
+    columns, expected = P[:r].copy(), P[:r, :r].copy()
+    weight = _inverse(expected + np.diag(x.noise * known.variance))
     whitened = weight @ innovation
-    correction = columns[:, :r] @ whitened
+    correction = expected @ whitened
     # Mean square, which has the mean 1 and the variance 2 / r.
     surprise = innovation @ whitened / r
     if surprise < 1.0 + _GATE * math.sqrt(2.0 / r):
         surprise = 1.0
     if excess.max() > 0.0:
-        weight = _inverse(columns[:, :r] + np.diag(x.noise * known.variance + excess))
+        weight = _inverse(expected + np.diag(x.noise * known.variance + excess))
     keep = math.exp(-elapsed / _DOUBT_TIME)
     x.surprise = max(surprise, 1.0 + keep * (last.surprise - 1.0))
     _correct(x, columns, weight @ columns, innovation, learning)
@@ -470,7 +474,7 @@ def _listen_to_feet(
         columns = row @ P[:r]
         innovation = -(row @ x.velocity) - T * then.turning[foot]
         believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
-        S = (columns[:, :r] @ row[0])[0] + last.foot_noise[foot] * believed
+        S = columns[0, :r] @ row[0] + last.foot_noise[foot] * believed
         surprise = innovation[0] ** 2 / S
         x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
         # A foot that turns is no measurement.
@@ -589,7 +593,8 @@ def _finish(
             x.settled[joint, j] = settled
             unsettled += share * (x.weights[joint, j] - settled)
         x.friction[joint] = friction
-        x.link_torque[joint] = torque_command[joint] - friction
+        if math.isfinite(torque_command[joint]):
+            x.link_torque[joint] = torque_command[joint] - friction
         if tick.duration == 0.0:
             x.residual[joint] = friction
         # What the law does not explain, or learned just now, is not confirmed yet; and nobody
@@ -599,8 +604,9 @@ def _finish(
             contradicted = max(contradicted, abs(x.correction[of_velocity]))
         doubt = max(abs(lacking) + abs(unsettled), contradicted)
         x.doubt[joint] = max(doubt, keep * last.doubt[joint])
-        # The Birge ratio widens all that follows from readings that contradict the model.
-        x.friction_std[joint] = math.sqrt(x.surprise * max(0.0, variance) + x.doubt[joint] ** 2)
+        # The Birge ratio widens what follows from readings that contradict the model.
+        variance = max(0.0, variance) * max(x.surprise, x.agreement[of_velocity])
+        x.friction_std[joint] = math.sqrt(variance + x.doubt[joint] ** 2)
         for k in range(x.parameters.shape[1]):
             x.parameters[joint, k] = x.weights[joint, k]
             x.parameter_variance[joint, k] = P[first + k, first + k]
@@ -627,8 +633,8 @@ class WholeBodyFilter(RecursiveEstimator):
     joints, r = 3 + n and m weights of each law:
 
         friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
-        link_torque              (n,)    command less friction; what passes the joint to its link
-                                         [Nm]
+        link_torque              (n,)    the last command that is a number, less friction; what
+                                         passes the joint to its link [Nm]
         residual                 (n,)    friction as it is measured in the tick, unfiltered [Nm]
         joint_acceleration       (n,)    mean over the tick [rad/s^2]
         parameters, parameter_variance   (n, ...)  linear parameters of the law
@@ -641,6 +647,7 @@ class WholeBodyFilter(RecursiveEstimator):
         innovation, innovation_variance   (r,)  of gyro and encoders [rad/s]
         correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
         unexplained, unexplained_variance (r,)  running mean of the corrections [Nm]
+        agreement                (r,)    running mean of the innovations squared over their variance
         surprise                 ()      mean square of the innovations as a share of their
                                          variance, the largest of late that is beyond chance; at
                                          least 1
@@ -680,11 +687,11 @@ class WholeBodyFilter(RecursiveEstimator):
         n, m = len(robot.joint_names), self._regressor.weights
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         feet = len(legs)
-        per_row = ("velocity", "lacking", "innovation", "innovation_variance", "correction")
-        per_row += ("correction_variance", "unexplained", "unexplained_variance", "noise")
-        per_row += ("reading", "pushed")
-        per_joint = ("friction", "friction_std", "link_torque", "residual", "joint_acceleration")
-        per_joint += ("doubt", "law_velocity", "friction_there", "slope")
+        per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
+        per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
+        per_row += ["reading", "pushed", "agreement"]
+        per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
+        per_joint += ["doubt", "law_velocity", "friction_there", "slope"]
         posterior_type = record_type(
             time=(),
             status=(),
@@ -767,7 +774,8 @@ class WholeBodyFilter(RecursiveEstimator):
         n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"] = start["weights"]
-        start["noise"] = start["foot_noise"] = start["surprise"] = 1.0
+        start["noise"] = start["foot_noise"] = 1.0
+        start["surprise"] = start["agreement"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
