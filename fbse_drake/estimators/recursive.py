@@ -20,7 +20,6 @@ from pydrake.systems.framework import (
     DiscreteStateIndex,
     DiscreteValues,
     InputPort,
-    InputPortIndex,
     LeafSystem,
     OutputPort,
     State,
@@ -92,13 +91,12 @@ def start_share(elapsed: float, reading: float) -> float:
 class RecordInput:
     """An input port that gets the posterior of another estimator."""
 
-    system: LeafSystem
-    index: InputPortIndex
+    port: InputPort
     kind: np.dtype
 
     def Eval(self, context: Context) -> np.ndarray:
-        """The posterior as a record, not to be written. (The port's own `Eval` would copy it.)"""
-        return as_record(self.system.EvalVectorInput(context, self.index).value(), self.kind)
+        """The posterior as a record."""
+        return as_record(self.port.Eval(context), self.kind)
 
 
 @dataclass(frozen=True)
@@ -249,8 +247,7 @@ class RecursiveEstimator(LeafSystem):
     def _declare_record_input(self, name: str, kind: np.dtype) -> RecordInput:
         """Declares an input port for a posterior of this type."""
         self.record_inputs[name] = kind
-        port = self.DeclareVectorInputPort(name, size_of(kind))
-        return RecordInput(self, port.get_index(), kind)
+        return RecordInput(self.DeclareVectorInputPort(name, size_of(kind)), kind)
 
     def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
         """Declares an input port that the posterior of the next tick depends on, not this one's."""

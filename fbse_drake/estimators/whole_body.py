@@ -20,7 +20,7 @@ from fbse_drake.estimators.equation_of_motion import motion_type, pushed, put_eq
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
-from fbse_drake.estimators.innovations import AGREEMENT, AGREEMENT_TIME, LOG_OF_ONE, learned_noise
+from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_ONE, learned_noise
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import (
@@ -39,6 +39,8 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 _GATE = 5.0
 # ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
+# Corrections whose mean is beyond so many standard deviations show that torque is lacking.
+_NOTICED = 3.0
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
@@ -510,7 +512,7 @@ def _watch_corrections(
         x.unexplained[i] = keep * last.unexplained[i] + (1.0 - keep) * torque[i]
         of_last = last.unexplained_variance[i]
         x.unexplained_variance[i] = keep**2 * of_last + (1.0 - keep) ** 2 * variance
-        excess = x.unexplained[i] ** 2 - AGREEMENT * x.unexplained_variance[i]
+        excess = x.unexplained[i] ** 2 - _NOTICED**2 * x.unexplained_variance[i]
         if excess > 0.0:
             P[r + i, r + i] += (1.0 - keep) * excess
         twice = _confirmed(torque[i], last.correction[i]) ** 2
