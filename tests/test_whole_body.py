@@ -229,12 +229,20 @@ def coverage(log: Log) -> float:
 ROLES = ("hip_yaw", "hip_roll", "hip_pitch", "knee_pitch", "ankle_pitch", "ankle_roll")
 
 
+@pytest.fixture(scope="module")
+def healthy(run: Run) -> Log:
+    """The walk as it is, with the filter's estimates, which several tests look at."""
+    return estimated(run("paper_walk_fbse", "duration=3"), WALK, WHOLE_BODY)
+
+
 @pytest.mark.parametrize("changes", [(), ("ground.stiffness=1.0e5",), ("seed=3",)])
-def test_friction_in_swing_is_not_the_noise_of_the_encoders(run: Run, changes: tuple[str, ...]):
+def test_friction_in_swing_is_not_the_noise_of_the_encoders(
+    run: Run, healthy: Log, changes: tuple[str, ...]
+):
     """Measured over the filter joint by joint: the hip yaws at a quarter to a half, in stance at
     half, and less over all."""
     log = run("paper_walk_fbse", "duration=3", *changes)
-    result = estimated(log, WALK, WHOLE_BODY)
+    result = estimated(log, WALK, WHOLE_BODY) if changes else healthy
     ratios = {
         (role, swings): phase_rms(result, friction_error(result), role, swings=swings)
         / phase_rms(log, friction_error(log), role, swings=swings)
@@ -256,29 +264,25 @@ def test_wrong_masses_are_no_surprise(run: Run):
     assert rms(friction_error(result)[1000:]) < 1.15 * rms(friction_error(log)[1000:])
 
 
-def test_late_forces_belong_to_the_tick_in_which_they_were(run: Run):
+def test_late_forces_belong_to_the_tick_in_which_they_were(run: Run, healthy: Log):
     """Taken for those of the present tick, forces that are 5 ms late make the error ten times as
     large; so they are stale in the first half second, until they are found to be late."""
-    late, log = (
-        run("paper_walk_fbse", "duration=3", *changes)
-        for changes in (("sensors.foot_force.delay=0.005",), ())
-    )
+    late = run("paper_walk_fbse", "duration=3", "sensors.foot_force.delay=0.005")
     errors = []
-    for of in (late, log):
-        result = estimated(of, WALK, WHOLE_BODY)
+    for result in (estimated(late, WALK, WHOLE_BODY), healthy):
         assert coverage(result) > 0.98
-        yawless = [not joint.endswith("hip_yaw") for joint in of.joints]
+        yawless = [not joint.endswith("hip_yaw") for joint in result.joints]
         errors.append(rms(friction_error(result)[1000:, yawless]))
     assert errors[0] < 1.5 * errors[1]
 
 
-def test_a_sensor_that_fails_leaves_friction_to_its_law(run: Run):
+def test_a_sensor_that_fails_leaves_friction_to_its_law(run: Run, healthy: Log):
     log = run("paper_walk_fbse", "duration=3")
     rows = slice(1500, 1700)
     force = log["foot/right/pad_force"].copy()
     force[rows] = 0.0
     broken = dataclasses.replace(log, channels={**log.channels, "foot/right/pad_force": force})
-    result, healthy = (estimated(of, WALK, WHOLE_BODY) for of in (broken, log))
+    result = estimated(broken, WALK, WHOLE_BODY)
     friction = result["estimate/joint/friction_torque"]
     assert np.all(np.isfinite(friction))
     assert coverage(result) > 0.97
