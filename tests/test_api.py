@@ -164,8 +164,8 @@ def test_compare_diagnose_add_agree_and_are_saved(rubbing, tmp_path: Path):
 
 def test_pictures_that_are_drawn_beside_a_diagnosis_are_those_of_one_job(rubbing, tmp_path: Path):
     one, two = (fd.diagnose(*rubbing, FEW, jobs=jobs) for jobs in (1, 2))
-    assert one.where is None
-    assert two.where is not None
+    assert one.illustrated is None
+    assert two.illustrated is not None
     texts = []
     for found in (one, two):
         found.report(tmp_path / "report.html")
