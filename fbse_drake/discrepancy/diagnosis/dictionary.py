@@ -173,7 +173,7 @@ class Dictionary:
         usual = self._fixed_columns(effect, target, self.usual_at(effect, target))
         if not len(usual.signature.rows):
             return []
-        around = self._around(effect, target) if self._is_deflection(usual.signature) else []
+        around = self._around(effect, target) if self.is_deflection(usual.signature) else []
         return [*(self._fixed_columns(effect, target, values) for values in around), usual]
 
     def _fixed_columns(
@@ -190,7 +190,7 @@ class Dictionary:
             noise = self.predictor.noise_in(effect, target, raw)
         return FixedColumns(target, nonlinear, raw, noise)
 
-    def _is_deflection(self, signature: Signature) -> bool:
+    def is_deflection(self, signature: Signature) -> bool:
         """Does an effect show in a transmission alone? Elsewhere the data hardly tell nonlinear
         parameters of what is no joint torque effect from others: they keep their default."""
         rows = self.predictor.motion.rows
