@@ -24,9 +24,11 @@ from fbse_drake.discrepancy.diagnosis import compare as comparing
 from fbse_drake.discrepancy.diagnosis import diagnose as diagnosing
 from fbse_drake.discrepancy.diagnosis import identify as identifying
 from fbse_drake.discrepancy.diagnosis import study as studying
+from fbse_drake.discrepancy.diagnosis.bandwidth import averaged_to_bandwidth
 from fbse_drake.discrepancy.diagnosis.compare import Comparison
 from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
-from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding, plausible_effects
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.identify import Identification
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.reading import Reading
@@ -50,7 +52,10 @@ from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress, silent
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy import (
+    Illustrated,
+    how_it_falls,
     where_it_fails,
+    why_it_fails,
     write_compare_report,
     write_diagnosis_report,
     write_study_report,
@@ -61,7 +66,7 @@ from fbse_drake.report.discrepancy_tables import (
     spread_tables,
     steps_table,
 )
-from fbse_drake.report.html import Section, Table, drawn
+from fbse_drake.report.html import Table, drawn
 from fbse_drake.report.identification import (
     errors_table,
     identification_outcome,
@@ -264,8 +269,8 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
     """Which effects a model lacks, see `Diagnosis`."""
 
     case: Case = field(kw_only=True, repr=False)
-    # What its report says of where the model fails, if that was drawn beside the diagnosis.
-    where: Section | None = field(default=None, kw_only=True, repr=False)
+    # Of its report, if that was drawn beside the diagnosis; else it is drawn when it is shown.
+    illustrated: Illustrated | None = field(default=None, kw_only=True, repr=False)
     file: ClassVar[str] = "diagnosis"
 
     @property
@@ -287,7 +292,8 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
 
     def _report(self, path: Path, inputs: Inputs) -> None:
         case = self.case
-        write_diagnosis_report(path, self, case.comparison, case.predictor, inputs, self.where)
+        illustrated = self.illustrated or Illustrated.of(self, case.comparison, case.predictor)
+        write_diagnosis_report(path, self, case.predictor, inputs, illustrated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,8 +411,8 @@ def diagnose(
         name: what the scenario is called in reports.
         progress: is told what is being done, and may end the work with what is known then
             (`ProgressLines(print, limit=60)`).
-        jobs: how many things are done side by side: from two on, pictures of its report are drawn
-            while it searches.
+        jobs: how many things are done side by side: from two on, effects are predicted while the
+            log is inspected, and pictures of its report are drawn while it searches.
 
     Raises:
         InputError: see `compare`; or no joint is left whose torque can be trusted.
@@ -420,19 +426,33 @@ def diagnose(
     'Nm'
     """
     case = Case.divided(scenario, log, tests, name)
-    trusted = case.predictor.of(case.trusted)
-    tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
     with Processes(jobs) as processes:
-        drawing = processes.begin(lambda _: drawn(where_it_fails(case.comparison, case.predictor)))
         beside = processes.beside(progress)
-        diagnosis = diagnose_confirmed(trusted, effects, tested, progress=beside)
-        # With one job it is drawn when it is shown.
-        (where,) = processes.results([drawing], silent, "drawing") if jobs > 1 else [None]
-    if diagnosis.chosen:
-        completed = addition.add(case.trusted, diagnosis.chosen)
-        set_aside = {test: validated(other, other.of(completed)) for test, other in tested.items()}
-        diagnosis = replace(diagnosis, set_aside=set_aside)
-    return _with_case(DiagnosisResult, diagnosis, case=case, where=where)
+        averaged, _ = averaged_to_bandwidth(case.predictor)
+        tried = plausible_effects(averaged) if effects is None else list(effects)
+        dictionary = Dictionary(averaged, tried, beside)
+        dictionary.begin(processes)
+        where = processes.begin(lambda _: drawn(where_it_fails(case.comparison, case.predictor)))
+        # While it is begun the log is inspected; mostly all of it is trusted.
+        trusted = case.predictor.of(case.trusted)
+        tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
+        diagnosis = diagnose_confirmed(
+            trusted, tried, tested, progress=beside, dictionary=dictionary
+        )
+        why = processes.begin(lambda _: [*map(drawn, why_it_fails(diagnosis))])
+        path = processes.begin(lambda _: [*map(drawn, how_it_falls(diagnosis, trusted.robot))])
+        set_aside = {}
+        if diagnosis.chosen:
+            completed = addition.add(case.trusted, diagnosis.chosen)
+            set_aside = {
+                test: validated(other, other.of(completed)) for test, other in tested.items()
+            }
+        illustrated = None
+        if jobs > 1:
+            (of_where,) = processes.results([where], silent, "drawing")
+            illustrated = Illustrated(of_where, *processes.results([why, path], silent, "drawing"))
+    diagnosis = replace(diagnosis, set_aside=set_aside)
+    return _with_case(DiagnosisResult, diagnosis, case=case, illustrated=illustrated)
 
 
 def study(

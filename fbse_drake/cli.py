@@ -5,6 +5,7 @@ Exit status: 0 done, 1 the run failed or was interrupted (what is known is writt
 
 import argparse
 import errno
+import gc
 import io
 import os
 import sys
@@ -18,6 +19,8 @@ from fbse_drake.entry import FAILED, INTERRUPTED, end_as_at_ctrl_c, keep_what_is
 from fbse_drake.errors import InputError, on_one_line
 
 DONE, BAD_INPUT = 0, 2
+# Objects that may be made before those that hold each other are looked for.
+_COLLECTED = 100_000
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 # What can be listed.
 LISTED = ("scenarios", "robots", "effects", "estimators", "sensors", "compensations")
@@ -72,6 +75,8 @@ def _complain(line: str) -> None:
 def entry() -> None:
     """The command. It ends at SIGTERM and SIGHUP as it does at Ctrl-C."""
     end_as_at_ctrl_c()
+    # By default all that lives is looked through so often that it is a tenth of a diagnosis' time.
+    gc.set_threshold(_COLLECTED)
     for stream in (sys.stdout, sys.stderr):
         # What a terminal of an old locale cannot show becomes a question mark.
         if isinstance(stream, io.TextIOWrapper):
@@ -267,8 +272,8 @@ def _parser() -> argparse.ArgumentParser:
                 "--jobs",
                 metavar="N",
                 type=_positive_whole_number,
-                default=1,
-                help="do so many things side by side: diagnose, draw, simulate (default: 1)",
+                help="do so many things side by side: predict, search, draw, simulate "
+                "(default: one for each core on Linux, else 1)",
             )
         _add_output(run, f"as for simulate, with _{name} at its end")
 

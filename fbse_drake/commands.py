@@ -37,6 +37,7 @@ from fbse_drake.interop.convert import read_log, read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.listing import listing
 from fbse_drake.log import Log
+from fbse_drake.processes import usual_jobs
 from fbse_drake.progress import Interrupted, Progress, ProgressLines
 from fbse_drake.report.discrepancy_figures import targets_text
 from fbse_drake.report.discrepancy_tables import findings_table
@@ -120,7 +121,7 @@ def _diagnose(options: argparse.Namespace) -> bool:
             tests=_tests(options),
             name=given.inputs.name,
             progress=progress,
-            jobs=options.jobs,
+            jobs=options.jobs or usual_jobs(),
         )
     _conclude(given, result)
     return result.partial is None
@@ -135,7 +136,7 @@ def _study(options: argparse.Namespace) -> bool:
             tests=_tests(options),
             name=given.inputs.name,
             progress=progress,
-            jobs=options.jobs,
+            jobs=options.jobs or usual_jobs(),
         )
     _conclude(given, result)
     return not result.partial

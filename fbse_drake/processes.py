@@ -1,7 +1,9 @@
 """Work in processes of its own, beside what this one does."""
 
 import multiprocessing
+import os
 import signal
+import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,6 +18,14 @@ from fbse_drake.progress import Progress, silent
 T = TypeVar("T")
 # How often processes are looked at while nothing else is done [s].
 _LOOK_PERIOD = 0.2
+
+
+def usual_jobs() -> int:
+    """How many things are best done side by side: one for each core that this process may use.
+
+    Elsewhere than on Linux one, for system libraries there do not bear a fork.
+    """
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
 
 
 @dataclass(eq=False)

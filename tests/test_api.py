@@ -15,6 +15,7 @@ import pytest
 
 import fbse_drake as fd
 from fbse_drake.files import from_json, to_json
+from fbse_drake.progress import Interrupted
 from fbse_drake.scenario import dump_scenario
 
 FEW = [fd.CoulombFriction, fd.ViscousFriction, fd.TorqueBias]
@@ -164,13 +165,30 @@ def test_compare_diagnose_add_agree_and_are_saved(rubbing, tmp_path: Path):
 
 def test_pictures_that_are_drawn_beside_a_diagnosis_are_those_of_one_job(rubbing, tmp_path: Path):
     one, two = (fd.diagnose(*rubbing, FEW, jobs=jobs) for jobs in (1, 2))
-    assert one.where is None
-    assert two.where is not None
+    assert one.illustrated is None
+    assert two.illustrated is not None
     texts = []
     for found in (one, two):
         found.report(tmp_path / "report.html")
         texts.append((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert texts[0] == texts[1]
+
+
+def test_a_diagnosis_that_is_stopped_beside_other_work_is_a_valid_partial_one(
+    rubbing, tmp_path: Path
+):
+    stops = ["time is up"]
+
+    def progress(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+        if text.startswith("predicting") and stops:
+            raise Interrupted(stops.pop())
+
+    found = fd.diagnose(*rubbing, FEW, jobs=2, progress=progress)
+    assert found.partial == "time is up"
+    assert not found.chosen
+    found.save(tmp_path)
+    assert json.loads((tmp_path / "diagnosis.json").read_text())["partial"]
+    assert "time is up" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_folder_that_cannot_be_made_is_refused(rubbing, tmp_path: Path):

@@ -31,6 +31,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.processes import Processes
 from fbse_drake.progress import Interrupted
 from fbse_drake.scenario import IdentifyConfig, Scenario, load_scenario
 from fbse_drake.simulation import simulate
@@ -109,6 +110,39 @@ HIDDEN = {
         {"x": 0.1, "y": -0.05, "z": 0.0},
     ),
 }
+
+
+def test_effects_that_are_predicted_in_another_process_are_those_of_this_one():
+    @dataclass(frozen=True)
+    class Local(library()["FootForceGain"]):  # type: ignore[misc]
+        """Nobody finds it by its name."""
+
+    predictor = Predictor(scenario(), log_with(""))
+    tried = [*effects(), Local]
+    here, beside = (Dictionary(predictor, tried) for _ in range(2))
+    with Processes(2) as processes:
+        beside.begin(processes)
+        there = beside.fixed
+    assert list(there) == list(here.fixed)
+    for effect, columns in here.fixed.items():
+        assert [c.target for c in columns] == [c.target for c in there[effect]]
+        for one, other in zip(columns, there[effect], strict=True):
+            np.testing.assert_array_equal(one.signature.values, other.signature.values)
+            np.testing.assert_array_equal(one.signature.rows, other.signature.rows)
+
+
+def test_a_dictionary_serves_no_other_log_model_or_effects():
+    predictor = Predictor(scenario(), log_with(""))
+    dictionary = Dictionary(predictor, effects())
+    assert dictionary.serves(Predictor(scenario(), log_with("")), effects())
+    recording = replace(scenario().recording, unused_rows=["left_knee_pitch"])
+    distrusting = replace(scenario(), recording=recording)
+    assert not dictionary.serves(predictor.of(distrusting), effects())
+    assert not dictionary.serves(predictor.without([(1.0, 1.1)]), effects())
+    assert not dictionary.serves(
+        Predictor(scenario(), Log(log_with("").channels, log_with("").meta)), effects()
+    )
+    assert not dictionary.serves(predictor, effects()[1:])
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)

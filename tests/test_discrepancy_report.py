@@ -250,7 +250,13 @@ def test_diagnosis_report_says_what_how_sure_what_else_and_what_next(
     walk: tuple[Predictor, Comparison],
     tmp_path: Path,
 ):
-    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    reports.write_diagnosis_report(
+        tmp_path / "report.html",
+        diagnosis,
+        walk[0],
+        INPUTS,
+        reports.Illustrated.of(diagnosis, walk[1], walk[0]),
+    )
     text = page_text(tmp_path / "report.html")
     for expected in texts:
         assert expected in text
@@ -500,7 +506,13 @@ def test_effects_without_a_place_on_the_robot_are_not_spoken_of(
     """As feet on an arm."""
     feet = EffectStatus("not_visible", "gain", "1", {}, "Stand on one foot.")
     diagnosis = made_diagnosis(effects=STATUSES | {"FootForceGain": feet})
-    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    reports.write_diagnosis_report(
+        tmp_path / "report.html",
+        diagnosis,
+        walk[0],
+        INPUTS,
+        reports.Illustrated.of(diagnosis, walk[1], walk[0]),
+    )
     text = page_text(tmp_path / "report.html")
     assert "4 effects: 1 present, 1 confusable, 1 absent, 1 not visible." in text
     assert "Foot force gain" not in text
@@ -513,7 +525,13 @@ def test_a_search_that_ended_early_rules_nothing_out(
 ):
     stopped = {"partial": "the time limit of 6 s was reached"} if interrupted else {}
     diagnosis = dataclasses.replace(UNKNOWN, **stopped)
-    reports.write_diagnosis_report(tmp_path / "report.html", diagnosis, walk[1], walk[0], INPUTS)
+    reports.write_diagnosis_report(
+        tmp_path / "report.html",
+        diagnosis,
+        walk[0],
+        INPUTS,
+        reports.Illustrated.of(diagnosis, walk[1], walk[0]),
+    )
     text = page_text(tmp_path / "report.html")
     for claim in ("no effect explains enough", "Nothing else in the library", "of your own"):
         assert (claim in text) != interrupted

@@ -268,6 +268,21 @@ def test_play_is_found_with_its_rotor():
     assert finding.parameters["rotor_inertia"].value == pytest.approx(0.2, rel=0.05)
 
 
+def test_a_spring_and_play_in_one_joint_have_their_own_values():
+    """The spring's time constant is sought between the values that are tried first: at the nearest
+    of these 15 times the noise is left, and the rotor is a fifth too light."""
+    diagnosis = found_in(log_of(("elastic", ANKLE), ("play", ANKLE), duration=6.0))
+    assert names(diagnosis) == {("TransmissionElasticity", (ANKLE,)), ("Backlash", (ANKLE,))}
+    values = {f.effect: f.parameters for f in diagnosis.chosen}
+    spring, play = values["TransmissionElasticity"], values["Backlash"]
+    assert spring["compliance"].value == pytest.approx(COMPLIANCE, rel=0.02)
+    assert spring["time_constant"].value == pytest.approx(TIME_CONSTANT, rel=0.03)
+    assert play["gap"].value == pytest.approx(3e-3, rel=0.02)
+    assert play["rotor_inertia"].value == pytest.approx(0.2, rel=0.05)
+    assert diagnosis.held_out_after < 1.2
+    assert all(structure.ratio < 3.0 for structure in diagnosis.unexplained)
+
+
 def test_play_under_a_torque_of_one_sign_is_not_told_from_an_offset():
     log = log_of(("play", KNEE))
     assert np.ptp(np.sign(log["joint/torque_command"][:, log.joints.index(KNEE)])) == 0

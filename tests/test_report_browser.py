@@ -227,7 +227,11 @@ def test_reports_of_a_machine_without_legs_are_lab_reports(visit: Visitor, folde
     check(visit, folder / "compare.html", [SUMMARY, WHERE, HYGIENE, AGAIN], 3)
     assert "In 2 of 2 joints." in (folder / "compare.html").read_text(encoding="utf-8")
     reports.write_diagnosis_report(
-        folder / "diagnosis.html", found.diagnoses[0], comparison, before, INPUTS
+        folder / "diagnosis.html",
+        found.diagnoses[0],
+        before,
+        INPUTS,
+        reports.Illustrated.of(found.diagnoses[0], comparison, before),
     )
     check(visit, folder / "diagnosis.html", [SUMMARY, WHERE, WHY, ELSE, FALL, HYGIENE, AGAIN], 7)
     reports.write_study_report(

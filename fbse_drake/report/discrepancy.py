@@ -1,6 +1,7 @@
 """The reports of compare, diagnose and study."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
@@ -138,20 +139,39 @@ def write_compare_report(
     )
 
 
+@dataclass(frozen=True)
+class Illustrated:
+    """What the report of a diagnosis says in sections with pictures: `where_it_fails`,
+    `why_it_fails` and `how_it_falls`."""
+
+    where: Section
+    why: Sequence[Section]
+    path: Sequence[Section]
+
+    @classmethod
+    def of(
+        cls, diagnosis: Diagnosis, comparison: Comparison, predictor: Predictor
+    ) -> "Illustrated":
+        """Drawn when it is shown.
+
+        Args:
+            comparison: of the model as it is.
+        """
+        return cls(
+            where_it_fails(comparison, predictor),
+            why_it_fails(diagnosis),
+            how_it_falls(diagnosis, predictor.robot),
+        )
+
+
 def write_diagnosis_report(
     path: str | Path,
     diagnosis: Diagnosis,
-    comparison: Comparison,
     predictor: Predictor,
     inputs: Inputs,
-    where: Section | None = None,
+    illustrated: Illustrated,
 ) -> None:
-    """Writes which effects a model lacks as one HTML file.
-
-    Args:
-        comparison: of the model as it is.
-        where: what `where_it_fails` says of it, if that was made already.
-    """
+    """Writes which effects a model lacks as one HTML file."""
     outcome, statuses = (
         inputs.hygiene.before(diagnosis_outcome(diagnosis)),
         applicable(diagnosis.effects),
@@ -177,10 +197,10 @@ def write_diagnosis_report(
     )
     sections = [
         _summary(rows),
-        where_it_fails(comparison, predictor) if where is None else where,
-        *_why([diagnosis.chosen], diagnosis.ranking, diagnosis.unexplained),
+        illustrated.where,
+        *illustrated.why,
         _what_was_looked_for(statuses),
-        *_path(diagnosis, predictor.robot),
+        *illustrated.path,
         _hygiene(predictor, inputs),
         _reproduce("diagnose", predictor, inputs),
     ]
@@ -323,6 +343,11 @@ def _worst(comparison: Comparison) -> list[Channel]:
     return [
         by_name[name] for name in dict.fromkeys(failure.row.name for failure in comparison.failures)
     ][:_CHANNELS]
+
+
+def why_it_fails(diagnosis: Diagnosis) -> list[Section]:
+    """What was found, with its values and the alternatives, and what is left."""
+    return _why([diagnosis.chosen], diagnosis.ranking, diagnosis.unexplained)
 
 
 def _why(
@@ -543,7 +568,7 @@ def _worst_stretch(power: np.ndarray) -> slice:
     return slice(start, start + length)
 
 
-def _path(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
+def how_it_falls(diagnosis: Diagnosis, robot: Robot) -> list[Section]:
     """How the error falls on the way to a diagnosis."""
     if len(diagnosis.path) < 2:
         return []

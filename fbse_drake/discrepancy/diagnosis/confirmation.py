@@ -16,6 +16,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import (
     diagnose,
     plausible_effects,
 )
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.validation import LEVEL, validated
 from fbse_drake.effects.effect import Effect
@@ -32,14 +33,16 @@ def diagnose_confirmed(
     tests: Mapping[str, Predictor] | None = None,
     *,
     progress: Progress = silent,
+    dictionary: Dictionary | None = None,
 ) -> Diagnosis:
     """A diagnosis as by `diagnose`, without effects that raise the error of data set aside.
 
     Args:
         tests: the predictor's model over logs set aside, by name.
+        dictionary: see `diagnose`.
     """
     tried = plausible_effects(predictor) if effects is None else list(effects)
-    diagnosis = diagnose(predictor, tried, progress=progress)
+    diagnosis = diagnose(predictor, tried, progress=progress, dictionary=dictionary)
     refuted: dict[str, tuple[Finding, ...]] = {}
     statuses: dict[str, EffectStatus] = {}
     for _ in range(_MOST_SEARCHES):

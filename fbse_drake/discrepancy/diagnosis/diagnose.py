@@ -175,6 +175,7 @@ def diagnose(
     effects: Iterable[type[Effect]] | None = None,
     *,
     progress: Progress = silent,
+    dictionary: Dictionary | None = None,
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
@@ -185,14 +186,18 @@ def diagnose(
     Args:
         effects: what is tried; by default `plausible_effects`.
         progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
+        dictionary: of these effects, begun already; it is used where it is of this log and model.
     """
     predictor, averaging = averaged_to_bandwidth(predictor)
     tried = plausible_effects(predictor) if effects is None else list(effects)
-    search = _searched(predictor, tried, progress)
+    if dictionary is None or not dictionary.serves(predictor, tried):
+        dictionary = Dictionary(predictor, tried, progress)
+    predictor = dictionary.predictor
+    search = _searched(dictionary, tried)
     disturbed = search.disturbances
     if disturbed:
         predictor = predictor.without([(one.start, one.end) for one in disturbed])
-        search = _searched(predictor, tried, progress)
+        search = _searched(Dictionary(predictor, tried, progress), tried)
     proposals, path, alternatives = search.proposals, search.path, search.alternatives
     before, inertia, unexplained = search.before, search.inertia, search.unexplained
     partial, final, fits = search.partial, path[-1], proposals.fits
@@ -264,8 +269,9 @@ class _Search:
     partial: str | None
 
 
-def _searched(predictor: Predictor, effects: Sequence[type[Effect]], progress: Progress) -> _Search:
-    dictionary, partial = Dictionary(predictor, effects, progress), None
+def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Search:
+    """What is found by a dictionary of these effects."""
+    predictor, progress, partial = dictionary.predictor, dictionary.progress, None
     proposals = Proposals(Fits(dictionary))
     path, before = [proposals.fits.explain([])], proposals.fits.white.sse
     try:

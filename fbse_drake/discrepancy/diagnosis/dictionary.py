@@ -2,7 +2,7 @@
 nothing of noise."""
 
 import itertools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -22,17 +22,19 @@ from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
+from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress, silent
 
 # So many numbers are kept in columns, at most.
 _MOST_NUMBERS = 4_000_000
+# What is said meanwhile.
+_PREDICTING = "predicting what each effect would do"
 
 
 @dataclass(frozen=True)
 class FixedColumns:
-    """An effect that is no joint torque effect, on one target."""
+    """What an effect that is no joint torque effect adds on one target."""
 
-    effect: type[Effect]
     target: str
     # Values of its nonlinear parameters, which are not searched for, (m,).
     nonlinear: np.ndarray
@@ -57,6 +59,7 @@ class Dictionary:
             progress: is told what is being done with the dictionary, too.
         """
         self.predictor, self.progress = predictor, progress
+        self._given = tuple(effects)
         self.effects = [effect for effect in effects if not effect.composite]
         # In a log per step it is not known at which velocity within the step a law holds: what such
         # a law leaves is weak evidence.
@@ -76,6 +79,7 @@ class Dictionary:
             self._look_at(self.inertia)
         self._grids: dict[tuple[type[JointTorqueEffect], int], np.ndarray] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
+        self._fixed_beside: Callable[[], list[list[FixedColumns]]] | None = None
 
     def _look_at(self, inertia: UntrustedInertia) -> None:
         """Finds the directions of inertia that the log shows."""
@@ -100,6 +104,10 @@ class Dictionary:
     @cached_property
     def joint_effects(self) -> list[type[JointTorqueEffect]]:
         return [effect for effect in self.effects if issubclass(effect, JointTorqueEffect)]
+
+    @cached_property
+    def _other_effects(self) -> list[type[Effect]]:
+        return [effect for effect in self.effects if not issubclass(effect, JointTorqueEffect)]
 
     @cached_property
     def groups(self) -> list[tuple[str, ...]]:
@@ -130,25 +138,47 @@ class Dictionary:
             if allowed.issuperset(group) and (len(group) == 1 or shown.issuperset(group))
         ]
 
+    def serves(self, predictor: Predictor, effects: Collection[type[Effect]]) -> bool:
+        """Is it of these effects, and of another predictor's model over the same log?"""
+        return self._given == tuple(effects) and self.predictor.is_like(predictor)
+
+    def begin(self, processes: Processes) -> None:
+        """Begins to predict `fixed` beside other work."""
+        task = processes.begin(self._fixed)
+
+        def result() -> list[list[FixedColumns]]:
+            (found,) = processes.results([task], self.progress, _PREDICTING)
+            return found
+
+        self._fixed_beside = result
+
     @cached_property
-    def fixed(self) -> list[FixedColumns]:
+    def fixed(self) -> dict[type[Effect], list[FixedColumns]]:
         """All candidates that are no joint torque effects: one for each target that moves the
         residual."""
+        found = self._fixed(self.progress) if self._fixed_beside is None else self._fixed_beside()
+        return dict(zip(self._other_effects, found, strict=True))
+
+    def _fixed(self, progress: Progress) -> list[list[FixedColumns]]:
+        """By effect. (The class of an effect need not be known to another process by its name.)"""
         result = []
-        for k, effect in enumerate(self.effects):
-            self.progress("predicting what each effect would do", k / len(self.effects))
-            if issubclass(effect, JointTorqueEffect):
-                continue
-            for target in self._targets(effect):
-                usual = self._fixed(effect, target, self.usual_at(effect, target))
-                if self._is_deflection(usual.signature):
-                    points = self._around(effect, target)
-                    result += [self._fixed(effect, target, values) for values in points]
-                if len(usual.signature.rows):
-                    result.append(usual)
+        for k, effect in enumerate(self._other_effects):
+            progress(_PREDICTING, k / len(self._other_effects))
+            result.append([c for target in self._targets(effect) for c in self._on(effect, target)])
         return result
 
-    def _fixed(self, effect: type[Effect], target: str, nonlinear: np.ndarray) -> FixedColumns:
+    def _on(self, effect: type[Effect], target: str) -> list[FixedColumns]:
+        """Columns of an effect on one target, of several values of its nonlinear parameters where
+        these are searched for; none if it moves nothing."""
+        usual = self._fixed_columns(effect, target, self.usual_at(effect, target))
+        if not len(usual.signature.rows):
+            return []
+        around = self._around(effect, target) if self.is_deflection(usual.signature) else []
+        return [*(self._fixed_columns(effect, target, values) for values in around), usual]
+
+    def _fixed_columns(
+        self, effect: type[Effect], target: str, nonlinear: np.ndarray
+    ) -> FixedColumns:
         raw = self.predictor.signature(effect, target, nonlinear)
         raw = replace(
             raw,
@@ -158,9 +188,9 @@ class Dictionary:
         noise = None
         if issubclass(effect, InertiaEffect) and len(raw.rows):
             noise = self.predictor.noise_in(effect, target, raw)
-        return FixedColumns(effect, target, nonlinear, raw, noise)
+        return FixedColumns(target, nonlinear, raw, noise)
 
-    def _is_deflection(self, signature: Signature) -> bool:
+    def is_deflection(self, signature: Signature) -> bool:
         """Does an effect show in a transmission alone? Elsewhere the data hardly tell nonlinear
         parameters of what is no joint torque effect from others: they keep their default."""
         rows = self.predictor.motion.rows

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.stats import chi2
 
-from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary, FixedColumns
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
@@ -22,6 +22,7 @@ from fbse_drake.discrepancy.identification.regression import (
     leftover,
 )
 from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Probability of any false alarm on a log that hides nothing.
@@ -115,27 +116,28 @@ class Fits:
     def fixed_candidates(self) -> list[Candidate]:
         """All candidates that are no joint torque effects: one for each target that moves the
         residual."""
-        result = []
-        for fixed in self.dictionary.fixed:
-            signature = self.white.whiten_signature(fixed.signature)
-            spurious = (
-                0.0
-                if fixed.noise is None
-                else self._spurious(signature, self.white.whiten_signature(fixed.noise))
-            )
-            parameters = self.dictionary.parameters(fixed.effect, fixed.target)
-            result.append(
-                Candidate(
-                    fixed.effect,
-                    (fixed.target,),
-                    parameters,
-                    fixed.nonlinear,
-                    signature,
-                    fixed.signature,
-                    spurious,
-                )
-            )
-        return result
+        return [
+            self._fixed_candidate(effect, fixed)
+            for effect, found in self.dictionary.fixed.items()
+            for fixed in found
+        ]
+
+    def _fixed_candidate(self, effect: type[Effect], fixed: FixedColumns) -> Candidate:
+        signature = self.white.whiten_signature(fixed.signature)
+        spurious = (
+            0.0
+            if fixed.noise is None
+            else self._spurious(signature, self.white.whiten_signature(fixed.noise))
+        )
+        return Candidate(
+            effect,
+            (fixed.target,),
+            self.dictionary.parameters(effect, fixed.target),
+            fixed.nonlinear,
+            signature,
+            fixed.signature,
+            spurious,
+        )
 
     def _spurious(self, signature: Signature, noise: Signature) -> float:
         """Drop of the deviance that the noise in a signature may feign."""

@@ -91,6 +91,7 @@ class Predictor:
         self._given_noise = noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
+        self._motions_of_joint: dict[tuple[int, int, bool], JointMotion] = {}
 
     def of(self, scenario: Scenario) -> "Predictor":
         """Another scenario's model over the same log, which is read again only if need be; its
@@ -98,6 +99,15 @@ class Predictor:
         if scenario == self.scenario and self._given_noise is None:
             return self
         return Predictor(scenario, self.log, None, self.left_out, self.reading)
+
+    def is_like(self, other: "Predictor") -> bool:
+        """Does another one predict the same?"""
+        return (
+            self.log is other.log
+            and self.scenario == other.scenario
+            and self.left_out == other.left_out
+            and self._given_noise == other._given_noise
+        )
 
     def without(self, stretches: Sequence[tuple[float, float]]) -> "Predictor":
         """The same without some stretches [s] of the log."""
@@ -306,8 +316,12 @@ class Predictor:
     def _motion_of(self, joints: np.ndarray, step: int, *, noisier: bool) -> JointMotion:
         """What effects on some joints depend on, averaged over so many steps."""
         whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
-        names = ("velocity", "position", "command", "load")
-        return whole._replace(**{name: getattr(whole, name)[:, joints] for name in names})
+        if len(joints) > 1:
+            return _columns(whole, joints)
+        key = (int(joints[0]), step, noisier)
+        if key not in self._motions_of_joint:
+            self._motions_of_joint[key] = _columns(whole, joints)
+        return self._motions_of_joint[key]
 
     def _torques(
         self,
@@ -696,6 +710,12 @@ class Predictor:
         creep, (B, R)."""
         sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
+
+
+def _columns(motion: JointMotion, joints: np.ndarray) -> JointMotion:
+    """Of some joints."""
+    names = ("velocity", "position", "command", "load")
+    return motion._replace(**{name: getattr(motion, name)[:, joints] for name in names})
 
 
 def _joined(motion: JointMotion, steps: int) -> JointMotion:

@@ -23,6 +23,8 @@ from fbse_drake.errors import InputError
 
 # How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
 _POLISHINGS = 3
+# By these factors nonlinear values of what shows in a transmission are moved, one after the other.
+_WIDTHS = (1.25, 1.12, 1.06, 1.03, 1.015)
 # How often untrusted bodies are measured anew, at most.
 _REMEASUREMENTS = 3
 
@@ -53,10 +55,12 @@ def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
         if not issubclass(candidate.effect, JointTorqueEffect):
             values = explanation.solved.parameters[start - size : start]
             try:
-                moved.append(fits.about(candidate, values))
+                about = fits.about(candidate, values)
             except InputError:
                 # No body has these values.
                 return members
+            others = [c for c in members if c is not candidate]
+            moved.append(_narrowed(fits, others, about, values))
             continue
         if m == 0:
             moved.append(candidate)
@@ -75,6 +79,26 @@ def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
         )
     better = fits.explain(moved)
     return better.candidates if better.deviance <= explanation.deviance + COMPLEXITY else members
+
+
+def _narrowed(
+    fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray
+) -> Candidate:
+    """A candidate that is no joint torque effect with its nonlinear values where they fit best
+    beside others, if the log tells them at all: what shows in a transmission alone."""
+    if not fits.dictionary.is_deflection(candidate.signature):
+        return candidate
+    best = fits.explain([*others, candidate])
+    for k, name in enumerate(candidate.nonlinear_names):
+        low, high = candidate.parameters[name].plausible
+        for width in _WIDTHS:
+            here = best.candidates[-1].nonlinear
+            for value in np.clip(here[k] * np.array([1 / width, width]), low, high):
+                nonlinear = here.copy()
+                nonlinear[k] = value
+                tried = fits.about(replace(best.candidates[-1], nonlinear=nonlinear), linear)
+                best = min(best, fits.explain([*others, tried]), key=lambda e: e.deviance)
+    return best.candidates[-1]
 
 
 def consistent(
