@@ -299,14 +299,16 @@ def changed(log: Log, name: str, rows: slice, values: np.ndarray | float) -> Log
 
 
 @pytest.mark.parametrize("joint", ["right_knee_pitch", "left_ankle_roll"])
-def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(run: Run, joint: str):
+def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
+    run: Run, healthy: Log, joint: str
+):
     """A command that is larger than the torque by a constant looks like so much more friction."""
     log = run("paper_walk_fbse", "duration=3")
     number, rows, offset = log.joints.index(joint), slice(1500, 2000), 8.0
     command = log["joint/torque_command"][rows].copy()
     command[:, number] += offset
     wrong = changed(log, "joint/torque_command", rows, command)
-    result, healthy = (estimated(of, WALK, WHOLE_BODY) for of in (wrong, log))
+    result = estimated(wrong, WALK, WHOLE_BODY)
     friction, std = (
         np.stack([of[f"estimate/joint/{name}"] for of in (result, healthy)])
         for name in ("friction_torque", "friction_torque_std")
@@ -341,22 +343,21 @@ def test_laws_outlast_a_delay_of_the_forces_that_begins_later(run: Run):
     assert np.all(variance[-1] < 1.5 * variance[1500])
 
 
-def test_it_tells_what_the_stages_tell_that_it_stands_for(run: Run):
+def test_it_tells_what_the_stages_tell_that_it_stands_for(run: Run, healthy: Log):
     """Joint accelerations, link torque and the measured friction, against the truth."""
     log = run("paper_walk_fbse", "duration=3")
-    result = estimated(log, WALK, WHOLE_BODY)
     rows = slice(1000, None)
     command = log["joint/torque_command"][:-1]
-    told = result["estimate/joint/link_torque"] + result["estimate/joint/friction_torque"]
+    told = healthy["estimate/joint/link_torque"] + healthy["estimate/joint/friction_torque"]
     np.testing.assert_allclose(told[1:], command, atol=1e-9)
     truth = log["truth/joint/acceleration"][rows]
-    error = result["estimate/joint/acceleration"][rows] - truth
+    error = healthy["estimate/joint/acceleration"][rows] - truth
     # The encoders' difference has sqrt(2) 5e-4 / 1e-3 = 0.7 rad/s^2 of noise.
     assert rms(error) < 0.7 * np.sqrt(2)
     assert rms(error) < 0.2 * rms(truth)
     # White noise of the measured friction is gone in its mean.
     residual = (
-        result["estimate/joint/residual_torque"][rows]
-        - result["estimate/joint/friction_torque"][rows]
+        healthy["estimate/joint/residual_torque"][rows]
+        - healthy["estimate/joint/friction_torque"][rows]
     )
     assert np.all(np.abs(residual.mean(axis=0)) < 0.1 * residual.std(axis=0))
