@@ -319,16 +319,17 @@ def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
     np.testing.assert_allclose(found, offset, atol=0.5)
     assert np.mean(np.abs(moved[rows]) < 3 * widest[rows]) > 0.999
     others = np.arange(len(log.joints)) != number
-    assert np.all(np.abs(moved[rows.start + 20 : rows.stop, others]) < 0.5)
-    # The laws are what they were, and so is the friction as soon as the command is right.
+    assert max(rms(moved[rows, other]) for other in np.flatnonzero(others)) < 0.05 * offset
+    # The laws are what they were, and so is the friction soon after the command is right.
     parameters, deviation = (
         healthy[f"estimate/friction/{name}"][rows.stop]
         for name in ("parameters", "parameter_variance")
     )
     learned = result["estimate/friction/parameters"][rows.stop] - parameters
     assert np.all(np.abs(learned) < 3 * np.sqrt(deviation) + 0.05)
-    after = slice(rows.stop + 50, None)
-    assert np.all(np.abs(moved[after]) < 3 * std[1][after] + 1e-3)
+    as_before = np.abs(moved) < 3 * std[1]
+    assert np.mean(as_before[rows.stop + 50 :]) > 0.99
+    assert np.all(as_before[rows.stop + 300 :])
 
 
 def test_laws_outlast_a_delay_of_the_forces_that_begins_later(run: Run):
