@@ -362,3 +362,20 @@ def test_it_tells_what_the_stages_tell_that_it_stands_for(run: Run, healthy: Log
         - healthy["estimate/joint/friction_torque"][rows]
     )
     assert np.all(np.abs(residual.mean(axis=0)) < 0.1 * residual.std(axis=0))
+
+
+def test_a_loose_contact_leaves_nothing_behind(run: Run, healthy: Log):
+    """A velocity that is zero in every other 20 ms contradicts the model by hundreds of Nm, again
+    and again; variances of such a size beside the sensors' must not cancel."""
+    log = run("paper_walk_fbse", "duration=3")
+    number, rows = log.joints.index("right_knee_pitch"), slice(1500, 2000)
+    velocity = log["joint/velocity"][rows].copy()
+    velocity[np.arange(500) // 20 % 2 == 0, number] = 0.0
+    result = estimated(changed(log, "joint/velocity", rows, velocity), WALK, WHOLE_BODY)
+    friction, std = (
+        np.stack([of[f"estimate/joint/{name}"] for of in (result, healthy)])
+        for name in ("friction_torque", "friction_torque_std")
+    )
+    moved = np.abs(friction[0] - friction[1])
+    assert np.mean(moved[rows] < 3 * std[:, rows].max(axis=0)) > 0.999
+    assert np.all(moved[rows.stop + 500 :] < 3 * std[1, rows.stop + 500 :])

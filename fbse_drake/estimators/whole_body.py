@@ -449,8 +449,34 @@ def _listen(
         weight = _inverse(expected + np.diag(x.noise * known.variance + excess))
     keep = math.exp(-elapsed / _DOUBT_TIME)
     x.surprise = max(surprise, 1.0 + keep * (last.surprise - 1.0))
-    _correct(x, columns, weight @ columns, innovation, learning)
+    gain = weight @ columns
+    _correct(x, columns, gain, innovation, learning)
+    # R S^-1 P is P - P S^-1 P without the difference of large numbers.
+    for i in range(r):
+        P[i] = (x.noise[i] * known.variance[i] + excess[i]) * gain[i]
+    P[:, :r] = P[:r].T
+    P[:r, :r] = 0.5 * (P[:r, :r] + P[:r, :r].T)
+    _restore_variance(x, elapsed, known)
     return correction
+
+
+@njit(cache=True)
+def _restore_variance(x: Record, elapsed: float, known: Record) -> None:
+    """What rounding leaves less uncertain of `lacking` than a tick makes it is as at the start."""
+    P, r, config = x.covariance, len(x.velocity), known.config
+    for i in range(r):
+        walk = config.moment_walk if i < 3 else config.disturbance_walk
+        if P[r + i, r + i] < 1e-3 * walk**2 * elapsed:
+            _forget_lacking(x, i, known)
+
+
+@njit(cache=True)
+def _forget_lacking(x: Record, row: int, known: Record) -> None:
+    """Of the torque that is lacking in a row, no more is known than at the start, and its size."""
+    P, at, config = x.covariance, len(x.velocity) + row, known.config
+    start = config.moment_uncertainty if row < 3 else config.disturbance_uncertainty
+    P[at], P[:, at] = 0.0, 0.0
+    P[at, at] = start**2 + x.lacking[row] ** 2
 
 
 @njit(cache=True)
@@ -540,7 +566,7 @@ def _forget_motion(x: Record, known: Record) -> None:
     P[:, :r] = 0.0
     for i in range(r):
         P[i, i] = x.noise[i] * known.variance[i]
-        P[r + i, r + i] += x.lacking[i] ** 2
+        _forget_lacking(x, i, known)
     x.velocity[:], x.lacking[:], x.innovation[:] = x.reading, 0.0, 0.0
     x.unexplained[:], x.correction[:] = 0.0, 0.0
 
