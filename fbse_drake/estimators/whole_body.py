@@ -61,7 +61,7 @@ class WholeBody:
     Foot forces that come late belong to the tick in which they were: the filter is then so many
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
     keep contradicting the model, torque is lacking in the rows that their corrections point at, and
-    no law is learned.
+    the laws of these joints are not learned.
     """
 
     # Does it go back to the tick that late forces belong to?
