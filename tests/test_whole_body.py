@@ -10,13 +10,16 @@ from conftest import scenario
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 from rig import BENT, CLOCK, TICK, Base, Rig, estimated, pack, rms
+from scipy.stats import chi2
 
 from fbse_drake import Log
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
+from fbse_drake.estimators.equation_of_motion import touching
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.records import record
 from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.report.metrics import friction_error, joint_sides, stance
 from fbse_drake.robot.plant import grasp_map
@@ -66,6 +69,28 @@ def seen_from_imu(
         for sole in map(robot.sole, robot.description.sides)
     ]
     return from_ours.T @ M @ from_ours, bias, np.array(soles), np.array(sole_turning)
+
+
+def test_a_pad_touches_the_ground_if_its_force_is_more_than_noise_at_once_or_on_average():
+    """White noise is taken for a touch as rarely as chi^2 says; a force that a tick's noise hides
+    shows in some ticks, and its end, too."""
+    generator, ticks, pads = np.random.default_rng(2), 3000, 8
+    noise = USUAL_SENSORS.force_noise
+    known = record(pads=record(foot=np.repeat([0, 1], 4)), sensors=USUAL_SENSORS)
+
+    def touches(force: np.ndarray) -> np.ndarray:
+        mean = np.zeros((pads, 3))
+        return np.array([touching(mean, now, TICK, np.ones(2), known[()]) for now in force])
+
+    white = noise * generator.standard_normal((ticks, pads, 3))
+    assert 0 < touches(white).mean() < 2 * 2 * chi2.sf(18.5, 3)
+    faint = white.copy()
+    # It pushes between two instants with 1.5 standard deviations along each axis.
+    faint[1000:2000] += 1.5 * noise
+    found, alone = touches(faint), (faint**2).sum(axis=2) > 18.5 * noise**2
+    assert alone[1000:2000].mean() < 0.3
+    assert found[1020:2000].mean() > 0.9
+    assert found[2020:].mean() < 2 * 2 * chi2.sf(18.5, 3)
 
 
 def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
@@ -141,6 +166,7 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
             )
         velocity = V + sigma * generator.standard_normal(15)
         command = 2 * generator.standard_normal(n)
+        pad_force[3:] = noise * generator.uniform(-2.0, 2.0, size=(5, 3))
         posterior = tick(start, velocity, force)
 
         # Linearised where the tick ends.

@@ -4,6 +4,8 @@ They are those of the base's turning and of the joints. The accelerometer says h
 accelerates, so the base's linear rows are not needed; moments are about the IMU.
 """
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -22,6 +24,8 @@ from fbse_drake.robot.plant import Robot
 # A wrench, or the force on a pad, is beyond its sensors' noise above these quantiles of chi^2 with
 # six and three degrees of freedom (one in 3000).
 _WRENCH_GATE, _PAD_GATE = 25.1, 18.5
+# Over which time the force on a pad is averaged, to see what a tick's noise hides [s].
+_CONTACT_TIME = 0.005
 
 
 def motion_type(robot: Robot) -> np.dtype:
@@ -91,20 +95,50 @@ def put_equation_of_motion(
 
 
 @njit(cache=True)
+def touching(
+    mean: np.ndarray, pad_force: np.ndarray, elapsed: float, force_noise: np.ndarray, known: Record
+) -> np.ndarray:
+    """Does a pad touch the ground? It does if its force shows more than noise, now or on average.
+
+    Noise that is taken for a force shakes the leg, and a force that is taken for noise is missed.
+
+    Args:
+        mean: of late, (P, 3) [N]; goes on to this tick.
+        pad_force: (P, 3) [N]; elapsed: since the last [s].
+        force_noise, known: see `pushed`.
+
+    Returns:
+        For each pad, (P,).
+    """
+    result, share = np.zeros(len(mean), dtype=np.bool_), 1.0 - math.exp(-elapsed / _CONTACT_TIME)
+    for pad in range(len(mean)):
+        mean[pad] += share * (pad_force[pad] - mean[pad])
+        excess = force_noise[known.pads.foot[pad]]
+        of_force = np.full(3, excess * known.sensors.force_noise**2)
+        # The variance of an exponential mean of white noise.
+        of_mean = share / (2.0 - share) * of_force
+        touches = _pushes(pad_force[pad], of_force, _PAD_GATE)
+        result[pad] = touches or _pushes(mean[pad], of_mean, _PAD_GATE)
+    return result
+
+
+@njit(cache=True)
 def pushed(
     of_tick: Record,
     pad_force: np.ndarray,
+    pad_touches: np.ndarray,
     wrench: np.ndarray,
     force_noise: np.ndarray,
     known: Record,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The push (r,) in an equation of motion, feet included, and its variance (r, r).
 
-    A foot or pad that shows no more than its sensors' noise touches nothing.
+    A foot that shows no more than its sensors' noise touches nothing.
 
     Args:
         of_tick: see `motion_type`.
         pad_force: (P, 3) [N]; wrench: on each sole, (feet, 6) [Nm, N].
+        pad_touches: see `touching`, (P,).
         force_noise: by how much the variance of each foot's forces is larger than believed.
         known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
             (feet, 6) of each foot, and `pads`, see `FootPads`.
@@ -113,7 +147,7 @@ def pushed(
     variance = known.sensors.acceleration_noise**2 * (of_linear @ of_linear.T)
     for foot in range(len(known.has_pads)):
         if known.has_pads[foot]:
-            of_foot, of_noise = _pad_wrench(pad_force, foot, force_noise[foot], known)
+            of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)
         else:
             diagonal = force_noise[foot] * known.wrench_variance[foot]
             touches = _pushes(wrench[foot], diagonal, _WRENCH_GATE)
@@ -139,18 +173,18 @@ def _pushes(force: np.ndarray, variance: np.ndarray, gate: float) -> bool:
 
 @njit(cache=True)
 def _pad_wrench(
-    force: np.ndarray, foot: int, excess: float, known: Record
+    force: np.ndarray, touches: np.ndarray, foot: int, excess: float, known: Record
 ) -> tuple[np.ndarray, np.ndarray]:
     """Wrench of a foot's pads that touch the ground, (6,) on the sole, and its variance (6, 6).
 
     Args:
-        force: of all pads, (P, 3) [N].
+        force: of all pads, (P, 3) [N]; touches: see `touching`.
         excess: by how much the variance of the forces is larger than believed.
     """
     pads, of_force = known.pads, np.full(3, excess * known.sensors.force_noise**2)
     wrench, variance, arm = np.zeros(6), np.zeros((6, 6)), np.empty((3, 3))
     for pad in range(len(force)):
-        if pads.foot[pad] == foot and _pushes(force[pad], of_force, _PAD_GATE):
+        if pads.foot[pad] == foot and touches[pad]:
             # A force f at p has the moment p x f.
             put(arm, skew(vector(pads.position[pad])))
             for i in range(3):

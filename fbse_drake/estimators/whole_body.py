@@ -16,7 +16,12 @@ from pydrake.systems.framework import Context
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
 from fbse_drake.errors import require_not_negative, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.equation_of_motion import motion_type, pushed, put_equation_of_motion
+from fbse_drake.estimators.equation_of_motion import (
+    motion_type,
+    pushed,
+    put_equation_of_motion,
+    touching,
+)
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
@@ -263,7 +268,9 @@ def _begin(
         T = 0.0
         if not has_shown:
             _forget_laws(x, known)
-    push, variance = pushed(then, measured.mean.pad_force, wrench, x.force_noise, known)
+    pad_force = measured.mean.pad_force
+    touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
+    push, variance = pushed(then, pad_force, touches, wrench, x.force_noise, known)
     # What rare readings leave out is as large as they differ.
     missed = (start_share(T, known.reading) * (push - last.pushed)) ** 2 if T > 0.0 else 0.0 * push
     for i in range(r):
@@ -684,6 +691,7 @@ class WholeBodyFilter(RecursiveEstimator):
                                          than believed, at least 1
         foot_noise               (feet,) the same of standing feet's turning
         force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
+        pad_mean                 (P, 3)  force on each pad, mean of late [N]
         reading                  (r,)    what gyro and encoders read, free of the bias [rad/s]
         late                     ()      how many ticks ago the forces were what is read now: all
                                          but the friction is of that tick
@@ -733,6 +741,7 @@ class WholeBodyFilter(RecursiveEstimator):
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
             covariance=(2 * r + n * m, 2 * r + n * m),
             now=motion_type(robot),
+            pad_mean=(len(pads.position), 3),
         )
         super().__init__(posterior_type, clock)
         gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
