@@ -129,6 +129,7 @@ def pushed(
     pad_touches: np.ndarray,
     wrench: np.ndarray,
     force_noise: np.ndarray,
+    acceleration_noise: float,
     known: Record,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The push (r,) in an equation of motion, feet included, and its variance (r, r).
@@ -139,12 +140,15 @@ def pushed(
         of_tick: see `motion_type`.
         pad_force: (P, 3) [N]; wrench: on each sole, (feet, 6) [Nm, N].
         pad_touches: see `touching`, (P,).
-        force_noise: by how much the variance of each foot's forces is larger than believed.
+        force_noise, acceleration_noise: by how much the variance of each foot's forces, and of the
+            accelerometer, is larger than believed.
         known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
             (feet, 6) of each foot, and `pads`, see `FootPads`.
     """
     push, of_linear = of_tick.push.copy(), of_tick.of_linear
-    variance = known.sensors.acceleration_noise**2 * (of_linear @ of_linear.T)
+    variance = (acceleration_noise * known.sensors.acceleration_noise**2) * (
+        of_linear @ of_linear.T
+    )
     for foot in range(len(known.has_pads)):
         if known.has_pads[foot]:
             of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)

@@ -25,7 +25,12 @@ from fbse_drake.estimators.equation_of_motion import (
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
-from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_ONE, learned_noise
+from fbse_drake.estimators.innovations import (
+    AGREEMENT_TIME,
+    LOG_OF_ONE,
+    LOG_OF_THREE,
+    learned_noise,
+)
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import (
@@ -242,6 +247,7 @@ def _begin(
     feet = len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     watch_forces(x, last, elapsed, wrench, known)
+    _watch_accelerometer(x, last, elapsed, measured.mean.specific_force, known)
     x.status, now = measured.trust.max(), x.now
     if math.isnan(elapsed):
         elapsed = 0.0
@@ -270,7 +276,9 @@ def _begin(
             _forget_laws(x, known)
     pad_force = measured.mean.pad_force
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
-    push, variance = pushed(then, pad_force, touches, wrench, x.force_noise, known)
+    push, variance = pushed(
+        then, pad_force, touches, wrench, x.force_noise, x.acceleration_noise, known
+    )
     # What rare readings leave out is as large as they differ.
     missed = (start_share(T, known.reading) * (push - last.pushed)) ** 2 if T > 0.0 else 0.0 * push
     for i in range(r):
@@ -283,6 +291,21 @@ def _begin(
         return tick, x.velocity[3:].copy()
     velocity, _ = _implicit_step(x, x.velocity, A, push, T)
     return tick, velocity[3:].copy()
+
+
+@njit(cache=True)
+def _watch_accelerometer(
+    x: Record, last: Record, elapsed: float, force: np.ndarray, known: Record
+) -> None:
+    """Learns by how much the accelerometer is noisier than believed, see `watch_forces`."""
+    x.specific_force[:] = force
+    x.specific_force_change[:] = force - last.specific_force
+    if math.isnan(elapsed) or not known.learns_noise or last.acceleration_noise == 0.0:
+        x.acceleration_noise = 1.0
+        return
+    bend, believed = x.specific_force_change - last.specific_force_change, last.acceleration_noise
+    share = bend @ bend / (18.0 * believed * known.sensors.acceleration_noise**2)
+    x.acceleration_noise = learned_noise(believed, share, LOG_OF_THREE, elapsed)
 
 
 @njit(cache=True)
@@ -428,7 +451,9 @@ def _listen(
     """
     P, r = x.covariance, len(x.velocity)
     innovation, excess = x.reading - x.velocity, np.zeros(r)
-    keep = math.exp(-elapsed / AGREEMENT_TIME)
+    keep, forget = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
+    # The standard deviation of an exponential mean of white squares is the root.
+    beyond_chance = _GATE * math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep))
     for i in range(r):
         # How noisy a sensor is shows in its steps, whatever the model is wrong by.
         step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
@@ -442,6 +467,9 @@ def _listen(
             S += twice
         x.innovation[i], x.innovation_variance[i] = innovation[i], S
         x.agreement[i] += (1.0 - keep) * (innovation[i] ** 2 / S - x.agreement[i])
+        # The reading's noise is known from its steps: the velocity's variance is too small.
+        excess_now = (x.agreement[i] - 1.0) * S if x.agreement[i] > 1.0 + beyond_chance else 0.0
+        x.contradiction[i] = max(excess_now, forget * last.contradiction[i])
         # An innovation counts as little as makes it just likely.
         excess[i] = max(0.0, (innovation[i] / _GATE) ** 2 - S)
     columns, expected = P[:r].copy(), P[:r, :r].copy()
@@ -454,8 +482,7 @@ def _listen(
         surprise = 1.0
     if excess.max() > 0.0:
         weight = _inverse(expected + np.diag(x.noise * known.variance + excess))
-    keep = math.exp(-elapsed / _DOUBT_TIME)
-    x.surprise = max(surprise, 1.0 + keep * (last.surprise - 1.0))
+    x.surprise = max(surprise, 1.0 + forget * (last.surprise - 1.0))
     gain = weight @ columns
     _correct(x, columns, gain, innovation, learning)
     # R S^-1 P is P - P S^-1 P without the difference of large numbers.
@@ -607,6 +634,7 @@ def _finish(
     _linearise(x, velocity_now, law_now, shaped)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME) if elapsed > 0.0 else 1.0
+    brief = math.exp(-elapsed / AGREEMENT_TIME) if elapsed > 0.0 else 1.0
     for joint in range(n):
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
         slope, lacking = x.slope[joint], x.lacking[3 + joint]
@@ -616,7 +644,10 @@ def _finish(
             variance += slope * slope * x.noise[of_velocity] * known.variance[of_velocity]
             slope = 0.0
         friction += slope * (x.velocity[of_velocity] - velocity_now[joint])
-        variance += slope * slope * P[of_velocity, of_velocity]
+        # The law's slope changes within the velocity's doubt.
+        x.steepest[joint] = max(x.slope[joint], brief * last.steepest[joint])
+        of_velocity_error = P[of_velocity, of_velocity] + x.contradiction[of_velocity]
+        variance += x.steepest[joint] ** 2 * of_velocity_error
         variance += 2.0 * slope * P[of_velocity, of_lacking]
         unsettled = 0.0
         for j in range(m):
@@ -683,6 +714,8 @@ class WholeBodyFilter(RecursiveEstimator):
         correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
         unexplained, unexplained_variance (r,)  running mean of the corrections [Nm]
         agreement                (r,)    running mean of the innovations squared over their variance
+        contradiction            (r,)    what the innovations say, beyond chance, that the variances
+                                         of the velocities lack, the largest of late [(rad/s)^2]
         surprise                 ()      mean square of the innovations as a share of their
                                          variance, the largest of late that is beyond chance; at
                                          least 1
@@ -692,6 +725,8 @@ class WholeBodyFilter(RecursiveEstimator):
         foot_noise               (feet,) the same of standing feet's turning
         force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
         pad_mean                 (P, 3)  force on each pad, mean of late [N]
+        acceleration_noise, specific_force, specific_force_change   the same of the accelerometer:
+                                 (), (3,) and (3,) [m/s^2]
         reading                  (r,)    what gyro and encoders read, free of the bias [rad/s]
         late                     ()      how many ticks ago the forces were what is read now: all
                                          but the friction is of that tick
@@ -701,6 +736,7 @@ class WholeBodyFilter(RecursiveEstimator):
                                          since then, or torque by which measurements contradict the
                                          model [Nm]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
+        steepest                 (n,)    the largest slope of late [Nm s/rad]
     """
 
     def __init__(
@@ -725,14 +761,16 @@ class WholeBodyFilter(RecursiveEstimator):
         feet = len(legs)
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
-        per_row += ["reading", "pushed", "agreement"]
+        per_row += ["reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
-        per_joint += ["doubt", "law_velocity", "friction_there", "slope"]
+        per_joint += ["doubt", "law_velocity", "friction_there", "slope", "steepest"]
         posterior_type = record_type(
             time=(),
             status=(),
             late=(),
             surprise=(),
+            acceleration_noise=(),
+            **dict.fromkeys(("specific_force", "specific_force_change"), (3,)),
             **dict.fromkeys(per_row, (r,)),
             **dict.fromkeys(per_joint, (n,)),
             **dict.fromkeys(("foot_noise", "force_noise"), (feet,)),
