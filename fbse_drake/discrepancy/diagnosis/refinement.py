@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, Fits
@@ -23,8 +24,9 @@ from fbse_drake.errors import InputError
 
 # How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
 _POLISHINGS = 3
-# By these factors nonlinear values of what shows in a transmission are moved, one after the other.
-_WIDTHS = (1.25, 1.12, 1.06, 1.03, 1.015)
+# Nonlinear values of what shows in a transmission are looked for within such a factor, and with
+# such a relative tolerance.
+_NEAR, _TOLERANCE = 1.6, 0.01
 # How often untrusted bodies are measured anew, at most.
 _REMEASUREMENTS = 3
 
@@ -88,17 +90,29 @@ def _narrowed(
     beside others, if the log tells them at all: what shows in a transmission alone."""
     if not fits.dictionary.is_deflection(candidate.signature):
         return candidate
-    best = fits.explain([*others, candidate])
-    for k, name in enumerate(candidate.nonlinear_names):
-        low, high = candidate.parameters[name].plausible
-        for width in _WIDTHS:
-            here = best.candidates[-1].nonlinear
-            for value in np.clip(here[k] * np.array([1 / width, width]), low, high):
-                nonlinear = here.copy()
-                nonlinear[k] = value
-                tried = fits.about(replace(best.candidates[-1], nonlinear=nonlinear), linear)
-                best = min(best, fits.explain([*others, tried]), key=lambda e: e.deviance)
-    return best.candidates[-1]
+    for k in range(len(candidate.nonlinear)):
+        candidate = _with_fitting_value(fits, others, candidate, linear, k)
+    return candidate
+
+
+def _with_fitting_value(
+    fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray, k: int
+) -> Candidate:
+    """A candidate with one of its nonlinear values where it fits best nearby, beside others."""
+
+    def with_value(logarithm: float) -> Candidate:
+        nonlinear = candidate.nonlinear.copy()
+        nonlinear[k] = np.exp(logarithm)
+        return fits.about(replace(candidate, nonlinear=nonlinear), linear)
+
+    here = candidate.nonlinear[k]
+    low, high = candidate.parameters[candidate.nonlinear_names[k]].plausible
+    found = minimize_scalar(
+        lambda logarithm: fits.explain([*others, with_value(logarithm)]).deviance,
+        bounds=np.log(np.clip([here / _NEAR, here * _NEAR], low, high)),
+        options={"xatol": _TOLERANCE},
+    )
+    return with_value(found.x)
 
 
 def consistent(
