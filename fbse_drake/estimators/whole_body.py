@@ -235,7 +235,7 @@ def _begin(
         elapsed: of the tick [s], NaN of the first.
         past: of the ticks before, see `motion_type`.
         delay: by how much the forces are late [s].
-        has_shown: has the delay shown by which the laws were learned?
+        has_shown: has any delay shown?
 
     Returns:
         The tick to which the forces belong that are read now, and the velocities of the joints (n,)
@@ -269,8 +269,8 @@ def _begin(
         x.covariance[r + i, r + i] += walk**2 * elapsed
     T = then.duration * then.known if is_known else 0.0
     if x.late != last.late:
-        # The last state is of another tick; and its laws were learned with forces of another time,
-        # unless that was the right one.
+        # The last state is of another tick; and until a delay has shown, its laws were learned with
+        # forces of another time.
         T = 0.0
         if not has_shown:
             _forget_laws(x, known)
@@ -824,7 +824,7 @@ class WholeBodyFilter(RecursiveEstimator):
             last = self._start()
         if self._hears_delay:
             delay = float(attitude["force_delay"]["delay"])
-            has_shown = bool(attitude["force_delay"]["usual"][int(last["late"])] > 0.0)
+            has_shown = bool(attitude["force_delay"]["usual"].any())
         model, regressor = self._model.Eval(context), self._regressor
         tick, velocity = _begin(
             posterior, last, elapsed, measured, model, attitude, torque_command, past, delay,
