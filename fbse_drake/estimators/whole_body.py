@@ -49,7 +49,8 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 _GATE = 5.0
 # ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
-# Corrections whose mean is beyond so many standard deviations show that torque is lacking.
+# Corrections whose mean is beyond so many standard deviations show that torque is lacking, and
+# innovations whose root mean square is that they are no noise.
 _NOTICED = 3.0
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
@@ -379,13 +380,15 @@ def _update(
 
 @njit(cache=True)
 def _learning(last: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for laws of joints whose row is contradicted, (size,).
+    """Which states are corrected: 1, but 0 for laws of joints that are contradicted, (size,).
 
-    What is contradicted may be the law or what the law is learned from, and nobody knows.
+    What is contradicted may be the law or what the law is learned from, and nobody knows. So it is
+    where torque keeps being lacking in the joint's row, and where innovations are no noise.
     """
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
     for joint in range(n):
-        if _is_contradicted(last, 3 + joint):
+        row = 3 + joint
+        if _is_contradicted(last, row) or last.agreement[row] > _NOTICED**2:
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
 
