@@ -393,18 +393,52 @@ def test_it_tells_what_the_stages_tell_that_it_stands_for(run: Run, healthy: Log
     assert np.all(np.abs(residual.mean(axis=0)) < 0.1 * residual.std(axis=0))
 
 
-def test_a_loose_contact_leaves_nothing_behind(run: Run, healthy: Log):
-    """A velocity that is zero in every other 20 ms contradicts the model by hundreds of Nm, again
-    and again; variances of such a size beside the sensors' must not cancel."""
-    log = run("paper_walk_fbse", "duration=3")
-    number, rows = log.joints.index("right_knee_pitch"), slice(1500, 2000)
-    velocity = log["joint/velocity"][rows].copy()
-    velocity[np.arange(500) // 20 % 2 == 0, number] = 0.0
-    result = estimated(changed(log, "joint/velocity", rows, velocity), WALK, WHOLE_BODY)
+def loose_contact(velocity: np.ndarray) -> np.ndarray:
+    """A knee's velocity that is zero in every other 20 ms: it contradicts the model by hundreds of
+    Nm, again and again, and variances of such a size beside the sensors' must not cancel."""
+    spoilt, knee = velocity.copy(), BASE.robot.joint_names.index("right_knee_pitch")
+    spoilt[np.arange(len(velocity)) // 20 % 2 == 0, knee] = 0.0
+    return spoilt
+
+
+def late_by_5_ms(force: np.ndarray) -> np.ndarray:
+    """It makes the delay of the forces change, and change back."""
+    return np.concatenate([np.repeat(force[:1], 5, axis=0), force[:-5]])
+
+
+@pytest.mark.parametrize(
+    ("channel", "fault"),
+    [
+        ("joint/velocity", loose_contact),
+        ("foot/right/pad_force", late_by_5_ms),
+    ],
+)
+def test_a_fault_is_in_the_deviation_and_leaves_nothing_behind(
+    run: Run, healthy: Log, channel: str, fault: Callable[[np.ndarray], np.ndarray]
+):
+    log, rows = run("paper_walk_fbse", "duration=3"), slice(1500, 2000)
+    result = estimated(changed(log, channel, rows, fault(log[channel][rows])), WALK, WHOLE_BODY)
     friction, std = (
         np.stack([of[f"estimate/joint/{name}"] for of in (result, healthy)])
         for name in ("friction_torque", "friction_torque_std")
     )
     moved = np.abs(friction[0] - friction[1])
+    assert np.any(moved[rows] > 3 * std[1, rows])
     assert np.mean(moved[rows] < 3 * std[:, rows].max(axis=0)) > 0.999
     assert np.all(moved[rows.stop + 500 :] < 3 * std[1, rows.stop + 500 :])
+
+
+def test_noise_of_the_accelerometer_is_learned(run: Run, healthy: Log):
+    """Believed to be ten times smaller, it moves a yaw that sticks by more than is stated."""
+    log, rows = run("paper_walk_fbse", "duration=3"), slice(1500, 2500)
+    noise = np.random.default_rng(3).normal(size=(1000, 3))
+    acceleration = log["imu/linear_acceleration"][rows]
+    acceleration = acceleration + 10 * USUAL_SENSORS.acceleration_noise * noise
+    result = estimated(
+        changed(log, "imu/linear_acceleration", rows, acceleration), WALK, WHOLE_BODY
+    )
+    friction, std = (
+        np.stack([of[f"estimate/joint/{name}"][rows] for of in (result, healthy)])
+        for name in ("friction_torque", "friction_torque_std")
+    )
+    assert np.all(np.abs(friction[0] - friction[1]) < 2.5 * std.max(axis=0))

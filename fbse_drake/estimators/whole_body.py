@@ -301,12 +301,10 @@ def _watch_accelerometer(
     """Learns by how much the accelerometer is noisier than believed, see `watch_forces`."""
     x.specific_force[:] = force
     x.specific_force_change[:] = force - last.specific_force
-    if math.isnan(elapsed) or not known.learns_noise or last.acceleration_noise == 0.0:
-        x.acceleration_noise = 1.0
-        return
-    bend, believed = x.specific_force_change - last.specific_force_change, last.acceleration_noise
-    share = bend @ bend / (18.0 * believed * known.sensors.acceleration_noise**2)
-    x.acceleration_noise = learned_noise(believed, share, LOG_OF_THREE, elapsed)
+    if not math.isnan(elapsed):
+        bend, noise = x.specific_force_change - last.specific_force_change, last.acceleration_noise
+        share = bend @ bend / (18.0 * noise * known.sensors.acceleration_noise**2)
+        x.acceleration_noise = learned_noise(noise, share, LOG_OF_THREE, elapsed)
 
 
 @njit(cache=True)
@@ -642,15 +640,14 @@ def _finish(
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
         slope, lacking = x.slope[joint], x.lacking[3 + joint]
         variance, friction = P[of_lacking, of_lacking], x.friction_there[joint] + lacking
+        of_error = P[of_velocity, of_velocity] + x.contradiction[of_velocity]
         if x.late > 0.0:
             # Nobody knows more of the velocity now than is measured.
-            variance += slope * slope * x.noise[of_velocity] * known.variance[of_velocity]
-            slope = 0.0
+            of_error, slope = x.noise[of_velocity] * known.variance[of_velocity], 0.0
         friction += slope * (x.velocity[of_velocity] - velocity_now[joint])
         # The law's slope changes within the velocity's doubt.
         x.steepest[joint] = max(x.slope[joint], brief * last.steepest[joint])
-        of_velocity_error = P[of_velocity, of_velocity] + x.contradiction[of_velocity]
-        variance += x.steepest[joint] ** 2 * of_velocity_error
+        variance += x.steepest[joint] ** 2 * of_error
         variance += 2.0 * slope * P[of_velocity, of_lacking]
         unsettled = 0.0
         for j in range(m):
@@ -853,7 +850,7 @@ class WholeBodyFilter(RecursiveEstimator):
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"] = start["weights"]
         start["noise"] = start["foot_noise"] = 1.0
-        start["surprise"] = start["agreement"] = 1.0
+        start["surprise"] = start["agreement"] = start["acceleration_noise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
