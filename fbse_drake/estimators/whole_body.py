@@ -461,13 +461,14 @@ def _listen(
         believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
         x.noise[i] = learned_noise(last.noise[i], step * step / believed, LOG_OF_ONE, elapsed)
         S = P[i, i] + x.noise[i] * known.variance[i]
+        share = innovation[i] ** 2 / S
         # The velocity is elsewhere, and nobody knows why.
         twice = _confirmed(innovation[i], last.innovation[i]) ** 2
         if twice > _GATE**2 * S:
             P[i, i] += twice
             S += twice
         x.innovation[i], x.innovation_variance[i] = innovation[i], S
-        x.agreement[i] += (1.0 - keep) * (innovation[i] ** 2 / S - x.agreement[i])
+        x.agreement[i] += (1.0 - keep) * (share - x.agreement[i])
         # The reading's noise is known from its steps: the velocity's variance is too small.
         excess_now = (x.agreement[i] - 1.0) * S if x.agreement[i] > 1.0 + beyond_chance else 0.0
         x.contradiction[i] = max(excess_now, forget * last.contradiction[i])
