@@ -52,6 +52,8 @@ _DOUBT_TIME = 0.1
 # Corrections whose mean is beyond so many standard deviations show that torque is lacking, and
 # innovations whose root mean square is that they are no noise.
 _NOTICED = 3.0
+# A law is known when it is so many times surer than at the start.
+_LEARNED = 10.0
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
@@ -72,7 +74,7 @@ class WholeBody:
     Foot forces that come late belong to the tick in which they were: the filter is then so many
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
     keep contradicting the model, torque is lacking in the rows that their corrections point at, and
-    the laws of these joints are not learned.
+    the laws of these joints, once known, are not learned; nor are those of joints that rest.
     """
 
     # Does it go back to the tick that late forces belong to?
@@ -369,7 +371,7 @@ def _update(
     P[:r, :r] = expected
     x.velocity[:], x.pushed[:] = predicted, tick.push
     x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
-    learning = _learning(last)
+    learning = _learning(last, known)
     correction = _listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
     _listen_to_feet(x, last, then, measured, learning, T, known)
     _watch_corrections(x, last, A, correction, expected, T)
@@ -377,18 +379,37 @@ def _update(
 
 
 @njit(cache=True)
-def _learning(last: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for laws of joints that are contradicted, (size,).
+def _learning(last: Record, known: Record) -> np.ndarray:
+    """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
-    What is contradicted may be the law or what the law is learned from, and nobody knows. So it is
-    where torque keeps being lacking in the joint's row, and where innovations are no noise.
+    A joint whose velocity is not known from zero says nothing of its law but the size of that
+    doubt: coefficient and velocity, known by their product alone, would drift apart. What
+    contradicts a law that is known by now may be the law or what it is learned from, and nobody
+    knows which. So it is where torque keeps being lacking in the joint's row, and where innovations
+    are no noise.
     """
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
     for joint in range(n):
         row = 3 + joint
-        if _is_contradicted(last, row) or last.agreement[row] > _NOTICED**2:
+        moves = last.velocity[row] ** 2 > _NOTICED**2 * last.covariance[row, row]
+        no_noise = last.agreement[row] > _NOTICED**2
+        contradicted = _is_contradicted(last, row) or no_noise
+        if not moves or (contradicted and _is_learned(last, joint, known)):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
+
+
+@njit(cache=True)
+def _is_learned(x: Record, joint: int, known: Record) -> bool:
+    """Is a joint's law, where it is asked, known _LEARNED times as well as at the start?"""
+    n, m = x.weights.shape
+    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
+    for j in range(m):
+        start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
+        for k in range(m):
+            both = x.regressor[joint, j] * x.regressor[joint, k]
+            now += both * x.covariance[first + j, first + k]
+    return now * _LEARNED**2 < start
 
 
 @njit(cache=True)
