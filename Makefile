@@ -38,11 +38,11 @@ lint: $(INSTALLED)
 	$(VENV)/bin/mypy
 
 # Compiles estimators that many tests need, once for all workers, which grow by it: those of two legs,
-# and those of four, of an arm and of the whole body, side by side.
+# and those of four, of an arm and of the filter joint by joint, side by side.
 kernels: kernels-biped kernels-others
 
 kernels-biped: WALKS = ('paper_walk_fbse', None), ('paper_walk_fbse', 'paper_method')
-kernels-others: WALKS = ('quadruped_trot', None), ('bsc_arm', None), ('paper_walk_fbse', None, 'estimator.friction=!WholeBody {}')
+kernels-others: WALKS = ('quadruped_trot', None), ('bsc_arm', None), ('paper_walk_fbse', None, 'estimator.friction=!ModelAided {}')
 kernels-biped kernels-others: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
 		[simulate(load(file, name, ['duration=0.01', *changes])) for file, name, *changes in ($(WALKS))]"

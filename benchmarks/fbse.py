@@ -59,7 +59,7 @@ _DISTURBED = {
     "IMU turned by 0.5 deg about y": ("sensors.imu.misalignment=[0, 0.00873, 0]",),
     "all sensors ten times finer": _FINER,
     "friction model twice as steep": (
-        "estimator.friction=!ModelAided {model: {transition: {all: 0.005}}}",
+        "estimator.friction=!WholeBody {model: {transition: {all: 0.005}}}",
     ),
 }
 

@@ -17,8 +17,8 @@ What the limit knows, and what not:
   white noise as large as its motion in this walk under such a load. No contact law.
 - Commands are exact.
 - Friction: its true law, with the nonlinear parameters known. The linear parameters are constant
-  and as uncertain at the start as those of `ModelAided`. "With walk", a random walk is added to the
-  law's torque, as `ModelAided` believes for the sake of what no law explains. That is the limit
+  and as uncertain at the start as those of `WholeBody`. "With walk", a random walk is added to the
+  law's torque, as `WholeBody` believes for the sake of what no law explains. That is the limit
   where friction does walk so. In a simulation it follows its law, and the best filter that expects
   a walk errs less there, by up to a third.
 
@@ -55,6 +55,7 @@ from fbse_drake.errors import InputError
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
 from fbse_drake.report.metrics import (
@@ -399,9 +400,10 @@ def _law(scenario: Scenario, robot: Robot, velocity: np.ndarray) -> tuple[np.nda
 
 def priors(scenario: Scenario) -> dict[str, FrictionPrior]:
     """The prior without and with the random walk of the scenario's friction estimator."""
-    believed = ModelAided()
-    if isinstance(scenario.estimator, Fbse) and isinstance(scenario.estimator.friction, ModelAided):
-        believed = scenario.estimator.friction
+    believed: WholeBody | ModelAided = WholeBody()
+    if isinstance(scenario.estimator, Fbse):
+        friction = scenario.estimator.friction
+        believed = friction if isinstance(friction, WholeBody | ModelAided) else believed
     law = FrictionPrior(believed.parameter_uncertainty)
     walk, start = believed.disturbance_walk, believed.disturbance_uncertainty
     return {"law": law, "with walk": law._replace(walk=walk, start=start)}

@@ -77,7 +77,7 @@ def _foot_gain(gain: float) -> Case:
 
 def _transition(velocity: float) -> Case:
     """HRP-2's walk with a friction model that changes its sign over another velocity [rad/s]."""
-    model = f"estimator.friction=!ModelAided {{model: {{transition: {{all: {velocity}}}}}}}"
+    model = f"estimator.friction=!WholeBody {{model: {{transition: {{all: {velocity}}}}}}}"
     told = ("compensation=!NoCompensation {}", model)
     return Case(f"HRP-2, model's transition {velocity:g} rad/s", told, scenario=_HRP2_WALK)
 
@@ -106,13 +106,13 @@ CASES = (
 
 
 def watchers(
-    default: Estimator, whole_body: Estimator, alone: bool
+    default: Estimator, joint_by_joint: Estimator, alone: bool
 ) -> Iterator[tuple[str, str, Estimator]]:
     """Method, variant and estimator of each that runs over a log; or of the default alone."""
     yield "default", "", default
     if alone:
         return
-    yield "whole-body filter", "", whole_body
+    yield "joint by joint", "", joint_by_joint
     for bandwidth in _BANDWIDTHS:
         yield "momentum observer", f"{bandwidth:g} Hz", DisturbanceObserver(bandwidth)
     yield "paper's method", "", load_scenario(_PAPER_WALK, "paper_method").estimator
@@ -218,8 +218,8 @@ def run(case: Case, seed: int, duration: float, alone: bool) -> Walked:
     result = simulate(load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold]))
     believed = load_scenario(case.scenario, overrides=common)
     # The same model of the friction, by the other filter.
-    told = [text.replace("!ModelAided", "!WholeBody") for text in common]
-    other = load_scenario(case.scenario, overrides=["estimator.friction=!WholeBody {}", *told])
+    told = [text.replace("!WholeBody", "!ModelAided") for text in common]
+    other = load_scenario(case.scenario, overrides=["estimator.friction=!ModelAided {}", *told])
     figures = {
         (method, variant): Figures.of(estimate(replace(believed, estimator=config), result.log).log)
         for method, variant, config in watchers(believed.estimator, other.estimator, alone)

@@ -802,7 +802,8 @@ def test_feet_that_roll_are_not_believed_to_rest(
 def test_feet_that_rest_are_believed(run: Run):
     """What a walk on firm ground adds to the doubt is about what a standing foot does anyway."""
     log = part(run("paper_walk_fbse", "duration=3"), 2.0)
-    replay = Replay(diagram(Fbse(), scenario("paper_walk_fbse", "duration=3")))
+    estimator = Fbse(friction=ModelAided())
+    replay = Replay(diagram(estimator, scenario("paper_walk_fbse", "duration=3")))
     found = replay.run(log.time, inputs_of(log), "joint_acceleration.agreement", "estimate/support")
     keep = math.exp(-TICK / 0.02)
     mean_square = np.mean(found["joint_acceleration.agreement"].reshape(-1, 2, 2, 3) ** 2, axis=3)
@@ -816,8 +817,8 @@ def learned_force_noise(log: Log) -> np.ndarray:
     replay = Replay(
         diagram(Fbse(sensors=SensorBeliefs(force_noise=told)), scenario("paper_walk", "duration=3"))
     )
-    excess = replay.run(log.time, inputs_of(log), "link_torque.force_noise")
-    return told * np.sqrt(excess["link_torque.force_noise"])
+    excess = replay.run(log.time, inputs_of(log), "friction.force_noise")
+    return told * np.sqrt(excess["friction.force_noise"])
 
 
 def rough_force_noise(log: Log) -> np.ndarray:

@@ -19,6 +19,7 @@ from fbse_drake.estimators.base_state import ContactAided
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -284,7 +285,12 @@ def test_residual_is_the_friction_where_sensors_are_exact(run: Run):
     shortest = residual_error(
         log,
         estimated(
-            log, walk, Fbse(joint_acceleration=JointAccelerationConfig(method="minimum_norm"))
+            log,
+            walk,
+            Fbse(
+                joint_acceleration=JointAccelerationConfig(method="minimum_norm"),
+                friction=ModelAided(),
+            ),
         ),
     )
     assert np.median(shortest) > 20 * np.median(fused)

@@ -21,6 +21,7 @@ from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilt
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver, MomentumObserver
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import FloatingBaseModel
 from fbse_drake.estimators.friction import (
     ModelAided,
@@ -36,6 +37,7 @@ from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
 from fbse_drake.estimators.true_friction import TrueFrictionSource
+from fbse_drake.estimators.whole_body import WholeBody, WholeBodyFilter
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sensors.errors import held_signal
 
@@ -352,6 +354,15 @@ def test_stages_in_a_diagram_of_ones_own(run: Run):
         sensors=beliefs,
         **shared,
     )
+    whole_body = WholeBodyFilter.AddToBuilder(
+        builder,
+        measurements
+        | over_step
+        | {"attitude": base.GetOutputPort("posterior"), "torque_command": command},
+        config=WholeBody(),
+        sensors=beliefs,
+        **shared,
+    )
     observer = MomentumObserver.AddToBuilder(
         builder,
         measurements
@@ -372,15 +383,22 @@ def test_stages_in_a_diagram_of_ones_own(run: Run):
         context = system.GetMyContextFromRoot(simulator.get_context())
         return system.GetOutputPort(field).Eval(context)
 
-    observed = estimated(log, walk, DisturbanceObserver())["estimate/joint/friction_torque"]
-    expected = log["estimate/joint/friction_torque"]
+    frictions = {
+        system: estimated(log, walk, config)["estimate/joint/friction_torque"][-1]
+        for system, config in (
+            (whole_body, Fbse()),
+            (friction, Fbse(friction=ModelAided())),
+            (observer, DisturbanceObserver()),
+        )
+    }
     told = {"orientation": "base/orientation", "base_velocity": "base/velocity"}
     for field, channel in told.items():
         found = value(base, field)
         np.testing.assert_allclose(found, log[f"estimate/{channel}"][-1], rtol=0, atol=1e-5)
-    assert np.abs(expected[-1]).max() > 0.5
-    np.testing.assert_allclose(value(friction, "friction"), expected[-1], rtol=0, atol=5e-3)
-    np.testing.assert_allclose(value(observer, "friction"), observed[-1], rtol=0, atol=5e-2)
+    for system, tolerance in ((whole_body, 5e-3), (friction, 5e-3), (observer, 5e-2)):
+        expected = frictions[system]
+        assert np.abs(expected).max() > 0.5
+        np.testing.assert_allclose(value(system, "friction"), expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize(

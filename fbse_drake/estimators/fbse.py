@@ -14,7 +14,7 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.floating_base import FloatingBaseModel
-from fbse_drake.estimators.friction import FrictionConfig, ModelAided, RecursiveLeastSquares
+from fbse_drake.estimators.friction import FrictionConfig, RecursiveLeastSquares
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -50,8 +50,8 @@ class Fbse(Estimator):
     # !MeasuredSupport or the paper's !PlannedSupport.
     support: SupportConfig = field(default_factory=MeasuredSupport)
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
-    # !ModelAided, !WholeBody or the paper's !RecursiveLeastSquares.
-    friction: FrictionConfig | WholeBody = field(default_factory=ModelAided)
+    # !WholeBody, !ModelAided or the paper's !RecursiveLeastSquares.
+    friction: FrictionConfig | WholeBody = field(default_factory=WholeBody)
 
     @staticmethod
     def paper() -> "Fbse":
@@ -73,6 +73,10 @@ class Fbse(Estimator):
         return self.sensors.completed(usual)
 
     def remarks(self, sensors: SensorBeliefs) -> tuple[str, ...]:
+        unused = "joint_acceleration" in self.friction.stands_for
+        if unused and self.joint_acceleration != JointAccelerationConfig():
+            which = type(self.friction).__name__
+            return sensors.text, f"joint_acceleration: only used without torques, see !{which}"
         return (sensors.text,)
 
     def check(self, names: RobotDescription) -> None:

@@ -37,6 +37,7 @@ from fbse_drake.estimators.recursive import (
     Clock,
     Past,
     RecursiveEstimator,
+    Status,
     start_share,
     ticks_ago,
 )
@@ -50,10 +51,14 @@ _GATE = 5.0
 # ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
 _DOUBT_TIME = 0.1
 # Corrections whose mean is beyond so many standard deviations show that torque is lacking, and
-# innovations whose root mean square is that they are no noise.
+# innovations whose root mean square is that they are no noise; a velocity that is, that a joint
+# moves.
 _NOTICED = 3.0
 # A law is known when it is so many times surer than at the start.
 _LEARNED = 10.0
+_NOT_FINITE = float(Status.NOT_FINITE)
+# A pivot of a covariance is at least this share of its variance.
+_LEAST_PIVOT = 1e-14
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
@@ -120,9 +125,30 @@ class WholeBody:
 
 @njit(cache=True)
 def _inverse(A: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive definite matrix."""
-    inverse = np.linalg.inv(A)
-    return 0.5 * (inverse + inverse.T)
+    """Inverse of a symmetric positive definite matrix, by its Cholesky factor L.
+
+    Unlike numpy's it raises for nothing, and takes a tenth of the time for some ten rows. Pivots
+    that rounding leaves negative are kept positive.
+    """
+    n, L, inverse_of_L = len(A), np.zeros_like(A), np.zeros_like(A)
+    for j in range(n):
+        pivot = A[j, j]
+        for k in range(j):
+            pivot -= L[j, k] ** 2
+        L[j, j] = math.sqrt(max(pivot, _LEAST_PIVOT * A[j, j]))
+        for i in range(j + 1, n):
+            rest = A[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = rest / L[j, j]
+    for j in range(n):
+        inverse_of_L[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            rest = 0.0
+            for k in range(j, i):
+                rest -= L[i, k] * inverse_of_L[k, j]
+            inverse_of_L[i, j] = rest / L[i, i]
+    return inverse_of_L.T @ inverse_of_L
 
 
 @njit(cache=True)
@@ -258,7 +284,9 @@ def _begin(
     rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
     put(now.reading[:3], rotate(rotation(known.mount.R_BI), rate))
     now.reading[3:] = measured.joint_velocity
-    is_known = x.status == 0.0 and last.status == 0.0 and np.isfinite(torque_command).all()
+    if not np.isfinite(torque_command).all():
+        x.status = max(x.status, _NOT_FINITE)
+    is_known = x.status == 0.0 and last.status == 0.0
     is_known = is_known and elapsed > 0.0 and math.isfinite(delay) and model.velocity.any()
     now.known = 1.0 if is_known else 0.0
     if is_known:
@@ -382,8 +410,8 @@ def _update(
 def _learning(last: Record, known: Record) -> np.ndarray:
     """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
-    A joint whose velocity is not known from zero says nothing of its law but the size of that
-    doubt: coefficient and velocity, known by their product alone, would drift apart. What
+    A joint whose velocity has not been known from zero for some time says nothing of its law:
+    coefficient and velocity, known by their product alone, would drift apart. What
     contradicts a law that is known by now may be the law or what it is learned from, and nobody
     knows which. So it is where torque keeps being lacking in the joint's row, and where innovations
     are no noise.
@@ -391,10 +419,10 @@ def _learning(last: Record, known: Record) -> np.ndarray:
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
     for joint in range(n):
         row = 3 + joint
-        moves = last.velocity[row] ** 2 > _NOTICED**2 * last.covariance[row, row]
+        rests = last.rested[joint] > _DOUBT_TIME
         no_noise = last.agreement[row] > _NOTICED**2
         contradicted = _is_contradicted(last, row) or no_noise
-        if not moves or (contradicted and _is_learned(last, joint, known)):
+        if rests or (contradicted and _is_learned(last, joint, known)):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
 
@@ -667,6 +695,8 @@ def _finish(
             # Nobody knows more of the velocity now than is measured.
             of_error, slope = x.noise[of_velocity] * known.variance[of_velocity], 0.0
         friction += slope * (x.velocity[of_velocity] - velocity_now[joint])
+        moves = x.velocity[of_velocity] ** 2 > _NOTICED**2 * P[of_velocity, of_velocity]
+        x.rested[joint] = 0.0 if moves else last.rested[joint] + tick.duration
         # The law's slope changes within the velocity's doubt.
         x.steepest[joint] = max(x.slope[joint], brief * last.steepest[joint])
         variance += x.steepest[joint] ** 2 * of_error
@@ -757,6 +787,7 @@ class WholeBodyFilter(RecursiveEstimator):
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
                                          since then, or torque by which measurements contradict the
                                          model [Nm]
+        rested                   (n,)    for how long a joint has not moved, beyond doubt [s]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
         steepest                 (n,)    the largest slope of late [Nm s/rad]
     """
@@ -785,7 +816,7 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
-        per_joint += ["doubt", "law_velocity", "friction_there", "slope", "steepest"]
+        per_joint += ["doubt", "rested", "law_velocity", "friction_there", "slope", "steepest"]
         posterior_type = record_type(
             time=(),
             status=(),
