@@ -66,7 +66,7 @@ from fbse_drake.report.discrepancy_tables import (
     spread_tables,
     steps_table,
 )
-from fbse_drake.report.html import Table, drawn
+from fbse_drake.report.html import Section, Table, drawn
 from fbse_drake.report.identification import (
     errors_table,
     identification_outcome,
@@ -432,13 +432,20 @@ def diagnose(
         tried = plausible_effects(averaged) if effects is None else list(effects)
         dictionary = Dictionary(averaged, tried, beside)
         dictionary.begin(processes)
-        where = processes.begin(lambda _: drawn(where_it_fails(case.comparison, case.predictor)))
+
+        def draw_where(_: Progress) -> Section:
+            return drawn(where_it_fails(case.comparison, case.predictor))
+
+        where = processes.begin(draw_where)
         # While it is begun the log is inspected; mostly all of it is trusted.
         trusted = case.predictor.of(case.trusted)
         tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
         diagnosis = diagnose_confirmed(
             trusted, tried, tested, progress=beside, dictionary=dictionary
         )
+        if diagnosis.partial is not None:
+            # It was cancelled together with the search.
+            where = processes.begin(draw_where)
         why = processes.begin(lambda _: [*map(drawn, why_it_fails(diagnosis))])
         path = processes.begin(lambda _: [*map(drawn, how_it_falls(diagnosis, trusted.robot))])
         set_aside = {}

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -13,7 +14,7 @@ from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 from fbse_drake.errors import InputError
-from fbse_drake.progress import Progress, silent
+from fbse_drake.progress import Interrupted, Progress, silent
 
 T = TypeVar("T")
 # How often processes are looked at while nothing else is done [s].
@@ -45,7 +46,8 @@ class Processes:
     """Tasks, so many at a time. With one job each is done when its result is asked for.
 
     Processes are forked: a plant's configuration does not go through a pipe, and a user's own
-    effects are known in this process only. At the end of the context what still runs is ended.
+    effects are known in this process only. What is not done is cancelled at the end of the context,
+    and as soon as a progress interrupts the work that it is done beside or for.
     """
 
     def __init__(self, jobs: int = 1):
@@ -62,8 +64,7 @@ class Processes:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for _, process in self._running.values():
-            process.terminate()
+        self.cancel()
 
     def begin(self, work: Callable[[Progress], T]) -> Task[T]:
         """A task, which is begun as soon as a process is free for it beside this one.
@@ -77,12 +78,28 @@ class Processes:
             self._look(self._jobs - 1)
         return task
 
+    def cancel(self) -> None:
+        """Ends the tasks that are not done; none of their processes is left."""
+        given_up = [*self._waiting, *(task for task, _ in self._running.values())]
+        processes = {receiver: process for receiver, (_, process) in self._running.items()}
+        self._waiting.clear()
+        self._running.clear()
+        for task in given_up:
+            task.error = CancelledError("it was cancelled")
+        for process in processes.values():
+            # One that has just been forked still has this process's handler of SIGTERM.
+            process.kill()
+        for receiver, process in processes.items():
+            process.join()
+            receiver.close()
+
     def beside(self, progress: Progress) -> Progress:
-        """A progress of other work at which it is also seen to it that tasks go on."""
+        """A progress of other work at which it is also seen to it that tasks go on; all are
+        cancelled where it interrupts that work."""
 
         def told(text: str, share: float = 0.0) -> None:
             self._look(self._jobs - 1)
-            progress(text, share)
+            self._tell(progress, text, share)
 
         return told
 
@@ -90,21 +107,30 @@ class Processes:
         """What comes out of tasks; waits for it.
 
         Args:
-            progress: is told it under this text.
+            progress: is told it under this text; all tasks are cancelled where it interrupts.
 
         Raises:
             Exception: that of the first task that raised one.
+            CancelledError: one was cancelled.
+            Interrupted: see `Progress`.
         """
         for k, task in enumerate(tasks):
             if self._jobs == 1 and not task.is_done:
                 task.outcome.append(task.work(_part(progress, k, len(tasks))))
         while not all(task.is_done for task in tasks):
-            progress(text, sum(task.is_done for task in tasks) / len(tasks))
+            self._tell(progress, text, sum(task.is_done for task in tasks) / len(tasks))
             self._look(self._jobs, _LOOK_PERIOD)
         for task in tasks:
             if task.error is not None:
                 raise task.error
         return [result for task in tasks for result in task.outcome]
+
+    def _tell(self, progress: Progress, text: str, share: float) -> None:
+        try:
+            progress(text, share)
+        except Interrupted:
+            self.cancel()
+            raise
 
     def _look(self, at_most: int, timeout: float = 0.0) -> None:
         """Takes results that have come and starts what waits.
@@ -130,7 +156,7 @@ class Processes:
         while self._waiting and len(self._running) < at_most:
             task = self._waiting.popleft()
             receiver, sender = context.Pipe(duplex=False)
-            process = context.Process(target=_send_result, args=(sender, task.work))
+            process = context.Process(target=_send_result, args=(sender, task.work), daemon=True)
             process.start()
             sender.close()
             self._running[receiver] = task, process

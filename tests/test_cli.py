@@ -686,6 +686,43 @@ def test_diagnose_then_add_then_compare(
     assert json.loads((again / "compare.json").read_text())["failures"] == []
 
 
+@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "--time-limit"])
+def test_a_diagnosis_that_is_ended_early_is_alone_and_keeps_what_is_known(
+    how: str, biased: Path, tmp_path: Path
+):
+    """What each effect would do is predicted in a process beside it, here without end."""
+    limit = ["--time-limit", "0.01"] if how == "--time-limit" else []
+    arguments = [*BIASED, str(biased), "--jobs", "2", *limit, "--out", str(tmp_path)]
+    script = f"""{HEEDED}
+import multiprocessing, time
+from fbse_drake import analysis, cli
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+def predict(dictionary, progress):
+    if {not limit}:
+        os.kill(os.getppid(), signal.{"SIGINT" if limit else how})
+    while True:
+        time.sleep(1.0)
+Dictionary._fixed = predict
+search = analysis.diagnose_confirmed
+def searched(*arguments, **options):
+    found = search(*arguments, **options)
+    print("beside it:", multiprocessing.active_children())
+    return found
+analysis.diagnose_confirmed = searched
+analysis.write_diagnosis_report = lambda path, *_: path.write_text("report")
+sys.argv = ["fbse", "diagnose", *{arguments}]
+cli.entry()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == FAILED, done.stderr
+    assert "beside it: []" in done.stdout
+    assert "Traceback" not in done.stderr
+    content = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert content["partial"]
+    assert content["interrupted_because"].startswith("the time limit" if limit else "it was")
+    assert (tmp_path / "report.html").read_text() == "report"
+
+
 @pytest.mark.usefixtures("undrawn_findings")
 def test_study_writes_the_completed_scenario(
     biased: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch

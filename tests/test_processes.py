@@ -2,12 +2,14 @@
 
 import multiprocessing
 import os
+import signal
+from concurrent.futures import CancelledError
 
 import pytest
 
 from fbse_drake.errors import InputError
 from fbse_drake.processes import Processes
-from fbse_drake.progress import Interrupted, Progress, ProgressLines, silent
+from fbse_drake.progress import Interrupted, Progress, silent
 
 
 def of_process(number: int) -> tuple[int, int]:
@@ -76,23 +78,46 @@ def test_a_process_that_is_killed_is_an_error():
         processes.results([processes.begin(die)], silent, "working")
 
 
-def test_no_process_is_left_behind():
-    def endless(told: Progress) -> None:  # noqa: ARG001
-        while True:
-            pass
+def endless(told: Progress) -> None:  # noqa: ARG001
+    while True:
+        pass
 
-    def interrupted_at_once(text: str, share: float = 0.0) -> None:
-        lines = ProgressLines(str)
-        lines.stop("enough")
-        lines(text, share)
 
-    def interrupted_work() -> None:
-        with Processes(3) as processes:
-            tasks = [processes.begin(endless), processes.begin(endless)]
-            processes.results(tasks, interrupted_at_once, "working")
+def interrupted(text: str, share: float = 0.0) -> None:  # noqa: ARG001
+    raise Interrupted("enough")
 
-    with pytest.raises(Interrupted, match="enough"):
-        interrupted_work()
-    for process in multiprocessing.active_children():
-        process.join(10.0)
+
+def test_tasks_are_cancelled_when_the_work_that_they_are_done_for_is_interrupted():
+    with Processes(2) as processes:
+        tasks = [processes.begin(endless), processes.begin(endless)]
+        with pytest.raises(Interrupted, match="enough"):
+            processes.results(tasks, interrupted, "working")
+        assert not multiprocessing.active_children()
+        with pytest.raises(CancelledError):
+            processes.results(tasks, silent, "working")
+
+
+def test_tasks_are_cancelled_when_the_work_beside_them_is_interrupted():
+    with Processes(3) as processes:
+        done = processes.begin(lambda told: 1)  # noqa: ARG005
+        assert processes.results([done], silent, "working") == [1]
+        tasks = [processes.begin(endless) for _ in range(3)]
+        assert len(multiprocessing.active_children()) == 2
+        with pytest.raises(Interrupted, match="enough"):
+            processes.beside(interrupted)("other work")
+        assert not multiprocessing.active_children()
+        assert all(isinstance(task.error, CancelledError) for task in tasks)
+        # What is known is kept, and written down with tasks that begin after that.
+        again = processes.begin(lambda told: 2)  # noqa: ARG005
+        assert processes.results([done, again], silent, "writing") == [1, 2]
+
+
+def test_a_process_that_heeds_no_signal_is_ended_with_the_context():
+    def deaf(told: Progress) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        endless(told)
+
+    with Processes(2) as processes:
+        processes.begin(deaf)
+        assert multiprocessing.active_children()
     assert not multiprocessing.active_children()
