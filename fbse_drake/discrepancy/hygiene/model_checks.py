@@ -246,15 +246,21 @@ def check_swapped_joints(evidence: Evidence) -> Iterable[HygieneFinding]:
 
     before = score(at)
     angles = ("joint_position", "joint_velocity", "joint_acceleration")
-    for channels, what in (
-        (angles, "joint/position and joint/velocity"),
-        (("torque_command",), "joint/torque_command"),
-        ((*angles, "torque_command"), "joint/*"),
-    ):
-        if "torque_command" in channels and "joint/torque_command" not in evidence.log:
-            continue
+    kinds = {
+        "joint/position and joint/velocity": angles,
+        "joint/torque_command": ("torque_command",),
+        "joint/*": (*angles, "torque_command"),
+    }
+    if "joint/torque_command" not in evidence.log:
+        kinds = {what: names for what, names in kinds.items() if names == angles}
+    # Pair by pair: what moves alike needs the same, and that is computed once.
+    scores: dict[str, list[float]] = {what: [] for what in kinds}
+    for pair in pairs:
+        for what, channels in kinds.items():
+            scores[what].append(score(swapped(at, channels, *pair)))
+    for what, channels in kinds.items():
         after, (first, second) = min(
-            ((score(swapped(at, channels, *pair)), pair) for pair in pairs),
+            zip(scores[what], pairs, strict=True),
             key=lambda one: one[0],
             default=(np.inf, ([], [])),
         )
