@@ -14,6 +14,9 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
+# The tests start many processes: each would compile the package's modules anew, if it were forbidden to keep them.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: walk test minimum docs lint kernels kernels-biped kernels-others format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
