@@ -15,6 +15,7 @@ import re
 import textwrap
 import types
 import typing
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -392,9 +393,14 @@ def defaults_of(schema: Any) -> dict[str, Any]:
 def fields_of(schema: Any) -> dict[str, Any]:
     """The fields of a dataclass, or of one of Drake's serialisable classes, with their types."""
     if dataclasses.is_dataclass(schema):
-        hints = typing.get_type_hints(schema)
+        hints = _hints(typing.cast(type, schema))
         return {field.name: hints[field.name] for field in dataclasses.fields(schema)}
     return {field.name: field.type for field in schema.__fields__}
+
+
+@lru_cache(maxsize=256)
+def _hints(schema: type) -> dict[str, Any]:
+    return typing.get_type_hints(schema)
 
 
 def describe(value: Any) -> str:

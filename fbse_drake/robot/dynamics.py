@@ -46,6 +46,15 @@ class PlantDynamics:
                 )
         return result
 
+    def mass_matrices(self, positions: np.ndarray) -> np.ndarray:
+        """Mass matrix of the plant, (M, velocities, velocities)."""
+        velocities = self._plant.num_velocities()
+        result = np.empty((len(positions), velocities, velocities))
+        for k, position in enumerate(positions):
+            self._plant.SetPositions(self._context, position)
+            result[k] = self._plant.CalcMassMatrix(self._context)
+        return result
+
     def bias_accelerations(self, frames: Sequence[Frame], states: np.ndarray) -> np.ndarray:
         """Spatial acceleration [angular, linear] of some frames in the world without any
         accelerations of joints, in their own axes, (frames, M, 6)."""

@@ -27,7 +27,6 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
@@ -58,6 +57,8 @@ _AXES = ("x", "y", "z")
 # at once: Jacobians take room.
 _REMEMBERED = 3
 _MOST_INSTANTS = 20_000
+# The noise of so many blocks is calculated at a time, which bounds the matrices that are kept.
+_AT_A_TIME = 500
 
 
 @dataclass(frozen=True)
@@ -502,52 +503,55 @@ class EquationOfMotion:
             Of what is white, and of the integral over time of what is differenced white noise, each
             (M, rows), in the rows' units squared (the second times s^2).
         """
-        robot, plant, context, order = self.robot, self.robot.plant, self._context, self._order
-        M, n, v = len(at.joint_position), len(robot.joint_names), len(order)
-        motors = at.motor_position.shape[1]
-        rows = len(residual_rows(robot, motor_encoders=motors > 0))
+        M, motors = len(at.joint_position), at.motor_position.shape[1]
+        rows = len(residual_rows(self.robot, motor_encoders=motors > 0))
         white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
         white[:, rows - motors :] = sensors.deflection_noise**2
-        velocity_noise = joint_velocity_noise(sensors)
+        for start in range(0, M, _AT_A_TIME):
+            part = slice(start, start + _AT_A_TIME)
+            self._fill_noise(at.joint_position[part], sensors, white[part], differenced[part])
+        return white, differenced
+
+    def _fill_noise(
+        self,
+        joint_position: np.ndarray,
+        sensors: SensorsConfig,
+        white: np.ndarray,
+        differenced: np.ndarray,
+    ) -> None:
+        """Fills what `noise` returns, in some postures."""
+        robot, n, v = self.robot, joint_position.shape[1], len(self._order)
+        positions = np.tile(self._upright, (len(joint_position), 1))
+        positions[:, robot.position_index] = joint_position
         gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
-        floating = robot.has_floating_base
-        state = np.concatenate([self._upright, np.zeros(plant.num_velocities())])
-        soles = [robot.sole(side) for side in robot.description.sides] if floating else []
-        world, wrt, origin = plant.world_frame(), JacobianWrtVariable.kV, np.zeros(3)
-        wrench_variance = (
-            [deviation**2 for deviation in wrench_deviations(sensors.foot_force, robot)]
-            if floating
-            else []
-        )
+        floating, velocity_noise = robot.has_floating_base, joint_velocity_noise(sensors)
         scale = np.concatenate(
             [np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)]
         )
         joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
-        lever = _skew(self.p_BI) if floating else None
-        for k in range(M):
-            state[robot.position_index] = at.joint_position[k]
-            plant.SetPositionsAndVelocities(context, state)
-            H = plant.CalcMassMatrix(context)[np.ix_(order, order)][joints_first]
-            if floating:
-                white[k, :v] = accelerometer**2 * (H[:, 3:6] ** 2).sum(axis=1)
-                H[:, :3] += H[:, 3:6] @ lever
-            differenced[k, :v] = ((H * scale) ** 2).sum(axis=1)
-            place, relative = v, []
-            for sole, variance in zip(soles, wrench_variance, strict=True):
-                J = plant.CalcJacobianSpatialVelocity(context, wrt, sole, origin, world, sole)[
-                    :, order
-                ]
-                white[k, :v] += (J**2).T[joints_first] @ variance
-                white[k, place : place + 3] = ((J[:3] * scale) ** 2).sum(axis=1)
-                white[k, place + 3 : place + 6] = accelerometer**2
-                differenced[k, place + 3 : place + 6] = ((J[3:] * scale) ** 2).sum(axis=1)
-                relative.append(J[3:, 3:6].T @ J[3:])
-                place += 6
-            for one, other in self._pairs:
-                apart = (relative[one] - relative[other]) * scale
-                white[k, place : place + 3] = (apart**2).sum(axis=1)
-                place += 3
-        return white, differenced
+        H = self.dynamics.mass_matrices(positions)[:, self._order[joints_first]][:, :, self._order]
+        if floating:
+            white[:, :v] = accelerometer**2 * (H[:, :, 3:6] ** 2).sum(axis=2)
+            H[:, :, :3] += H[:, :, 3:6] @ _skew(self.p_BI)
+        differenced[:, :v] = ((H * scale) ** 2).sum(axis=2)
+        if not floating:
+            return
+        place, relative = v, []
+        for J, deviation in zip(
+            self._calc_jacobians(positions),
+            wrench_deviations(sensors.foot_force, robot),
+            strict=True,
+        ):
+            white[:, :v] += np.einsum("mij,i->mj", J**2, deviation**2)[:, joints_first]
+            white[:, place : place + 3] = ((J[:, :3] * scale) ** 2).sum(axis=2)
+            white[:, place + 3 : place + 6] = accelerometer**2
+            differenced[:, place + 3 : place + 6] = ((J[:, 3:] * scale) ** 2).sum(axis=2)
+            relative.append(np.einsum("mij,mik->mjk", J[:, 3:, 3:6], J[:, 3:]))
+            place += 6
+        for one, other in self._pairs:
+            apart = (relative[one] - relative[other]) * scale
+            white[:, place : place + 3] = (apart**2).sum(axis=2)
+            place += 3
 
 
 def joint_velocity_noise(sensors: SensorsConfig) -> float:
