@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cached_property, lru_cache
 from os.path import expandvars
 from pathlib import Path
 from xml.etree import ElementTree
@@ -445,7 +445,13 @@ def bare_urdf(urdf: Path) -> str:
 
     Limits of which the lower one is the upper one are none: who writes 0 and 0 did not know them.
     """
-    root = ElementTree.parse(urdf).getroot()
+    return _bare(urdf.read_bytes())
+
+
+# A diagnosis makes its robot many times, of large files too.
+@lru_cache(maxsize=4)
+def _bare(urdf: bytes) -> str:
+    root = ElementTree.fromstring(urdf)
     for element in [root, *root.iter("link"), *root.iter("joint")]:
         for part in [part for part in element if part.tag in _NOT_TAKEN]:
             element.remove(part)
