@@ -6,10 +6,11 @@ import shutil
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import System
+from pydrake.systems.framework import InputPort, System
 
 from fbse_drake import Log, Scenario, resources
 from fbse_drake.estimation import estimate
@@ -174,27 +175,34 @@ class Replay:
 
         A name of the form `system.field` is a field of that system's posterior.
         """
-        outputs = {name: [] for name in channels or ("friction_estimate", *self.estimator.channels)}
+        names = channels or ("friction_estimate", *self.estimator.channels)
+        # Looked up once, for there are many ticks.
+        read = {name: self._reader(name) for name in names}
+        outputs: dict[str, list[np.ndarray]] = {name: [] for name in names}
         for k, now in enumerate(time):
             self.fix({name: values[k] for name, values in inputs.items()}, now)
             for name, values in outputs.items():
-                values.append(self._value(name))
+                values.append(read[name]().copy())
             self.estimator.ExecuteForcedEvents(self.context, publish=False)
         return {name: np.array(values) for name, values in outputs.items()}
 
     def fix(self, inputs: Mapping[str, np.ndarray], now: float) -> None:
         """Puts samples on the input ports."""
         self.context.SetTime(now)
-        for i in range(self.estimator.num_input_ports()):
-            port = self.estimator.get_input_port(i)
-            port.FixValue(self.context, inputs[port.get_name()])
+        for name, port in self._input_ports.items():
+            port.FixValue(self.context, inputs[name])
 
-    def _value(self, name: str) -> np.ndarray:
+    @cached_property
+    def _input_ports(self) -> dict[str, InputPort]:
+        ports = [self.estimator.get_input_port(i) for i in range(self.estimator.num_input_ports())]
+        return {port.get_name(): port for port in ports}
+
+    def _reader(self, name: str) -> Callable[[], np.ndarray]:
         if "." not in name:
-            return self.estimator.GetOutputPort(name).Eval(self.context).copy()
+            return partial(self.estimator.GetOutputPort(name).Eval, self.context)
         system_name, field = name.split(".")
         system = self.estimator.GetSubsystemByName(system_name)
-        return system.GetOutputPort(field).Eval(system.GetMyContextFromRoot(self.context)).copy()
+        return partial(system.GetOutputPort(field).Eval, system.GetMyContextFromRoot(self.context))
 
 
 def rms(values: np.ndarray) -> float:
