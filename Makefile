@@ -17,14 +17,14 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name 
 # The tests start many processes: each would compile the package's modules anew, if it were forbidden to keep them.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: walk test minimum docs lint kernels kernels-biped kernels-others format bench fuzz fbse rivals hidden clean
+.PHONY: walk test minimum docs lint kernels kernels-biped kernels-others characters format bench fuzz fbse rivals hidden clean
 
 walk: $(INSTALLED)
 	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
 
 # A file's tests share its runs, so they stay on one worker. Each has a core: threads of the linear algebra would wait for each other.
 test: $(INSTALLED)
-	$(MAKE) --jobs 2 lint kernels
+	$(MAKE) --jobs 2 lint kernels characters
 	MPLBACKEND=Agg OMP_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # Files that call every dependency, in some minutes; most of it is compiled.
@@ -49,6 +49,10 @@ kernels-others: WALKS = ('quadruped_trot', None), ('bsc_arm', None), ('paper_wal
 kernels-biped kernels-others: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
 		[simulate(load(file, name, ['duration=0.01', *changes])) for file, name, *changes in ($(WALKS))]"
+
+# Hypothesis keeps a table of all characters, whose making takes 200 MiB: not in a worker of the tests.
+characters: $(INSTALLED)
+	$(VENV)/bin/python -W ignore -c "from hypothesis.strategies import text; text().example()"
 
 format: $(INSTALLED)
 	$(VENV)/bin/ruff check --fix .

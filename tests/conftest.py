@@ -15,12 +15,22 @@ from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 
-# A file that takes long and starts last would keep a single worker busy.
-_FIRST = ("test_notebooks", "test_physics", "test_whole_body", "test_report_browser")
+# A file that takes long and starts last would keep a single worker busy; one that needs much room
+# for a while finds it best before a worker has grown.
+_FIRST = (
+    "test_notebooks",
+    "test_physics",
+    "test_real_icub",
+    "test_motor_encoders",
+    "test_whole_body",
+    "test_report_browser",
+    "test_real_emps",
+    "test_validation",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take longest come first."""
+    """Files that take longest, or most room, come first."""
     places = {name: place for place, name in enumerate(_FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 

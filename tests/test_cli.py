@@ -28,6 +28,7 @@ FILES = ["log.npz", "metrics.json", "report.html", "scenario.yaml"]
 WALK = ["paper_walk_fbse", "--set", "duration=1"]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture):
     status = main(
         [
@@ -55,7 +56,7 @@ def test_simulate_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "report.html" in printed
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("undrawn")
 def test_the_written_scenario_runs_again_to_the_same_log(tmp_path: Path):
     main(["simulate", "sway", "--set", "duration=0.2", "--out", str(tmp_path / "a"), "--quiet"])
     main(["simulate", str(tmp_path / "a/scenario.yaml"), "--out", str(tmp_path / "b"), "--quiet"])
@@ -71,7 +72,7 @@ def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("undrawn")
 def test_meshcat_is_recorded(tmp_path: Path):
     assert (
         main(
