@@ -14,7 +14,8 @@ INSTALLED := $(VENV)/.installed
 # Compiled kernels are kept by what their sources say: a cache beside them would not notice a change in a module that they call.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba/$(shell find fbse_drake -name '*.py' | LC_ALL=C sort | xargs cat | cksum | cut -d' ' -f1)
 
-# The tests start many processes: each would compile the package's modules anew, if it were forbidden to keep them.
+# The tests start many processes, and each would compile the package's modules anew if it were
+# forbidden to keep them.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: walk test minimum docs lint kernels kernels-biped kernels-others characters format bench fuzz fbse rivals hidden clean
@@ -50,7 +51,8 @@ kernels-biped kernels-others: $(INSTALLED)
 	$(VENV)/bin/python -c "from fbse_drake import load_scenario as load, simulate; \
 		[simulate(load(file, name, ['duration=0.01', *changes])) for file, name, *changes in ($(WALKS))]"
 
-# Hypothesis keeps a table of all characters, whose making takes 200 MiB: not in a worker of the tests.
+# Hypothesis keeps a table of all characters, whose making takes 200 MiB: not in a worker of the
+# tests.
 characters: $(INSTALLED)
 	$(VENV)/bin/python -W ignore -c "from hypothesis.strategies import text; text().example()"
 
