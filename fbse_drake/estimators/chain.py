@@ -64,6 +64,8 @@ class Chain:
         self._suffix = f"_{workshop.chains}" if workshop.chains else ""
         workshop.chains += 1
         self._systems: dict[str, RecursiveEstimator] = {}
+        # Second names of systems.
+        self._aliases: set[str] = set()
 
     @property
     def is_empty(self) -> bool:
@@ -131,8 +133,12 @@ class Chain:
         return self.builder.AddNamedSystem(f"{name}{self._suffix}", system)
 
     def alias(self, system: str, name: str) -> None:
-        """Gives a system a second name, as one that does the work of two."""
+        """Gives a system a second name, as one that does the work of two.
+
+        By that name it tells what it estimates, but not its innovations a second time.
+        """
         self._systems[name] = self._systems[system]
+        self._aliases.add(name)
 
     def connect(self, source: str, target: str) -> None:
         """Connects a posterior, or an output `system.port`, to an input `system.port`."""
@@ -207,6 +213,8 @@ class Chain:
         """
         system, told = self._systems[name], {"friction"}
         told |= {row.field for row in estimates() if row.estimator == name}
+        if name in self._aliases:
+            told -= {"innovation", "innovation_variance"}
         spans = {
             field: part for field, part in parts(system.posterior_type).items() if field in told
         }

@@ -350,13 +350,19 @@ def _measurement_parts(log: Log, name: str, components: int) -> list[str]:
         "joint_acceleration": [
             f"{side} foot, {kind}" for side in log.sides for kind in ("angular", "linear")
         ],
-        "friction": log.joints,
+        "friction": _friction_parts(log, components),
     }[name]
     return (
         parts
         if parts and components % len(parts) == 0
         else [str(number) for number in range(1, components + 1)]
     )
+
+
+def _friction_parts(log: Log, components: int) -> list[str]:
+    """Of filters joint by joint, or of one that hears the gyro, too."""
+    gyro = [f"gyro, {axis}" for axis in "xyz"] if components == 3 + len(log.joints) else []
+    return [*gyro, *log.joints]
 
 
 def _base_state_parts(log: Log, components: int) -> list[str]:

@@ -77,17 +77,23 @@ def filter_consistency(log: Log) -> Figure:
     "Consistency of the friction filters",
     f"The same for the friction filter of each joint, averaged over {_NIS_WINDOW:g} s. Recursive "
     "least squares knows no noise in Nm; for it, this is the NIS for a noise of 1 Nm.",
-    where=lambda log: _has_updates(normalised_innovations(log).get("friction", {})),
+    where=lambda log: _has_updates(_of_joints(log)),
 )
 def friction_consistency(log: Log) -> Figure:
     """NIS of the friction filter of each joint."""
     figure, panels = joint_grid(log, "NIS [1]", own_swing=True)
-    parts = list(normalised_innovations(log)["friction"].values())
+    parts = _of_joints(log)
     for joint, axes in panels.items():
         label = str(joint_style(log, joint, "NIS")["label"])
-        _plot_nis(axes, log, {label: parts[joint]}, {label: joint_color(log, joint)})
+        _plot_nis(axes, log, {label: parts[log.joints[joint]]}, {label: joint_color(log, joint)})
     add_legend(figure)
     return figure
+
+
+def _of_joints(log: Log) -> dict[str, np.ndarray]:
+    """The friction filter's innovations that are of joints, see `normalised_innovations`."""
+    parts = normalised_innovations(log).get("friction", {})
+    return {name: squares for name, squares in parts.items() if name in log.joints}
 
 
 @figure_kind(
