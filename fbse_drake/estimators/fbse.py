@@ -14,7 +14,7 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.floating_base import FloatingBaseModel
-from fbse_drake.estimators.friction import FrictionConfig, RecursiveLeastSquares
+from fbse_drake.estimators.friction import FrictionConfig, ModelAided, RecursiveLeastSquares
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -67,7 +67,8 @@ class Fbse(Estimator):
 
     @classmethod
     def variants(cls) -> dict[str, Estimator]:
-        return {"": cls(), "the paper's": cls.paper()}
+        joint_by_joint = cls(friction=ModelAided())
+        return {"": cls(), "joint by joint": joint_by_joint, "the paper's": cls.paper()}
 
     def believed_sensors(self, usual: SensorBeliefs) -> SensorBeliefs:
         return self.sensors.completed(usual)
