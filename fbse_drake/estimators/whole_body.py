@@ -365,14 +365,19 @@ def _expect(
     A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
     _linearise(x, velocity, law, shaped)
     expected, inverse = _implicit_step(x, x.velocity, A, tick.push, tick.duration)
-    _, S = _own_covariance(x, A, inverse, tick)
-    gain, innovation = S.copy(), x.reading - expected
+    _, own = _own_covariance(x, A, inverse, tick)
+    innovation, S = x.reading - expected, own.copy()
     for i in range(len(S)):
         S[i, i] += x.noise[i] * known.variance[i]
-        largest = _GATE * math.sqrt(S[i, i])
-        if _confirmed(innovation[i], last.innovation[i]) < largest:
+        twice = _confirmed(innovation[i], last.innovation[i]) ** 2
+        if twice > _GATE**2 * S[i, i]:
+            # As in the update.
+            own[i, i] += twice
+            S[i, i] += twice
+        else:
+            largest = _GATE * math.sqrt(S[i, i])
             innovation[i] = min(max(innovation[i], -largest), largest)
-    expected += gain @ (_inverse(S) @ innovation)
+    expected += own @ (_inverse(S) @ innovation)
     return expected[3:].copy()
 
 
