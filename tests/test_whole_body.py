@@ -344,6 +344,11 @@ def test_a_sensor_that_fails_leaves_friction_to_its_law(run: Run, healthy: Log):
     friction = result["estimate/joint/friction_torque"]
     assert np.all(np.isfinite(friction))
     assert coverage(result) > 0.97
+    # Accelerations are those of the encoders meanwhile, whose noise is 0.7 rad/s^2.
+    wrong = result["estimate/joint/acceleration"] - log["truth/joint/acceleration"]
+    unheard = np.ravel(result["estimate/joint_acceleration/status"]) > 0
+    assert unheard[rows].mean() > 0.5
+    assert 0.6 < rms(wrong[unheard]) < 0.9
     # Half a second later nothing is left of it.
     change = (friction - healthy["estimate/joint/friction_torque"])[2200:]
     assert np.all(np.abs(change) < 3 * healthy["estimate/joint/friction_torque_std"][2200:])

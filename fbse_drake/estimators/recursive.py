@@ -315,7 +315,11 @@ class RecursiveEstimator(LeafSystem):
             return
         now = output.get_mutable_value()
         posterior = as_record(now, self.posterior_type)
-        self._tick(context, as_record(before, self.posterior_type), elapsed, posterior)
+        try:
+            self._tick(context, as_record(before, self.posterior_type), elapsed, posterior)
+        except np.linalg.LinAlgError:
+            # As of a matrix that is not finite.
+            now[:] = math.nan
         now[0] = time  # The first field.
         # Is it finite? The square is the cheapest sum over all.
         if not math.isfinite(now.dot(now)):
