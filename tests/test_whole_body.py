@@ -313,6 +313,17 @@ def test_standing_teaches_no_law(run: Run):
     assert coverage(log) > 0.98
 
 
+def test_laws_are_of_friction_that_brakes(run: Run):
+    """Joints that hardly move until they first swing, from which noise taught laws that push: the
+    worst joint's error was 0.58 of its friction. Measured 0.31."""
+    log = run("quadruped_trot", "duration=1.2", "seed=1")
+    rows = log.time >= 0.5
+    truth = log["truth/joint/friction_torque"][rows]
+    ratios = [rms(e) / rms(t) for e, t in zip(friction_error(log)[rows].T, truth.T, strict=True)]
+    assert max(ratios) < 0.45
+    assert coverage(log) > 0.97
+
+
 def test_wrong_masses_are_no_surprise(run: Run):
     """Decoy: what the model lacks looks like friction, and is stated as doubt."""
     heavier = "robot.effects.thighs=!BodyMass {mass: {left_thigh: 1.2, right_thigh: 1.2}}"
