@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from fbse_drake import Log
 from fbse_drake.estimators.base_filter import (
     _AT_REST,
+    _HABIT_TIME,
     _LEAST_HABIT,
     _WALKING_SPEED,
     InvariantBaseFilter,
@@ -561,12 +562,16 @@ def test_biases_are_found_while_it_stands():
     # robot is; nobody tells it that it rests.
     size = np.ones((len(speed), 3))
     size[:, 2] = np.clip(speed / _WALKING_SPEED, _AT_REST, 1.0)
-    # What they have not done for long they are less and less believed to do.
-    size[:, :] *= (1 + TICK * np.arange(len(size)) / rates.foot_time)[:, None] ** -0.5
+    # What they have not done for long they are less and less believed to do: the mean over all that
+    # has been, then a running mean.
+    age = rates.foot_time + TICK * np.arange(len(size))
+    share = rates.foot_time / np.minimum(age, _HABIT_TIME)
+    share *= np.exp(-np.maximum(age - _HABIT_TIME, 0.0) / _HABIT_TIME)
+    size *= np.sqrt(np.maximum(share, _LEAST_HABIT))[:, None]
     told = 2 * TICK / (2 * rates.foot_time * (rates.foot_rate * size) ** 2)
     information = 1 / beliefs.angular_velocity_bias**2 + told.sum(axis=0)
-    assert information[2] > 3 * information[0]
-    np.testing.assert_allclose(last["angular_velocity_bias_std"], information**-0.5, rtol=0.05)
+    assert information[2] > 1.5 * information[0]
+    np.testing.assert_allclose(last["angular_velocity_bias_std"], information**-0.5, rtol=0.07)
     left = GYRO_BIAS / beliefs.angular_velocity_bias**2 / information
     np.testing.assert_allclose(last["angular_velocity_bias"], GYRO_BIAS - left, atol=3e-4)
     forces = dataclasses.replace(

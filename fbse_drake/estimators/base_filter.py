@@ -109,7 +109,7 @@ _RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = (0.1, 0.1, 0.03, 0.03), 1e-4
 _MOST_TOLD, _LARGEST_SURPRISE = 0.05, 100.0
 # For how long feet [s], and forces, must have erred less than believed to be trusted more, and the
 # least that they are taken to err, as a share of the variance believed.
-_HABIT_TIME, _FORCE_HABIT_TIME, _LEAST_HABIT = 1.0, 3.0, 0.01
+_HABIT_TIME, _FORCE_HABIT_TIME, _LEAST_HABIT = 0.4, 3.0, 0.01
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 # A foot that carries less than this share of the weight moves more easily the less it carries.
