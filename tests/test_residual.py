@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.identification.regression import Regression, Signature, WhitenedResidual
-from fbse_drake.discrepancy.identification.structure import leftover_structure
-from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, Row, block_means, rms
+from fbse_drake.discrepancy.identification.structure import EXCESS, leftover_structure
+from fbse_drake.discrepancy.residual.residual import Residual, Row, block_means, rms
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
@@ -91,11 +92,27 @@ def test_more_noise_of_the_feet_than_is_believed_is_measured_and_no_structure(
     assert finding.size == pytest.approx(2.0, rel=0.1)
     white = WhitenedResidual(residual)
     assert not leftover_structure(motion, white, white.y)
-    # As believed, it would be structure in half of the rows.
-    believed = WhitenedResidual(
-        RecordedMotion(predictor.robot, scenario.sensors, scenario.recording, noisier).residual
-    )
-    assert len(leftover_structure(motion, believed, believed.y)) > 10
+
+
+def test_structure_is_what_is_left_and_tells_of_what_comes_next(walk: tuple[Scenario, Log]) -> None:
+    """Of as much beyond the sensors' noise, white or of a single impact, nothing is said: it is the
+    noise of impacts, or of what happens between rare samples."""
+    predictor = Predictor(*walk)
+    motion, white = predictor.motion, WhitenedResidual(predictor.residual)
+    rows = [k for k, row in enumerate(white.residual.rows) if row.kind != "kinematic"]
+    known = white.residual.known
+    noise = np.random.default_rng(2).standard_normal(known.shape)
+    impact = noise.copy()
+    impact[len(impact) // 2] += 30.0
+    drifting = lfilter([np.sqrt(1 - 0.8**2)], [1.0, -0.8], noise, axis=0)
+
+    def found(left: np.ndarray) -> int:
+        structures = leftover_structure(motion, white, np.where(known, left, 0.0))
+        return sum(structure.index in rows for structure in structures)
+
+    assert EXCESS < 1.5 < np.sqrt((impact**2).mean(axis=0)).min()
+    assert found(noise) == found(1.5 * noise) == found(impact) == 0
+    assert found(drifting) < found(1.5 * drifting) == len(rows)
 
 
 def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:

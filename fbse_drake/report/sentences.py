@@ -21,6 +21,8 @@ from fbse_drake.report.html import Step, number
 
 # So many rows of a disturbance are named.
 _DISTURBED = 3
+# What is left follows a variable that explains more than this share of it.
+_FOLLOWS = 0.1
 
 _COURSES = {
     "falls": "the error falls",
@@ -243,7 +245,8 @@ def _suggested(found: str) -> str:
 
 def _unexplained(diagnosis: Diagnosis) -> str:
     places = ", ".join(
-        f"{words(left.row)} (follows {left.variable})" for left in diagnosis.unexplained
+        f"{words(left.row)} (follows {left.variable})" if left.share > _FOLLOWS else words(left.row)
+        for left in diagnosis.unexplained
     )
     return f"Something is missing that no effect of the library explains, in {places}."
 

@@ -4,6 +4,7 @@ does it live in?"""
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.residual import RecordedMotion
@@ -18,6 +19,11 @@ EXCESS = 1.2
 _DROP = 25.0
 # How many times as large as it was taken the doubt about known laws may be.
 _DOUBT = 3.0
+# Of so many next averages what is left may tell something, and this is how often noise seems to.
+_LAGS, _FALSE_ALARM = 5, 1e-3
+# What is left may be an impact, which tells of itself alone: it counts up to so many deviations of
+# the noise.
+_LARGEST = 3.0
 # Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
 _KINEMATIC_EXCESS = 3.0
 
@@ -40,7 +46,10 @@ class Structure:
 def leftover_structure(
     motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray
 ) -> list[Structure]:
-    """Rows in which more than noise is left.
+    """Rows in which more than noise is left: it lives in variables that were measured, or it is
+    more than the sensors' noise and tells of what comes next.
+
+    What does neither is noise all the same, of impacts or of what happens between rare samples.
 
     Args:
         white: the residual by which it is measured.
@@ -58,10 +67,8 @@ def leftover_structure(
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            if (
-                ratio < tolerated
-                and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]
-            ):
+            is_noise = ratio < tolerated or _is_white(left[:, k], int(white.count[k]))
+            if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
         shares = {
@@ -70,6 +77,20 @@ def leftover_structure(
         best = max(shares, key=lambda name: shares[name])
         result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
     return result
+
+
+def _is_white(left: np.ndarray, count: int) -> bool:
+    """Does what is left of a row (B,) tell nothing of what comes next? (G. M. Ljung and G. E. P.
+    Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.)
+
+    Args:
+        count: how many of the averages are known; the others are 0.
+    """
+    y = np.clip(left, -_LARGEST, _LARGEST)
+    lags = np.arange(1, _LAGS + 1)
+    correlation = np.array([y[lag:] @ y[:-lag] for lag in lags]) / (y @ y)
+    told = count * (count + 2) * (correlation**2 / (count - lags)).sum()
+    return bool(told < chi2.isf(_FALSE_ALARM, _LAGS))
 
 
 def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
