@@ -621,8 +621,9 @@ def _make_dissipative(x: Record) -> None:
 
 @njit(cache=True)
 def _forget_laws(x: Record, known: Record) -> None:
-    """What was learned of the laws is as uncertain as at the start."""
+    """The laws are those of the start."""
     P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
+    x.weights[:], x.settled[:] = known.weights, known.weights
     P[of_laws:] = 0.0
     P[:, of_laws:] = 0.0
     for joint in range(n):
@@ -837,6 +838,7 @@ class WholeBodyFilter(RecursiveEstimator):
             wrench_variance=np.array([wrench_variance(sensors, robot, side) for side in legs]),
             learns_noise=sensors.learns_force_noise,
             weight_variance=self._weight_deviations() ** 2,
+            weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
