@@ -196,8 +196,9 @@ class Log(Mapping[str, np.ndarray]):
         return channel_kind(name)[0]
 
     def part(self, rows: slice) -> "Log":
-        """Some of its samples."""
-        return Log({name: values[rows] for name, values in self.channels.items()}, self.meta)
+        """Some of its samples; of every k-th the period is k times as long."""
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        return Log(channels, self.meta | {"period": self.meta["period"] * (rows.step or 1)})
 
     def to_pandas(self) -> "pandas.DataFrame":
         """As a data frame, see `fbse_drake.interop.frames`.

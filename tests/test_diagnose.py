@@ -177,6 +177,19 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("hidden", ["", "!BodyMass {mass: {trunk: 2.0}}"])
+def test_a_log_that_is_rarer_than_the_control_shows_when_commands_act(hidden: str) -> None:
+    """What happens between its samples is noise, and nothing unknown; but a command acts in the
+    millisecond after it was read."""
+    rare = log_with(hidden).part(slice(None, None, 2))
+    recording = replace(scenario().recording, rows="instantaneous")
+    diagnosis = diagnose(Predictor(replace(scenario(), recording=recording), rare), effects())
+    assert diagnosis.verdict == "effect_found"
+    found = {finding.effect: finding for finding in diagnosis.chosen}
+    assert set(found) == ({"TorqueLag", "BodyMass"} if hidden else {"TorqueLag"})
+    assert found["TorqueLag"].parameters["time_constant"].value == pytest.approx(1e-3, rel=0.2)
+
+
 @pytest.mark.parametrize("seed", [11, 12])
 def test_noise_in_the_regressors_is_not_taken_for_an_effect(seed: int) -> None:
     """In a squat the feet hardly move: what their accelerations show is noise, and it is in the

@@ -21,9 +21,9 @@ _DROP = 25.0
 _DOUBT = 3.0
 # Of so many next averages what is left may tell something, and this is how often noise seems to.
 _LAGS, _FALSE_ALARM = 5, 1e-3
-# What is left may be an impact, which tells of itself alone: it counts up to so many deviations of
-# the noise.
-_LARGEST = 3.0
+# An impact tells of itself alone: what is left counts up to so many of its usual deviations, which
+# are had from the median of their sizes.
+_LARGEST, _NORMAL_MEDIAN = 3.0, 0.6745
 # Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
 _KINEMATIC_EXCESS = 3.0
 
@@ -56,10 +56,12 @@ def leftover_structure(
         left: what is left of it, (B, R).
     """
     result = []
+    size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
+    left = _without_impacts(left, white.residual.known)
     for k, row in enumerate(white.residual.rows):
         if white.count[k] < 50:
             continue
-        ratio = float(np.sqrt((left[:, k] ** 2).sum() / white.count[k]))
+        ratio = float(size[k])
         variables = _variables(motion, white, k)
         if row.kind == "kinematic":
             if ratio < _KINEMATIC_EXCESS:
@@ -67,7 +69,8 @@ def leftover_structure(
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            is_noise = ratio < tolerated or _is_white(left[:, k], int(white.count[k]))
+            usual = np.sqrt((left[:, k] ** 2).sum() / white.count[k])
+            is_noise = usual < tolerated or _is_white(left[:, k], int(white.count[k]))
             if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
@@ -79,6 +82,16 @@ def leftover_structure(
     return result
 
 
+def _without_impacts(left: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """What is left, (B, R), as far as it counts."""
+    usual = [
+        np.median(np.abs(row[of])) if of.any() else 0.0
+        for row, of in zip(left.T, known.T, strict=True)
+    ]
+    largest = _LARGEST * np.maximum(np.array(usual) / _NORMAL_MEDIAN, 1.0)
+    return np.clip(left, -largest, largest)
+
+
 def _is_white(left: np.ndarray, count: int) -> bool:
     """Does what is left of a row (B,) tell nothing of what comes next? (G. M. Ljung and G. E. P.
     Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.)
@@ -86,9 +99,8 @@ def _is_white(left: np.ndarray, count: int) -> bool:
     Args:
         count: how many of the averages are known; the others are 0.
     """
-    y = np.clip(left, -_LARGEST, _LARGEST)
     lags = np.arange(1, _LAGS + 1)
-    correlation = np.array([y[lag:] @ y[:-lag] for lag in lags]) / (y @ y)
+    correlation = np.array([left[lag:] @ left[:-lag] for lag in lags]) / (left @ left)
     told = count * (count + 2) * (correlation**2 / (count - lags)).sum()
     return bool(told < chi2.isf(_FALSE_ALARM, _LAGS))
 
