@@ -54,6 +54,8 @@ _DOUBT_TIME = 0.1
 # innovations whose root mean square is that they are no noise; a velocity that is, that a joint
 # moves.
 _NOTICED = 3.0
+# A law is known when it is so many times surer than at the start.
+_LEARNED = 10.0
 _NOT_FINITE = float(Status.NOT_FINITE)
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
@@ -75,7 +77,7 @@ class WholeBody:
     Foot forces that come late belong to the tick in which they were: the filter is then so many
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
     keep contradicting the model, torque is lacking in the rows that their corrections point at, and
-    the laws of these joints are not learned; nor are those of joints that rest.
+    the laws of these joints, once known, are not learned; nor are those of joints that rest.
     """
 
     # Does it go back to the tick that late forces belong to?
@@ -381,7 +383,7 @@ def _update(
     P[:r, :r] = expected
     x.velocity[:], x.pushed[:] = predicted, tick.push
     x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
-    learning = _learning(last)
+    learning = _learning(last, known)
     correction = _listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
     _listen_to_feet(x, last, then, measured, learning, T, known)
     _watch_corrections(x, last, A, correction, expected, T)
@@ -389,22 +391,36 @@ def _update(
 
 
 @njit(cache=True)
-def _learning(last: Record) -> np.ndarray:
+def _learning(last: Record, known: Record) -> np.ndarray:
     """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
     A joint whose velocity has not been known from zero for some time says nothing of its law:
-    coefficient and velocity, known by their product alone, would drift apart. What is contradicted
-    may be the law or what it is learned from, and nobody knows which. So it is where torque keeps
-    being lacking in the joint's row, and where innovations are no noise.
+    coefficient and velocity, known by their product alone, would drift apart. Of what contradicts a
+    law that is known by now nobody knows whether it is the law or what it is learned from. So it is
+    where torque keeps being lacking in the joint's row, and where innovations are no noise.
     """
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
     for joint in range(n):
         row = 3 + joint
         rests = last.rested[joint] > _DOUBT_TIME
         no_noise = last.agreement[row] > _NOTICED**2
-        if rests or no_noise or _is_contradicted(last, row):
+        contradicted = _is_contradicted(last, row) or no_noise
+        if rests or (contradicted and _is_learned(last, joint, known)):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
+
+
+@njit(cache=True)
+def _is_learned(x: Record, joint: int, known: Record) -> bool:
+    """Is a joint's law, where it is asked, known _LEARNED times as well as at the start?"""
+    n, m = x.weights.shape
+    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
+    for j in range(m):
+        start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
+        for k in range(m):
+            both = x.regressor[joint, j] * x.regressor[joint, k]
+            now += both * x.covariance[first + j, first + k]
+    return now * _LEARNED**2 < start
 
 
 @njit(cache=True)
