@@ -40,6 +40,9 @@ _AT_THE_END = 0.98
 # A finding takes off a row at least this share of what then is left there beyond the noise: what
 # explains a large rest would also change what is small beside it.
 _LEAST_OF_REST = 0.1
+# A row is worse for a member if its held-out error rises by more than this share: a body that is
+# heavier brings the noise of its acceleration, also where its mass hardly shows.
+_WORSE = 0.01
 # Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
 # of two that round alike.
 _ROUNDING = 1e-3
@@ -202,8 +205,10 @@ class Judge:
     def _is_sound(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
         """Does a member worsen no row, stand out in one, and have values that can be?"""
         fits, rows = self._fits, member.signature.rows
+        worse = self.gain_by_row(rest, whole) < -MARGIN
+        worse &= whole.held_out_sse > (1 + _WORSE) ** 2 * rest.held_out_sse
         return (
-            self.gain_by_row(rest, whole)[rows].min() > -MARGIN
+            not worse[rows].any()
             and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
