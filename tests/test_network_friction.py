@@ -135,7 +135,7 @@ def test_a_robot_is_trained_on_its_own_log():
         "time": time,
         "joint/position": np.zeros((len(time), 2)),
         "joint/velocity": np.stack([velocity, velocity], axis=1),
-        "estimate/joint/residual_torque": np.stack([torque, -2 * torque], axis=1),
+        "estimate/joint/friction_torque": np.stack([torque, -2 * torque], axis=1),
     }
     log = Log(channels, {"joints": ["hip", "knee"], "period": 0.01})
     found = NetworkFriction().identified(log)

@@ -83,15 +83,15 @@ class NetworkFriction(Estimator):
         require_positive(self, "unknown")
 
     def identified(self, log: Log) -> "NetworkFriction":
-        """Networks of all joints, of the velocities and torques of a log, behind the filters'
-        settling.
+        """Networks of all joints, of the velocities and the estimated friction of a log, behind the
+        filters' settling. (Friction as it is measured in a tick is mostly noise.)
 
         Raises:
             InputError: scikit-learn is not installed.
         """
         step = max(1, round(_SAMPLE_TIME / float(log.meta["period"])))
         rows = np.flatnonzero(log.time > log.time[0] + _SETTLING_TIME)[::step]
-        velocity, torque = log["joint/velocity"][rows], log["estimate/joint/residual_torque"][rows]
+        velocity, torque = log["joint/velocity"][rows], log["estimate/joint/friction_torque"][rows]
         networks = {
             joint: trained(velocity[:, j], torque[:, j]) for j, joint in enumerate(log.joints)
         }

@@ -382,13 +382,12 @@ def _update(
     P[:, :r] = with_states.T
     P[:r, :r] = expected
     x.velocity[:], x.pushed[:] = predicted, tick.push
+    x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
     learning = _learning(last, known)
     correction = _listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
     _listen_to_feet(x, last, then, measured, learning, T, known)
     _watch_corrections(x, last, A, correction, expected, T)
-    acceleration = (x.velocity - last.velocity) / T
-    x.residual[:] = (tick.push - A @ acceleration)[3:]
-    x.joint_acceleration[:] = acceleration[3:]
+    x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T
 
 
 @njit(cache=True)
@@ -760,8 +759,7 @@ class WholeBodyFilter(RecursiveEstimator):
         friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
         link_torque              (n,)    the last command that is a number, less friction; what
                                          passes the joint to its link [Nm]
-        residual                 (n,)    what the tick's acceleration leaves of the torques, that
-                                         is, friction by no law [Nm]
+        residual                 (n,)    friction as it is measured in the tick, unfiltered [Nm]
         joint_acceleration       (n,)    mean over the tick [rad/s^2]
         parameters, parameter_variance   (n, ...)  linear parameters of the law
         velocity                 (r,)    of the base's turning in its axes, and of the joints
