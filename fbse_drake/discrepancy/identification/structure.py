@@ -62,6 +62,7 @@ def leftover_structure(
         if white.count[k] < 50:
             continue
         ratio = float(size[k])
+        usual = np.sqrt((left[:, k] ** 2).sum() / white.count[k])
         variables = _variables(motion, white, k)
         if row.kind == "kinematic":
             if ratio < _KINEMATIC_EXCESS:
@@ -69,11 +70,10 @@ def leftover_structure(
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            usual = np.sqrt((left[:, k] ** 2).sum() / white.count[k])
             is_noise = usual < tolerated or _is_white(left[:, k], int(white.count[k]))
             if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
-        excess = max(ratio**2 - 1.0, 1e-3) * white.count[k]
+        excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
         shares = {
             name: _explained(white, left, k, basis) / excess for name, basis in variables.items()
         }
