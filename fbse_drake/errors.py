@@ -47,10 +47,11 @@ def required(value: float | None, name: str) -> float:
 
 
 def require_not_negative(config: object, *names: str) -> None:
-    """Refuses a configuration in which one of these numbers is < 0."""
+    """Refuses a configuration in which one of these numbers is given (not None) and < 0."""
     for name in names:
-        if not getattr(config, name) >= 0:
-            raise InputError(f"{name}: expected a number >= 0, found {getattr(config, name):g}")
+        value = getattr(config, name)
+        if value is not None and not value >= 0:
+            raise InputError(f"{name}: expected a number >= 0, found {value:g}")
 
 
 def require_at_most(config: object, **largest: float) -> None:

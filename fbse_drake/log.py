@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fbse_drake import schema
-from fbse_drake.errors import InputError, located, require_positive
+from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.files import from_json, to_json, write_atomically
 from fbse_drake.npz import read_npz
 from fbse_drake.signals import channel_kind
@@ -26,7 +26,7 @@ FORMAT_VERSION = 1
 
 _REQUIRED = ("time", "joint/position")
 # Keys of `LogMeta` with numbers that are calculated with.
-_NUMBERS = ("period", "pads", "segments")
+_NUMBERS = ("period", "reading_time", "command_time", "pads", "segments")
 # Not even a recording with gaps lacks more rows for each that it has.
 _MOST_GAPS = 100
 
@@ -59,6 +59,11 @@ class LogMeta:
     joints: list[str]
     # Nominal time between rows [s].
     period: float
+    # A reading of accelerometer or foot force is the mean over so long before its row, a command is
+    # held for so long from its row on [s]; by default the period. Rows that are rarer know nothing
+    # of what is in between.
+    reading_time: float | None = None
+    command_time: float | None = None
     sides: list[str] = field(default_factory=list)
     # Joints by side.
     legs: dict[str, list[str]] = field(default_factory=dict)
@@ -78,6 +83,7 @@ class LogMeta:
 
     def __post_init__(self) -> None:
         require_positive(self, "period")
+        require_not_negative(self, "reading_time", "command_time")
         for key in ("joints", "sides"):
             names = getattr(self, key)
             if len(set(names)) != len(names):

@@ -155,9 +155,11 @@ class RecordingConfig:
 
     # The equation of motion is averaged over blocks of this length [s].
     block: float = 0.010
-    # What a row of the log holds: `per_step` (IMU and forces over the step that ends there, the
-    # torque that is held over the step that begins there), or `instantaneous` (all channels sampled
-    # together). Whether a simulation made the motion, and in what steps, is told by the log itself.
+    # What a row of the log holds: `per_step` (IMU and forces over the time that ends there, the
+    # torque that is held over the time that begins there; the log's `reading_time` and
+    # `command_time` say how long these are, by default its period), or `instantaneous` (all
+    # channels sampled together). Whether a simulation made the motion, and in what steps, is told
+    # by the log itself.
     rows: str = "per_step"
     # Joint velocities: `measured`, or `differenced` from the angles, as they are in any case where
     # the log has none.

@@ -339,6 +339,8 @@ def _make_log(scenario: Scenario, name: str, run: RecordedRun) -> Log:
         # Places of the force sensors in each sole frame [m].
         "pads": {side: robot.pad_positions(side).tolist() for side in robot.description.sides},
         "period": scenario.log.period,
+        "reading_time": scenario.plant.time_step,
+        "command_time": scenario.control.period,
         "source": "fbse_drake simulation",
         "title": scenario.title,
         "scenario": dump_scenario(scenario, name),

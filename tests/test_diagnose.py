@@ -177,9 +177,28 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("every", [2, 5])
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        "",
+        "!BodyMass {mass: {trunk: 2.0}}",
+        "!TorqueGain {shortfall: {left_knee_pitch: 0.04}}",
+    ],
+)
+def test_of_a_log_that_is_rarer_than_the_control_the_same_is_found(hidden: str, every: int) -> None:
+    rare = log_with(hidden).part(slice(None, None, every))
+    found = diagnose(Predictor(scenario(), rare), effects()).chosen
+    whole = diagnosis_of(hidden).chosen
+    assert [(f.effect, f.targets) for f in found] == [(f.effect, f.targets) for f in whole]
+    for one, other in zip(found, whole, strict=True):
+        for name, parameter in one.parameters.items():
+            assert parameter.value == pytest.approx(other.parameters[name].value, rel=0.03)
+
+
 @pytest.mark.parametrize("hidden", ["", "!BodyMass {mass: {trunk: 2.0}}"])
-def test_a_log_that_is_rarer_than_the_control_shows_when_commands_act(hidden: str) -> None:
-    """What happens between its samples is noise, and nothing unknown; but a command acts in the
+def test_samples_that_are_rarer_than_the_control_show_when_commands_act(hidden: str) -> None:
+    """What happens between them is noise, and nothing unknown; but a command acts in the
     millisecond after it was read."""
     rare = log_with(hidden).part(slice(None, None, 2))
     recording = replace(scenario().recording, rows="instantaneous")

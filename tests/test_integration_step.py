@@ -76,7 +76,7 @@ def test_nothing_is_left_whatever_integrated_the_motion(period: float, steps: in
     """Half a step of the posture is a hundred times what is left at 5 ms."""
     channels = pendulum(period, steps)
     predictor = Predictor(scenario(period), log_of(channels, period))
-    told = predictor.motion.integration_step
+    told = predictor.motion.timing.integration
     assert told == pytest.approx(period / steps if steps else 0.0, abs=0.02 * period)
     left = np.sqrt((predictor.residual.value**2).mean())
     half = 0.5 * period * channels["joint/velocity"] * WEIGHT * np.cos(channels["joint/position"])
@@ -85,6 +85,27 @@ def test_nothing_is_left_whatever_integrated_the_motion(period: float, steps: in
     assert left < 1.5 * curvature + 1e-6
     if period == 5e-3:
         assert left < 0.1 * np.sqrt((half**2).mean())
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_nothing_is_left_of_a_log_that_is_rarer_than_the_control(steps: int) -> None:
+    """A command that acts for a fifth of the time between rows is not held for all of it."""
+    control, period = 1e-3, 5e-3
+    channels = {name: values[::5] for name, values in pendulum(control, steps).items()}
+
+    def left(**said: float) -> float:
+        log = log_of(channels, period)
+        predictor = Predictor(scenario(period), replace(log, meta=log.meta | said))
+        told = predictor.motion.timing.integration
+        assert told == pytest.approx(control / steps if steps else 0.0, abs=0.02 * period)
+        return float(np.sqrt((predictor.residual.value**2).mean()))
+
+    torque = channels["joint/torque_command"]
+    # Between the rows it is taken to change evenly.
+    curvature = np.sqrt((torque**2).mean()) * (23 * period) ** 2 / 12
+    assert left(command_time=control) < 1.5 * curvature
+    held = 0.4 * np.sqrt((np.diff(torque, axis=0) ** 2).mean())
+    assert left() == pytest.approx(held, rel=0.1)
 
 
 @pytest.mark.parametrize("steps", [0, 1])
@@ -136,8 +157,8 @@ def test_friction_is_that_of_the_velocity_where_its_step_ended() -> None:
     period = 5e-3
     for steps, share in ((0, 0.5), (1, 1.0), (5, 0.6)):
         predictor = Predictor(scenario(period), log_of(pendulum(period, steps), period))
-        assert predictor.motion.law_share == pytest.approx(share, abs=0.01)
-        assert predictor.motion.motion_share == pytest.approx(1 - share, abs=0.01)
+        assert predictor.motion.timing.law_share == pytest.approx(share, abs=0.01)
+        assert predictor.motion.timing.motion_share == pytest.approx(1 - share, abs=0.01)
         velocity = predictor.motion.signals.joint_velocity
         expected = (1 - share) * velocity[:-1] + share * velocity[1:]
         found = predictor.joint_motion.velocity

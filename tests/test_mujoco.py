@@ -312,7 +312,7 @@ def test_rows_of_an_exact_arm_log_leave_nothing(integrator: str, step: float) ->
     scenario, reference = exact_arm()
     log = record(Run(scenario, 0, Nothing(), integrator=integrator), reference, "arm")
     motion = Predictor(scenario, log).motion
-    assert motion.integration_step == pytest.approx(step, abs=1e-5)
+    assert motion.timing.integration == pytest.approx(step, abs=1e-5)
     assert (rms(motion.residual.value) < 2e-5 * rms(log["joint/torque_command"])).all()
 
 

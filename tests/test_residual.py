@@ -177,7 +177,7 @@ def test_gaps_are_left_out_and_touch_nothing_else(
     intact = Predictor(scenario, log)
     whole = intact.residual
     # The one thing that is found from the log as a whole.
-    step = intact.motion.integration_step
+    step = intact.motion.timing.integration
     monkeypatch.setattr(
         "fbse_drake.discrepancy.residual.residual.integration_step", lambda *_: step
     )

@@ -231,6 +231,8 @@ def _log(
         },
         "pads": {side: robot.pad_positions(side).tolist() for side in names.sides},
         "period": period,
+        "reading_time": period,
+        "command_time": period,
         "source": f"MuJoCo {mujoco.__version__}",
         "title": scenario.title,
         "scenario": dump_scenario(scenario, name),

@@ -459,7 +459,9 @@ def _joined(recordings: Sequence[_Recording], log_map: LogMap) -> Log:
         moved = {"segments": segments} if first.origin else {}
         left_out = {"findings": first.findings} if first.findings else {}
         meta = first.meta | made | moved | left_out
-    log = Log(channels, meta | ({"pads": log_map.pads} if log_map.pads else {}))
+    said = {key: getattr(log_map, key) for key in ("pads", "reading_time", "command_time")}
+    meta |= {key: value for key, value in said.items() if value not in (None, {})}
+    log = Log(channels, meta)
     check_recorded(log)
     return log
 

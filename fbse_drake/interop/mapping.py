@@ -22,7 +22,7 @@ import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
 
 from fbse_drake import resources, schema
-from fbse_drake.errors import InputError, located, require_positive
+from fbse_drake.errors import InputError, located, require_not_negative, require_positive
 from fbse_drake.interop.units import si_factor
 from fbse_drake.signals import channel_kind
 
@@ -183,6 +183,9 @@ class LogMap:
     time: TimeMap = field(default_factory=TimeMap)
     # Nominal time between rows [s]; by default the median.
     period: float | None = None
+    # See `LogMeta`: of a robot whose control is faster than the recording.
+    reading_time: float | None = None
+    command_time: float | None = None
     # The only topics of a bag that are read; by default all with standard messages.
     topics: list[str] = field(default_factory=list)
     # The key of a JSON file under which the records are; by default its only list of records.
@@ -199,6 +202,7 @@ class LogMap:
 
     def __post_init__(self) -> None:
         require_positive(self, "gap", "period")
+        require_not_negative(self, "reading_time", "command_time")
         if self.end is not None and not self.end > self.start:
             raise InputError(f"end: expected a number > start = {self.start:g}, found {self.end:g}")
         if len(set(self.joints)) != len(self.joints):

@@ -309,7 +309,7 @@ class Predictor:
         motion = motion._replace(command=self.motion.steps.torque_command[:, joints])
         begin = deflection_over_time(effect, motion, nonlinear)
         end = np.concatenate([begin[..., 1:, :], begin[..., -1:, :]], axis=-2)
-        share = self.motion.motion_share
+        share = self.motion.timing.motion_share
         amid = (1.0 - share) * begin + share * end
         return self.is_driven[joints] * self._averages(amid[None], 1)
 
@@ -640,12 +640,11 @@ class Predictor:
         """
         motion, length, period = self.motion, self.motion.length, self.motion.period
         result = np.zeros((len(motion.time), self.rows))
-        # A force that is the mean over the step that ends tells of a sole in that step, a sampled
-        # one of that instant; where that is in a step of the residual, and the motion's rate there.
-        share = motion.motion_share
-        posture, rate = (
-            (2 * share, 3 * share - 1) if motion.recording.rows == "per_step" else (0.5, 0.0)
-        )
+        # A force that is the mean over some time before its row tells of a sole in that time, a
+        # sampled one of that instant; where that is in a step of the residual, and the motion's
+        # rate there.
+        reading, step = (t / period for t in (motion.timing.reading, motion.timing.integration))
+        posture, rate = 0.5 + 0.5 * reading - step, 0.5 * reading - 1.5 * step
         place = next(k for k, row in enumerate(motion.rows) if row.kind == "kinematic")
         velocities = []
         for rotation, displacement in motions:

@@ -102,7 +102,7 @@ class Reading:
         torque = self._without_noise(signals.torque_command)
         at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
         return JointMotion(
-            velocity=within_steps(velocity, motion.law_share),
+            velocity=within_steps(velocity, motion.timing.law_share),
             position=at.joint_position,
             command=at.torque_command,
             time=time[:, None],

@@ -263,37 +263,67 @@ class Instants:
     motor_position: np.ndarray
 
 
-def steps(
-    signals: SensorSignals, period: float, rows: str = "per_step", integration_step: float = 0.0
-) -> Instants:
-    """Every step between two samples, M = N - 1, see `RecordingConfig.rows`.
+@dataclass(frozen=True)
+class Timing:
+    """When that holds what a row of a log tells, see `RecordingConfig.rows`; all in [s]."""
 
-    Of samples per step the command counts that was held over the step, accelerations and forces are
-    those over it, and posture and velocities those amid it; a simulation has its forces from where
-    its own, semi-implicit steps began, which is half of such a step earlier. Of instantaneous
-    samples all is taken amid the step.
+    # From one row to the next.
+    period: float
+    # A reading of accelerometer or foot force is the mean over this before its row.
+    reading: float = 0.0
+    # The command of a row is held for this from then on.
+    command: float = 0.0
+    # Steps in which the motion was integrated; 0 for continuous motion.
+    integration: float = 0.0
 
-    Args:
-        integration_step: see the function `integration_step`.
-    """
-    if rows == "instantaneous":
-        middle = {name: 0.5 * (values[1:] + values[:-1]) for name, values in vars(signals).items()}
-        return Instants(
-            joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
-            angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
-            **middle,
-        )
-    share = 0.5 - 0.5 * integration_step / period
+    @staticmethod
+    def of(log: Log, recording: RecordingConfig) -> "Timing":
+        """That of a log's rows, but for the integration of its motion."""
+        period = float(log.meta["period"])
+        if recording.rows == "instantaneous":
+            return Timing(period)
+        said = (log.meta.get(key) for key in ("reading_time", "command_time"))
+        reading, command = (period if time is None else min(time, period) for time in said)
+        return Timing(period, reading, command)
+
+    @property
+    def reading_share(self) -> float:
+        """Between the readings at both ends of a step, where that of its middle is, as a share."""
+        return 0.5 + 0.5 * self.reading / self.period
+
+    @property
+    def command_share(self) -> float:
+        """The same of commands."""
+        return 0.5 - 0.5 * self.command / self.period
+
+    @property
+    def motion_share(self) -> float:
+        """Where in a step its forces have their posture and velocities: a simulation has its forces
+        from where its own, semi-implicit steps began, which is half of such a step earlier."""
+        return 0.5 - 0.5 * self.integration / self.period
+
+    @property
+    def law_share(self) -> float:
+        """Where in a step the velocity is that friction has: a simulated law holds at the end of
+        its integration step."""
+        return 0.5 + 0.5 * self.integration / self.period
+
+
+def steps(signals: SensorSignals, timing: Timing) -> Instants:
+    """Every step between two samples, M = N - 1: all that is measured is taken amid the step, the
+    accelerations are those over it."""
+    at_readings, at_commands = timing.reading_share, timing.command_share
+    at_motion, period = timing.motion_share, timing.period
     return Instants(
-        joint_position=within_steps(signals.joint_position, share),
-        joint_velocity=within_steps(signals.joint_velocity, share),
+        joint_position=within_steps(signals.joint_position, at_motion),
+        joint_velocity=within_steps(signals.joint_velocity, at_motion),
         joint_acceleration=np.diff(signals.joint_velocity, axis=0) / period,
-        angular_velocity=within_steps(signals.angular_velocity, share),
+        angular_velocity=within_steps(signals.angular_velocity, at_motion),
         angular_acceleration=np.diff(signals.angular_velocity, axis=0) / period,
-        specific_force=signals.specific_force[1:],
-        pad_force=signals.pad_force[1:],
-        torque_command=signals.torque_command[:-1],
-        motor_position=within_steps(signals.motor_position, share),
+        specific_force=within_steps(signals.specific_force, at_readings),
+        pad_force=within_steps(signals.pad_force, at_readings),
+        torque_command=within_steps(signals.torque_command, at_commands),
+        motor_position=within_steps(signals.motor_position, at_motion),
     )
 
 
@@ -637,7 +667,8 @@ class RecordedMotion:
             InputError: a log that does not fit the model, or one that is too short.
         """
         self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
-        self.period = float(log.meta["period"])
+        self.timing = Timing.of(log, recording)
+        self.period = self.timing.period
         self.signals, self.measured = read_signals(robot, log, recording)
         self.length = max(1, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
@@ -655,23 +686,10 @@ class RecordedMotion:
                 )
         self.start, self._left_out = float(log.time[0]), left_out
         self.equation = EquationOfMotion(robot)
-        # Steps in which the motion was integrated [s]: 0 for continuous motion.
-        self.integration_step = 0.0
         if recording.rows == "per_step":
-            self.integration_step = integration_step(
-                self.signals.joint_position, self.signals.joint_velocity, self.period, self.measured
-            )
-
-    @property
-    def motion_share(self) -> float:
-        """Where in a step its forces have their posture and velocities, as a share of it."""
-        return 0.5 - 0.5 * self.integration_step / self.period
-
-    @property
-    def law_share(self) -> float:
-        """Where in a step the velocity is that friction has: a simulated law holds at the end of
-        its integration step."""
-        return 0.5 + 0.5 * self.integration_step / self.period
+            position, velocity = self.signals.joint_position, self.signals.joint_velocity
+            found = integration_step(position, velocity, self.period, self.measured)
+            self.timing = replace(self.timing, integration=found)
 
     @cached_property
     def steps(self) -> Instants:
@@ -679,7 +697,7 @@ class RecordedMotion:
 
     def steps_of(self, signals: SensorSignals) -> Instants:
         """Steps of other signals on the same grid."""
-        return steps(signals, self.period, self.recording.rows, self.integration_step)
+        return steps(signals, self.timing)
 
     def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
         """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0
