@@ -19,8 +19,10 @@ EXCESS = 1.2
 _DROP = 25.0
 # How many times as large as it was taken the doubt about known laws may be.
 _DOUBT = 3.0
-# Of so many next averages what is left may tell something, and this is how often noise seems to.
-_LAGS, _FALSE_ALARM = 5, 1e-3
+# Of which later averages what is left may tell something: not of the next one, with which noise is
+# correlated if there is more or less of it white than believed, and less or more differenced. And
+# how often noise seems to.
+_LAGS, _FALSE_ALARM = np.arange(2, 7), 1e-3
 # An impact tells of itself alone: what is left counts up to so many of its usual deviations, which
 # are had from the median of their sizes.
 _LARGEST, _NORMAL_MEDIAN = 3.0, 0.6745
@@ -47,7 +49,7 @@ def leftover_structure(
     motion: RecordedMotion, white: WhitenedResidual, left: np.ndarray
 ) -> list[Structure]:
     """Rows in which more than noise is left: it lives in variables that were measured, or it is
-    more than the sensors' noise and tells of what comes next.
+    more than the sensors' noise and tells of what comes later.
 
     What does neither is noise all the same, of impacts or of what happens between rare samples.
 
@@ -93,16 +95,15 @@ def _without_impacts(left: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _is_white(left: np.ndarray, count: int) -> bool:
-    """Does what is left of a row (B,) tell nothing of what comes next? (G. M. Ljung and G. E. P.
+    """Does what is left of a row (B,) tell nothing of what comes later? (G. M. Ljung and G. E. P.
     Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.)
 
     Args:
         count: how many of the averages are known; the others are 0.
     """
-    lags = np.arange(1, _LAGS + 1)
-    correlation = np.array([left[lag:] @ left[:-lag] for lag in lags]) / (left @ left)
-    told = count * (count + 2) * (correlation**2 / (count - lags)).sum()
-    return bool(told < chi2.isf(_FALSE_ALARM, _LAGS))
+    correlation = np.array([left[lag:] @ left[:-lag] for lag in _LAGS]) / (left @ left)
+    told = count * (count + 2) * (correlation**2 / (count - _LAGS)).sum()
+    return bool(told < chi2.isf(_FALSE_ALARM, len(_LAGS)))
 
 
 def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
