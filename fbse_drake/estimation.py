@@ -107,9 +107,12 @@ def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]
     return inputs
 
 
-def _reading_time(scenario: Scenario) -> float:
+def _reading_time(scenario: Scenario, log: Log) -> float:
     """What a log's reading of accelerometer or foot force is the mean over [s]."""
-    return scenario.plant.time_step if scenario.recording.rows == "per_step" else 0.0
+    if scenario.recording.rows == "instantaneous":
+        return 0.0
+    said = log.meta.get("reading_time")
+    return scenario.plant.time_step if said is None else said
 
 
 def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.ndarray:
@@ -117,8 +120,10 @@ def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.n
 
     A log that is slower than the control has only samples of what changed in between.
     """
-    period = required(scenario.control.period, "control.period")
-    share = start_share(float(log.meta["period"]), period)
+    held = log.meta.get("command_time")
+    if held is None:
+        held = required(scenario.control.period, "control.period")
+    share = start_share(float(log.meta["period"]), held)
     after = np.concatenate([torque[1:], torque[-1:]])
     return torque + share * (after - torque)
 
@@ -149,7 +154,7 @@ class Replay:
             period=float(log.meta["period"]),
             plan=task_plan(scenario, robot),
             every_sample=True,
-            reading=_reading_time(scenario),
+            reading=_reading_time(scenario, log),
             sensors=sensors,
             knows_torque=knows_torque,
             beside=beside,

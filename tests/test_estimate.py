@@ -112,6 +112,22 @@ def test_samples_may_be_missing_and_late(run: Run):
     assert error(result) < 1.3 * error(log)
 
 
+def test_a_log_says_for_how_long_its_commands_are_held(run: Run):
+    """As a scenario says of those that do not."""
+    rare = run("paper_walk_fbse", "duration=1").part(slice(None, None, 5))
+    unsaid = {key: value for key, value in rare.meta.items() if key != "command_time"}
+
+    def estimated(log: Log, held: float) -> Log:
+        periods = (f"control.period={held}", "duration=0.1")
+        return estimate(scenario("paper_walk_fbse", *periods), log).log
+
+    held = estimated(dataclasses.replace(rare, meta=unsaid | {"command_time": 0.005}), held=0.001)
+    assert_same(held, estimated(dataclasses.replace(rare, meta=unsaid), held=0.005), atol=0.0)
+    sampled = estimated(rare, held=0.005)
+    assert_same(sampled, estimated(dataclasses.replace(rare, meta=unsaid), held=0.001), atol=0.0)
+    assert error(sampled) < error(held)
+
+
 def test_without_joint_velocities(run: Run):
     log = cut(run("paper_walk_fbse", "duration=3"), slice(0, 2001))
     result = estimate(WALK, without(log, "joint/velocity")).log

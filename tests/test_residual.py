@@ -94,7 +94,9 @@ def test_more_noise_of_the_feet_than_is_believed_is_measured_and_no_structure(
     assert not leftover_structure(motion, white, white.y)
 
 
-def test_structure_is_what_is_left_and_tells_of_what_comes_later(walk: tuple[Scenario, Log]) -> None:
+def test_structure_tells_of_what_comes_later(
+    walk: tuple[Scenario, Log],
+) -> None:
     """Of as much beyond the sensors' noise, white or of a single impact, nothing is said: it is the
     noise of impacts, or of what happens between rare samples. Nor where more noise is white, or
     more of it differenced, than was believed, for then only neighbours are correlated."""
