@@ -12,21 +12,15 @@ from rig import CLOCK, TICK, Base, Replay, Rig, diagram, estimated, inputs_of, n
 from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log
-from fbse_drake.estimators.base_filter import (
-    _AT_REST,
-    _HABIT_TIME,
-    _LEAST_HABIT,
-    _WALKING_SPEED,
-    InvariantBaseFilter,
-    InvariantFilter,
-)
+from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.friction import ModelAided
-from fbse_drake.estimators.innovations import LOG_OF_ONE, SMALLEST_SHARE
+from fbse_drake.estimators.innovations import LEAST_HABIT, LOG_OF_ONE, SMALLEST_SHARE
 from fbse_drake.estimators.records import as_record
 from fbse_drake.estimators.recursive import Status
+from fbse_drake.estimators.standing_foot import _AT_REST, _HABIT_TIME, _WALKING_SPEED
 from fbse_drake.robot.plant import grasp_map
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -567,7 +561,7 @@ def test_biases_are_found_while_it_stands():
     age = rates.foot_time + TICK * np.arange(len(size))
     share = rates.foot_time / np.minimum(age, _HABIT_TIME)
     share *= np.exp(-np.maximum(age - _HABIT_TIME, 0.0) / _HABIT_TIME)
-    size *= np.sqrt(np.maximum(share, _LEAST_HABIT))[:, None]
+    size *= np.sqrt(np.maximum(share, LEAST_HABIT))[:, None]
     told = 2 * TICK / (2 * rates.foot_time * (rates.foot_rate * size) ** 2)
     information = 1 / beliefs.angular_velocity_bias**2 + told.sum(axis=0)
     assert information[2] > 1.5 * information[0]
@@ -582,7 +576,7 @@ def test_biases_are_found_while_it_stands():
     # left of that after 0.7 s is white noise, mostly.
     told = np.log(SMALLEST_SHARE) - LOG_OF_ONE
     since = np.maximum(1.0, TICK * np.arange(1, len(speed) + 1) / forces.force_time)
-    share = np.maximum(_LEAST_HABIT, since**told)
+    share = np.maximum(LEAST_HABIT, since**told)
     pads = len(BASE.measurements()["pad_force"])
     white = beliefs.acceleration_noise**2 + pads * (beliefs.force_noise / MASS) ** 2
     arm = LEVEL["com"] - P_BI

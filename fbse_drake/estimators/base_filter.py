@@ -16,9 +16,10 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context
 
-from fbse_drake.errors import require_not_negative, require_positive
+from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.estimators.attitude import AttitudeConfig
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.bias_limits import leash_biases, remember_biases
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.cross_check import (
     cross_check,
@@ -27,93 +28,78 @@ from fbse_drake.estimators.cross_check import (
     force_contradiction,
 )
 from fbse_drake.estimators.floating_base import ImuMount, model_type
+from fbse_drake.estimators.foot_force_balance import force_errors, listen_to_forces
 from fbse_drake.estimators.force_delay import (
     force_delay_type,
     forget_force_delay,
     watch_force_delay,
 )
-from fbse_drake.estimators.innovations import (
-    AGREEMENT,
-    AGREEMENT_TIME,
-    LARGEST_SHARE,
-    LOG_OF_ONE,
-    SMALLEST_SHARE,
+from fbse_drake.estimators.innovations import AGREEMENT_TIME
+from fbse_drake.estimators.invariant_error import (
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    FEET,
+    GYRO_BIAS,
+    IDENTITY,
+    POSITION,
+    VELOCITY,
+    add_noise,
+    add_noise_along,
+    add_product,
+    correct,
+    isotropic,
+    moved_std,
+    propagate,
+    put_columns,
+    turn_to,
+    update,
 )
-from fbse_drake.estimators.records import record, record_type
+from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
-    Rotation,
     Vector,
     add,
-    conjugate,
     cross,
-    dot,
-    matrix_product,
-    normalized,
     put,
     quaternion,
     quaternion_from_gravity,
-    quaternion_of,
     quaternion_product,
     rotate,
     rotate_back,
     rotation,
     rotation_matrix,
-    rotation_vector,
     rotation_vector_to_quaternion,
     scale,
     skew,
     subtract,
+    transposed,
     vector,
+)
+from fbse_drake.estimators.standing_foot import (
+    FOOT_ORIENTATION,
+    FOOT_POSITION,
+    FOOT_RATE,
+    FOOT_VELOCITY,
+    TOLD,
+    land,
+    listen_to_foot,
+    trusted,
+    unrest,
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
-# Where three errors each start in the filter's error state; every foot has six, of its position and
-# its orientation.
-# (numpy integers: of a Python integer the value is part of the types that a function is compiled
-# for.)
-_ATTITUDE, _VELOCITY, _POSITION, _GYRO_BIAS, _ACCELEROMETER_BIAS, _FEET = np.arange(0, 18, 3)
-# What a standing foot tells.
-_FOOT_POSITION, _FOOT_ORIENTATION, _FOOT_VELOCITY, _FOOT_RATE, _TOLD = range(5)
-_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-_NONE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 # While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2], and how
 # long that lasts [s].
 _UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
-# An innovation is taken for a fault, and counts as little as makes it just likely, above this
-# quantile of chi^2 with three degrees of freedom (one in 3000).
-_GATE = 18.5
-# Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
-_MEMORY = 0.1
-# They stay within so many standard deviations of what was known of them so long ago [s]: they
-# hardly walk, and a sensor that drifts faster is at fault. What a filter finds out moves its
-# estimate by a variance as large as what it takes from its own; and at least by so many random
-# walks.
-_LEASH, _LEASH_TIME, _LEAST_WALKS = 2.0, 1.0, 20.0
-# Beyond so many standard deviations of what forces are wrong by, they contradict the accelerometer.
-_CONTRADICTION = 3.0
 # When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
 _LOST_AFTER = 0.25
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
-# A foot does little in spite of all while the robot rests: this share of what it does from this
-# speed of the robot on [m/s].
-_AT_REST, _WALKING_SPEED = 0.1, 0.03
-# How long it takes to learn what a standing foot does at present [s], by what it tells; how much of
-# that, and of larger innovations, one tick may tell; and the least that it is taken to do, as a
-# share of the variance believed.
-_RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = (0.1, 0.1, 0.03, 0.03), 1e-4
-_MOST_TOLD, _LARGEST_SURPRISE = 0.05, 100.0
-# For how long feet [s], and forces, must have erred less than believed to be trusted more, and the
-# least that they are taken to err, as a share of the variance believed.
-_HABIT_TIME, _FORCE_HABIT_TIME, _LEAST_HABIT = 0.4, 3.0, 0.01
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
-# A foot that carries less than this share of the weight moves more easily the less it carries.
-_FIRM_LOAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -189,107 +175,14 @@ class InvariantFilter:
 
 
 @njit(cache=True)
-def _add_product(to: np.ndarray, row: int, A: Rotation, source: np.ndarray, block: int) -> None:
-    """to[row : row + 3] += A source[block : block + 3]."""
-    for i in range(3):
-        x, y, z = A[3 * i], A[3 * i + 1], A[3 * i + 2]
-        for j in range(to.shape[1]):
-            total = x * source[block, j] + y * source[block + 1, j] + z * source[block + 2, j]
-            to[row + i, j] += total
-
-
-@njit(cache=True)
-def _propagate(P: np.ndarray, x: np.ndarray, gravity: Vector, T: float) -> None:
-    """P becomes F P F^T, with F = I + T A of the right-invariant error.
-
-    Args:
-        x: record of the posterior where the step begins.
-    """
-    R = rotation(x.rotation)
-    TR = _scaled(-T, R)
-    fall = _scaled(T, skew(gravity))
-    of_velocity = matrix_product(skew(vector(x.imu_velocity)), TR)
-    of_position = matrix_product(skew(vector(x.imu_position)), TR)
-    for _ in range(2):
-        M = P.copy()
-        _add_product(M, _ATTITUDE, TR, P, _GYRO_BIAS)
-        _add_product(M, _VELOCITY, fall, P, _ATTITUDE)
-        _add_product(M, _VELOCITY, of_velocity, P, _GYRO_BIAS)
-        _add_product(M, _VELOCITY, TR, P, _ACCELEROMETER_BIAS)
-        _add_product(M, _POSITION, of_position, P, _GYRO_BIAS)
-        for i in range(3):
-            for j in range(len(P)):
-                M[_POSITION + i, j] += T * P[_VELOCITY + i, j]
-        for foot in range(len(x.foot_standing)):
-            if x.foot_standing[foot] > 0:
-                of_foot = matrix_product(skew(vector(x.foot_position[foot])), TR)
-                _add_product(M, _FEET + 6 * foot, of_foot, P, _GYRO_BIAS)
-        for i in range(len(P)):
-            for j in range(len(P)):
-                P[i, j] = M[j, i]
-
-
-@njit(cache=True)
-def _transposed(A: Rotation) -> Rotation:
-    return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
-
-
-@njit(cache=True)
-def _scaled(factor: float, A: Rotation) -> Rotation:
-    return (
-        factor * A[0],
-        factor * A[1],
-        factor * A[2],
-        factor * A[3],
-        factor * A[4],
-        factor * A[5],
-        factor * A[6],
-        factor * A[7],
-        factor * A[8],
-    )
-
-
-@njit(cache=True)
-def _put_columns(to: np.ndarray, start: int, A: Rotation) -> None:
-    """Fills three columns of a matrix of three rows."""
-    for i in range(3):
-        for j in range(3):
-            to[i, start + j] = A[3 * i + j]
-
-
-@njit(cache=True)
-def _add_noise(P: np.ndarray, start: int, variance: float) -> None:
-    for i in range(start, start + 3):
-        P[i, i] += variance
-
-
-@njit(cache=True)
-def _trusted(x: np.ndarray, foot: int, told: int, axis: int) -> float:
-    """Share of the variance believed of what a standing foot does that it is taken to do: what it
-    usually does, or does at present, and never more than is believed. (More shows as an error that
-    lasts.)"""
-    shown = max(x.foot_habit[foot, told, axis], x.foot_restlessness[foot, told, axis])
-    return min(1.0, max(_LEAST_HABIT, shown))
-
-
-@njit(cache=True)
-def _add_noise_along(P: np.ndarray, start: int, F: Rotation, density: np.ndarray, T: float) -> None:
-    """Adds random walks of these densities (3,) along the columns of F."""
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                P[start + i, start + j] += T * density[k] * F[3 * i + k] * F[3 * j + k]
-
-
-@njit(cache=True)
 def _predict(
-    x: np.ndarray,
+    x: Record,
     P: np.ndarray,
     w: Vector,
     f: Vector,
     rate_variance: float,
     T: float,
-    known: np.ndarray,
+    known: Record,
 ) -> None:
     """The step that ends now, in place.
 
@@ -300,484 +193,55 @@ def _predict(
         known: see `_estimate_base`.
     """
     config, gravity = known.config, vector(known.gravity)
-    _propagate(P, x, gravity, T)
+    propagate(P, x, gravity, T)
     # Noise of the gyro turns attitude, and by the group all that turns with it: also feet, or what
     # is known of the legs would depend on how far from the world's origin they are.
     v, p = vector(x.imu_velocity), vector(x.imu_position)
     G = np.zeros((3, len(P)))
-    _put_columns(G, _ATTITUDE, _IDENTITY)
-    _put_columns(G, _VELOCITY, _transposed(skew(v)))
-    _put_columns(G, _POSITION, _transposed(skew(p)))
+    put_columns(G, ATTITUDE, IDENTITY)
+    put_columns(G, VELOCITY, transposed(skew(v)))
+    put_columns(G, POSITION, transposed(skew(p)))
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            _put_columns(G, _FEET + 6 * foot, _transposed(skew(vector(x.foot_position[foot]))))
+            put_columns(G, FEET + 6 * foot, transposed(skew(vector(x.foot_position[foot]))))
     q = rate_variance * T * T
     for i in range(len(P)):
         for j in range(len(P)):
             P[i, j] += q * (G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j])
-    _add_noise(P, _GYRO_BIAS, config.gyro_walk**2 * T)
-    _add_noise(P, _ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
+    add_noise(P, GYRO_BIAS, config.gyro_walk**2 * T)
+    add_noise(P, ACCELEROMETER_BIAS, config.accelerometer_walk**2 * T)
     creep, turn, lasts = np.empty(3), np.empty(3), 2.0 * AGREEMENT_TIME
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            at, restless = _FEET + 6 * foot, x.foot_restlessness[foot]
+            at, restless = FEET + 6 * foot, x.foot_restlessness[foot]
             # A foot that moves more than it does in spite of all does not stay.
             moving, turning = lasts * config.foot_velocity**2, lasts * config.foot_rate**2
             F = rotation_matrix(quaternion(x.foot_orientation[foot]))
             for i in range(3):
-                creep[i] = _trusted(x, foot, _FOOT_POSITION, i) * config.foot_creep**2
-                creep[i] += max(0.0, restless[_FOOT_VELOCITY, i] - 1.0) * moving
-                turn[i] = _trusted(x, foot, _FOOT_ORIENTATION, i) * config.foot_turning**2
+                creep[i] = trusted(x, foot, FOOT_POSITION, i) * config.foot_creep**2
+                creep[i] += max(0.0, restless[FOOT_VELOCITY, i] - 1.0) * moving
+                turn[i] = trusted(x, foot, FOOT_ORIENTATION, i) * config.foot_turning**2
                 if i == 2:
-                    turn[i] *= _unrest(v) ** 2
-                turn[i] += max(0.0, restless[_FOOT_RATE, i] - 1.0) * turning
-            _add_noise_along(P, at, F, creep, T)
-            _add_noise_along(P, at + 3, F, turn, T)
+                    turn[i] *= unrest(v) ** 2
+                turn[i] += max(0.0, restless[FOOT_RATE, i] - 1.0) * turning
+            add_noise_along(P, at, F, creep, T)
+            add_noise_along(P, at + 3, F, turn, T)
     acceleration = add(rotate(rotation(x.rotation), f), gravity)
     put(x.imu_position, add(p, add(scale(T, v), scale(0.5 * T * T, acceleration))))
     put(x.imu_velocity, add(v, scale(T, acceleration)))
-    _turn(
+    turn_to(
         x, quaternion_product(quaternion(x.orientation), rotation_vector_to_quaternion(scale(T, w)))
     )
 
 
 @njit(cache=True)
-def _unrest(v: Vector) -> float:
-    """Share of what a standing foot does in spite of all, for it comes of the robot's motion.
-
-    Args:
-        v: velocity of the IMU [m/s].
-    """
-    return min(1.0, max(_AT_REST, math.sqrt(dot(v, v)) / _WALKING_SPEED))
-
-
-@njit(cache=True)
-def _turn(x: np.ndarray, q: tuple[float, float, float, float]) -> None:
-    """Sets the attitude."""
-    q = normalized(q)
-    put(x.orientation, q)
-    put(x.rotation, rotation_matrix(q))
-
-
-@njit(cache=True)
-def _inverse(S: np.ndarray) -> Rotation:
-    """Inverse of a symmetric 3 x 3 matrix."""
-    a, b, c, d, e, f = S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2]
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
-    scaling = 1.0 / (a * A + b * B + c * C)
-    return _scaled(scaling, (A, B, C, B, D, E, C, E, F))
-
-
-@njit(cache=True)
-def _update(
-    P: np.ndarray,
-    correction: np.ndarray,
-    z: Vector,
-    first: int,
-    A: Rotation,
-    second: int,
-    B: Rotation,
-    noise: np.ndarray,
-    keep: float,
-    agreement: np.ndarray,
-    innovation: np.ndarray,
-    explained: np.ndarray,
-) -> None:
-    """Kalman update with z = A error[first] + B error[second] + noise, in place.
-
-    Innovations that agree with each other are no white noise, whatever P and the noise say: as
-    many as agree count as one with their mean as its error. One beyond all likelihood counts as
-    little as makes it likely.
-
-    Args:
-        P, correction: covariance of the errors, and what is known of them since P was made, (n,).
-        noise: covariance of z's noise, (3, 3).
-        keep: what a tick leaves of the running mean of innovations `agreement` (3,).
-        innovation: filled, (3,).
-        explained: filled with the innovation's variance along each axis by the covariance, and by
-            an error that lasts, (2, 3).
-    """
-    n = len(P)
-    PH, S = np.zeros((3, n)), noise.copy()
-    for i in range(3):
-        e = z[i]
-        for k in range(3):
-            a, b = A[3 * i + k], B[3 * i + k]
-            e -= a * correction[first + k] + b * correction[second + k]
-            for j in range(n):
-                PH[i, j] += a * P[first + k, j] + b * P[second + k, j]
-        innovation[i] = e
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                S[i, j] += PH[i, first + k] * A[3 * j + k] + PH[i, second + k] * B[3 * j + k]
-    # An error that lasts mostly points one way, so the sum over the axes counts; it makes all of
-    # them doubtful, and shows in that way.
-    count, excess, length = (1.0 + keep) / (1.0 - keep), 0.0, 1e-300
-    for i in range(3):
-        agreement[i] = keep * agreement[i] + (1.0 - keep) * innovation[i]
-        excess += count * agreement[i] ** 2 - AGREEMENT * S[i, i] / 3.0
-        length += agreement[i] ** 2
-    W = _inverse(S)
-    distance = dot(vector(innovation), rotate(W, vector(innovation)))
-    lasting = max(0.0, excess)
-    widening = lasting
-    if distance > _GATE:
-        widening += (distance / _GATE - 1.0) * (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
-    for i in range(3):
-        explained[0, i] = S[i, i] - noise[i, i]
-        explained[1, i] = lasting * agreement[i] ** 2 / (length * count)
-    if widening > 0.0:
-        for i in range(3):
-            S[i, i] += widening
-        W = _inverse(S)
-    gain = np.empty((3, n))
-    for i in range(3):
-        x, y, z_ = W[3 * i], W[3 * i + 1], W[3 * i + 2]
-        for j in range(n):
-            gain[i, j] = x * PH[0, j] + y * PH[1, j] + z_ * PH[2, j]
-    e0, e1, e2 = innovation[0], innovation[1], innovation[2]
-    for i in range(n):
-        a, b, c = gain[0, i], gain[1, i], gain[2, i]
-        correction[i] += a * e0 + b * e1 + c * e2
-        for j in range(n):
-            P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
-
-
-@njit(cache=True)
-def _moved(phi: Vector, a: Vector, xi: Vector) -> Vector:
-    """Where the group's exponential takes a: Exp(phi) a + J xi, J the left Jacobian of rotations.
-
-    To first order it would be Exp(phi) a + xi; but far from the world's origin, where both parts
-    are large and cancel each other, that is not enough.
-    """
-    angle = math.sqrt(dot(phi, phi))
-    once, twice = 0.5, 1.0 / 6.0
-    if angle > 1e-4:
-        once = (1.0 - math.cos(angle)) / angle**2
-        twice = (angle - math.sin(angle)) / angle**3
-    across = cross(phi, xi)
-    shift = add(xi, add(scale(once, across), scale(twice, cross(phi, across))))
-    return add(rotate(rotation_matrix(rotation_vector_to_quaternion(phi)), a), shift)
-
-
-@njit(cache=True)
-def _correct(x: np.ndarray, error: np.ndarray) -> None:
-    """Moves the estimate along the group by an error (n,)."""
-    phi = vector(error[_ATTITUDE:_VELOCITY])
-    _turn(x, quaternion_product(rotation_vector_to_quaternion(phi), quaternion(x.orientation)))
-    for part, start in ((x.imu_velocity, _VELOCITY), (x.imu_position, _POSITION)):
-        put(part, _moved(phi, vector(part), vector(error[start : start + 3])))
-    for i in range(3):
-        x.gyro_bias_B[i] += error[_GYRO_BIAS + i]
-        x.accelerometer_bias_B[i] += error[_ACCELEROMETER_BIAS + i]
-    for foot in range(len(x.foot_standing)):
-        if not x.foot_standing[foot] > 0:
-            continue
-        start = _FEET + 6 * foot
-        part = x.foot_position[foot]
-        put(part, _moved(phi, vector(part), vector(error[start : start + 3])))
-        turn = rotation_vector_to_quaternion(vector(error[start + 3 : start + 6]))
-        q = quaternion_product(turn, quaternion(x.foot_orientation[foot]))
-        put(x.foot_orientation[foot], normalized(q))
-
-
-@njit(cache=True)
-def _land(
-    x: np.ndarray,
-    P: np.ndarray,
-    correction: np.ndarray,
-    foot: int,
-    model: np.ndarray,
-    known: np.ndarray,
-) -> None:
-    """The errors of a foot that lands are those of the base, as is what is known of them."""
-    p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
-    moved = rotate(rotation(x.rotation), p_IF)
-    put(x.foot_position[foot], add(vector(x.imu_position), moved))
-    q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
-    put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
-    x.foot_agreement[foot] = 0.0
-    for part, source in ((0, _POSITION), (3, _ATTITUDE)):
-        start = _FEET + 6 * foot + part
-        for i in range(3):
-            correction[start + i] = correction[source + i]
-            for j in range(len(P)):
-                P[start + i, j] = P[source + i, j]
-        for j in range(len(P)):
-            for i in range(3):
-                P[j, start + i] = P[j, source + i]
-
-
-@njit(cache=True)
-def _leg_noise(J: np.ndarray, first: int) -> float:
-    """Mean square over three rows of what joint velocities with an error of one make there."""
-    total = 0.0
-    for i in range(first, first + 3):
-        for j in range(6, J.shape[1]):
-            total += J[i, j] ** 2
-    return total / 3.0
-
-
-@njit(cache=True)
-def _isotropic(variance: float) -> np.ndarray:
-    S = np.zeros((3, 3))
-    S[0, 0] = S[1, 1] = S[2, 2] = variance
-    return S
-
-
-@njit(cache=True)
-def _diagonal(x: np.ndarray, foot: int, told: int, variance: float, sensed: float) -> np.ndarray:
-    """Diagonal matrix of a variance believed, as far as the foot is not trusted, and a rest."""
-    S = np.zeros((3, 3))
-    for i in range(3):
-        S[i, i] = _trusted(x, foot, told, i) * variance + sensed
-    return S
-
-
-@njit(cache=True)
-def _listen_to_foot(
-    x: np.ndarray,
-    P: np.ndarray,
-    correction: np.ndarray,
-    foot: int,
-    share: float,
-    w_raw: Vector,
-    model: np.ndarray,
-    elapsed: float,
-    known: np.ndarray,
-) -> bool:
-    """What a foot that stands tells: where it is, how it is turned, and that it rests. (A point
-    foot may turn, and tells nothing of that.)
-
-    Args:
-        share: of the weight, that it carries.
-        w_raw: the gyro's reading in base axes.
-
-    Returns:
-        Has it moved of late by the robot's velocity, more than a foot does in spite of all?
-    """
-    config, sensors, J = known.config, known.sensors, model.foot_jacobian[foot]
-    R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
-    R_BF = rotation(model.foot_rotation[foot])
-    p_IF = subtract(vector(model.foot_position[foot]), vector(known.mount.p_BI))
-    start, keep = _FEET + 6 * foot, math.exp(-elapsed / AGREEMENT_TIME)
-    # Errors that last for some time, as white noise that leaves as much over many ticks.
-    light = max(1.0, _FIRM_LOAD / share) ** 2
-    lasting = max(1.0, 2.0 * config.foot_time / elapsed)
-    held = _unrest(v) ** 2 - 1.0
-    angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
-    gyro = sensors.angular_velocity_noise**2
-    turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
-    agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
-    explained = np.empty((2, 3))
-    # All in axes of the sole.
-    R_FW = _transposed(rotation_matrix(quaternion(x.foot_orientation[foot])))
-    opposite = _scaled(-1.0, R_FW)
-    is_flat = known.is_flat[foot] > 0
-    x.foot_age[foot] += elapsed
-
-    own, sensed = light * config.foot_position**2, moving * angle
-    z = rotate(R_FW, subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p)))
-    noise = _diagonal(x, foot, _FOOT_POSITION, own * lasting, sensed)
-    _update(
-        P, correction, z, start, R_FW, _POSITION, opposite, noise, keep,
-        agreement[_FOOT_POSITION], innovation[_FOOT_POSITION], explained,
-    )  # fmt: skip
-    _learn_motion(x, foot, _FOOT_POSITION, own, sensed, explained, elapsed)
-
-    if is_flat:
-        own, sensed = light * config.foot_orientation**2, turning * angle
-        q_BF = quaternion_of(R_BF)
-        seen = quaternion_product(quaternion(x.orientation), q_BF)
-        z = rotation_vector(
-            quaternion_product(seen, conjugate(quaternion(x.foot_orientation[foot])))
-        )
-        noise = _diagonal(x, foot, _FOOT_ORIENTATION, own * lasting, sensed)
-        noise[2, 2] += held * _trusted(x, foot, _FOOT_ORIENTATION, 2) * own * lasting
-        _update(
-            P, correction, rotate(R_FW, z), start + 3, R_FW, _ATTITUDE, opposite, noise,
-            keep, agreement[_FOOT_ORIENTATION], innovation[_FOOT_ORIENTATION], explained,
-        )  # fmt: skip
-        _learn_motion(x, foot, _FOOT_ORIENTATION, own, sensed, explained, elapsed)
-
-    w_F, v_F = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    for j in range(6, J.shape[1]):
-        w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
-        v_F = add(v_F, scale(model.velocity[j], (J[3, j], J[4, j], J[5, j])))
-    w_BF, v_BF = rotate(R_BF, w_F), rotate(R_BF, v_F)
-    w = subtract(w_raw, vector(x.gyro_bias_B))
-    own = light * config.foot_velocity**2
-    sensed = moving * rate + dot(p_IF, p_IF) * gyro
-    z = rotate(R_FW, subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v))
-    of_bias = matrix_product(R_FW, matrix_product(R, skew(p_IF)))
-    noise = _diagonal(x, foot, _FOOT_VELOCITY, own * lasting, sensed)
-    _update(
-        P, correction, z, _VELOCITY, R_FW, _GYRO_BIAS, of_bias, noise, keep,
-        agreement[_FOOT_VELOCITY], innovation[_FOOT_VELOCITY], explained,
-    )  # fmt: skip
-    _learn_motion(x, foot, _FOOT_VELOCITY, own, sensed, explained, elapsed)
-    possible = max(1.0, x.foot_habit[foot, _FOOT_VELOCITY].mean()) * own
-    for i in range(3):
-        possible += P[_VELOCITY + i, _VELOCITY + i] / 3.0
-    mean = vector(agreement[_FOOT_VELOCITY])
-    moves = dot(mean, mean) > _GATE * possible
-
-    if is_flat:
-        own, sensed = light * config.foot_rate**2, turning * rate + gyro
-        z = rotate_back(R_BF, add(w, w_BF))
-        noise = _diagonal(x, foot, _FOOT_RATE, own * lasting, sensed)
-        noise[2, 2] += held * _trusted(x, foot, _FOOT_RATE, 2) * own * lasting
-        _update(
-            P, correction, z, _GYRO_BIAS, _transposed(R_BF), _GYRO_BIAS, _NONE, noise, keep,
-            agreement[_FOOT_RATE], innovation[_FOOT_RATE], explained,
-        )  # fmt: skip
-        _learn_motion(x, foot, _FOOT_RATE, own, sensed, explained, elapsed)
-    if is_flat and config.level_ground > 0.0:
-        # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
-        n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
-        noise = _isotropic(config.level_ground**2 * lasting * light)
-        noise[2, 2] += 1e6
-        spare = np.zeros(3)
-        z = cross(n, (0.0, 0.0, 1.0))
-        _update(
-            P, correction, z, start + 3, _IDENTITY, _ATTITUDE, _NONE, noise, 0.0, spare,
-            spare.copy(), np.empty((2, 3)),
-        )  # fmt: skip
-    return moves
-
-
-@njit(cache=True)
-def _learn_motion(
-    x: np.ndarray,
-    foot: int,
-    told: int,
-    own: float,
-    sensed: float,
-    explained: np.ndarray,
-    elapsed: float,
-) -> None:
-    """A standing foot may do less than is believed, or more, and its innovations show it.
-
-    They are stated as large as they have just been.
-
-    Args:
-        told: what the innovation is of.
-        own, sensed: variance believed of what the foot does there, and of what sensors add.
-        explained: see `_update`.
-    """
-    innovation, variance = x.foot_innovation[foot, told], x.foot_innovation_variance[foot, told]
-    restless, habit = x.foot_restlessness[foot, told], x.foot_habit[foot, told]
-    fast = min(_MOST_TOLD, 1.0 - math.exp(-elapsed / _RESTLESSNESS_TIME[told]))
-    slow = elapsed / min(_HABIT_TIME, x.foot_age[foot])
-    for i in range(3):
-        square = innovation[i] * innovation[i]
-        known = explained[0, i] + sensed
-        variance[i] = known + explained[1, i] + restless[i] * own
-        surprise = min(_LARGEST_SURPRISE, square / variance[i])
-        learned = restless[i] * (1.0 + fast * (surprise - 1.0))
-        restless[i] = max(_LEAST_RESTLESSNESS, learned)
-        shown = min(LARGEST_SHARE, square / (known + habit[i] * own))
-        habit[i] = max(_LEAST_HABIT, habit[i] * (1.0 + slow * (shown - 1.0)))
-
-
-@njit(cache=True)
-def _force_errors(f_raw: Vector, config: np.ndarray) -> Vector:
-    """What the mean acceleration by the foot forces is hardly ever wrong by [m/s^2]."""
-    any_way, gain = config.force_error**2, config.force_gain_error**2
-    return (
-        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[0] ** 2),
-        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[1] ** 2),
-        _CONTRADICTION * math.sqrt(any_way + gain * f_raw[2] ** 2),
-    )
-
-
-@njit(cache=True)
-def _listen_to_forces(
-    x: np.ndarray,
-    P: np.ndarray,
-    correction: np.ndarray,
-    force: Vector,
-    f_raw: Vector,
-    w: Vector,
-    away: Vector,
-    away_before: Vector,
-    model: np.ndarray,
-    elapsed: float,
-    known: np.ndarray,
-) -> None:
-    """The foot forces tell how the centre of mass accelerates, and so the accelerometer's bias.
-
-    Args:
-        force: of the ground on the robot, in base axes [N].
-        f_raw: the accelerometer's reading in base axes [m/s^2].
-        w: angular velocity of the base [rad/s].
-        away, away_before: velocity of the centre of mass relative to the IMU in base axes, now and
-            a tick ago [m/s].
-    """
-    config = known.config
-    relative = add(scale(1.0 / elapsed, subtract(away, away_before)), cross(w, away))
-    f = subtract(f_raw, vector(x.accelerometer_bias_B))
-    z = subtract(add(f, relative), scale(1.0 / known.mass, force))
-    lasting = max(1.0, 2.0 * config.force_time / elapsed)
-    sensed = _acceleration_noise(model, elapsed, known)
-    own, noise, once = np.empty(3), np.zeros((3, 3)), np.empty(3)
-    explained = np.empty((2, 3))
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] = config.force_gain_error**2 * lasting * f_raw[i] * f_raw[j]
-        own[i] = x.force_habit[i] * config.force_error**2
-        once[i] = own[i] + noise[i, i] / lasting + sensed[i]
-        noise[i, i] += own[i] * lasting + sensed[i]
-    _update(
-        P, correction, z, _ACCELEROMETER_BIAS, _IDENTITY, _GYRO_BIAS, _NONE, noise,
-        math.exp(-elapsed / config.force_time), x.force_agreement, x.force_innovation, explained,
-    )  # fmt: skip
-    for i in range(3):
-        x.force_innovation_variance[i] = once[i] + explained[0, i] + explained[1, i]
-    # What lasts shows in the mean over that time, once there is one.
-    x.force_age += elapsed
-    if x.force_age < config.force_time:
-        return
-    gain = elapsed / min(_FORCE_HABIT_TIME, x.force_age)
-    filled = 1.0 - math.exp(-x.force_age / config.force_time)
-    for i in range(3):
-        gained, at = (config.force_gain_error * f_raw[i]) ** 2, _ACCELEROMETER_BIAS + i
-        by_habit = 0.5 * (own[i] + gained) + P[at, at]
-        shown = max(SMALLEST_SHARE, (x.force_agreement[i] / filled) ** 2 / by_habit)
-        told = math.log(min(shown, LARGEST_SHARE)) - LOG_OF_ONE
-        learned = x.force_habit[i] * math.exp(gain * own[i] / (own[i] + gained) * told)
-        x.force_habit[i] = min(1.0, max(_LEAST_HABIT, learned))
-
-
-@njit(cache=True)
-def _acceleration_noise(model: np.ndarray, elapsed: float, known: np.ndarray) -> np.ndarray:
-    """Variance of what the sensors' noise adds to the acceleration of the centre of mass by them,
-    less that by the foot forces, (3,)."""
-    sensors = known.sensors
-    rate = 2.0 * (sensors.joint_velocity_noise / elapsed) ** 2
-    turning = 2.0 * (sensors.angular_velocity_noise / elapsed) ** 2
-    arm = subtract(vector(model.com), vector(known.mount.p_BI))
-    variance = np.empty(3)
-    for i in range(3):
-        moved = 0.0
-        for joint in range(len(model.mass_matrix)):
-            moved += (model.mass_matrix[joint, 3 + i] / known.mass) ** 2
-        turned = dot(arm, arm) - arm[i] ** 2
-        variance[i] = rate * moved + turning * turned + sensors.acceleration_noise**2
-        variance[i] += known.force_variance / known.mass**2
-    return variance
-
-
-@njit(cache=True)
-def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
+def _start(x: Record, measured: Record, model: Record, known: Record) -> None:
     """The first posterior: upright by the accelerometer, looking ahead, soles where they are said
     to be."""
     sensors, P = known.sensors, x.error_covariance
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     f = rotate(R_BI, vector(measured.specific_force))
-    _turn(x, quaternion_from_gravity(f, 0.0))
+    turn_to(x, quaternion_from_gravity(f, 0.0))
     x.foot_restlessness[:] = 1.0
     x.foot_habit[:] = 1.0
     x.foot_age[:] = known.config.foot_time
@@ -788,34 +252,34 @@ def _start(x: np.ndarray, measured: np.ndarray, model: np.ndarray, known: np.nda
     base = subtract(vector(known.origin), rotate(R, middle))
     put(x.imu_position, add(base, rotate(R, p_BI)))
     for i in range(2):  # Yaw is what it is said to be ...
-        P[_ATTITUDE + i, _ATTITUDE + i] = known.start.tilt**2
+        P[ATTITUDE + i, ATTITUDE + i] = known.start.tilt**2
     # ... and so is the place of the soles, about which the error of the tilt turns the base.
     about = skew(vector(known.origin))
-    _add_product(P, _POSITION, about, P, _ATTITUDE)
-    _add_product(P.T, _POSITION, about, P.T, _ATTITUDE)
-    _add_noise(P, _VELOCITY, known.start.velocity**2)
-    _add_noise(P, _GYRO_BIAS, sensors.angular_velocity_bias**2 + 1e-12)
-    _add_noise(P, _ACCELEROMETER_BIAS, sensors.acceleration_bias**2 + 1e-12)
+    add_product(P, POSITION, about, P, ATTITUDE)
+    add_product(P.T, POSITION, about, P.T, ATTITUDE)
+    add_noise(P, VELOCITY, known.start.velocity**2)
+    add_noise(P, GYRO_BIAS, sensors.angular_velocity_bias**2 + 1e-12)
+    add_noise(P, ACCELEROMETER_BIAS, sensors.acceleration_bias**2 + 1e-12)
     # What the accelerometer reads is gravity, its bias and some motion.
     correction, spare = np.zeros(len(P)), np.zeros(3)
     reading = rotate(R, f)
     z = add(reading, vector(known.gravity))
-    noise = _isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
-    _update(
-        P, correction, z, _ATTITUDE, skew(reading), _ACCELEROMETER_BIAS, R, noise, 0.0, spare,
+    noise = isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
+    update(
+        P, correction, z, ATTITUDE, skew(reading), ACCELEROMETER_BIAS, R, noise, 0.0, spare,
         spare.copy(), np.empty((2, 3)),
     )  # fmt: skip
-    _correct(x, correction)
+    correct(x, correction)
 
 
 @njit(cache=True)
 def _estimate_base(
-    posterior: np.ndarray,
-    last: np.ndarray,
+    posterior: Record,
+    last: Record,
     elapsed: float,
-    measured: np.ndarray,
-    model: np.ndarray,
-    known: np.ndarray,
+    measured: Record,
+    model: Record,
+    known: Record,
 ) -> None:
     """One tick of `InvariantBaseFilter`; fills the posterior.
 
@@ -848,7 +312,7 @@ def _estimate_base(
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
     firm = x.foot_standing * known.is_flat
     rests, rolling = firm_foot_rate(firm, wrench, weight, w_now, model)
-    contradiction = force_contradiction(x.check, _force_errors(f_mean, known.config))
+    contradiction = force_contradiction(x.check, force_errors(f_mean, known.config))
     if first:
         _start(x, measured, model, known)
     else:
@@ -869,7 +333,7 @@ def _estimate_base(
             # Or velocities that it makes would be put down to a tilt.
             force_noise += contradiction * math.sqrt(max(1.0, 2.0 * _UNKNOWN_TIME / elapsed))
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
-        _add_noise(P, _VELOCITY, (force_noise * elapsed) ** 2)
+        add_noise(P, VELOCITY, (force_noise * elapsed) ** 2)
     force, carried = (0.0, 0.0, 0.0), 0.0
     load_by_mass = np.empty((feet, 3))
     x.foot_innovation[:] = 0.0
@@ -879,10 +343,10 @@ def _estimate_base(
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
-            _land(x, P, correction, foot, model, known)
+            land(x, P, correction, foot, model, known)
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
-            moves = _listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
+            moves = listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
             all_move, resting = all_move and moves, True
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
@@ -917,122 +381,46 @@ def _estimate_base(
             x.check.doubt[:] = 0.0
     if was_known and trust.max() == 0 and carried > _CARRIED * weight:
         before = vector(last.away)
-        _listen_to_forces(x, P, correction, force, f_mean, w, away, before, model, elapsed, known)
+        listen_to_forces(x, P, correction, force, f_mean, w, away, before, model, elapsed, known)
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
-    _correct(x, correction)
+    correct(x, correction)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
     # Nor is it they if the IMU is found to be wrong meanwhile: it was so before.
     if x.lost_for > _LOST_AFTER or (x.lost_for > 0.0 and trust[1] == _IMPLAUSIBLE):
         _start_over(x, model, known)
-    _leash_biases(x, first, elapsed, known.config)
+    leash_biases(x, first, elapsed, known.config)
     is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
     is_doubtful = is_doubtful or contradiction > 0.0 or x.lost_for > 0.0
-    _remember_biases(x, is_doubtful, first, elapsed)
+    remember_biases(x, is_doubtful, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
 
 
 @njit(cache=True)
-def _start_over(x: np.ndarray, model: np.ndarray, known: np.ndarray) -> None:
+def _start_over(x: Record, model: Record, known: Record) -> None:
     """Attitude, velocity and place are no better known than at the start; biases are.
 
     All feet that stand are put down anew.
     """
     P, spare = x.error_covariance, np.zeros(len(x.error_covariance))
-    _add_noise(P, _ATTITUDE, known.start.tilt**2)
-    _add_noise(P, _VELOCITY, known.start.velocity**2)
-    _add_noise(P, _POSITION, (known.start.velocity * _LOST_AFTER) ** 2)
+    add_noise(P, ATTITUDE, known.start.tilt**2)
+    add_noise(P, VELOCITY, known.start.velocity**2)
+    add_noise(P, POSITION, (known.start.velocity * _LOST_AFTER) ** 2)
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
-            _land(x, P, spare, foot, model, known)
+            land(x, P, spare, foot, model, known)
     x.lost_for = 0.0
 
 
 @njit(cache=True)
-def _leash_biases(x: np.ndarray, first: bool, elapsed: float, config: np.ndarray) -> None:
-    """Keeps the IMU's biases where they can be by what was known of them."""
-    leash, P = x.leash, x.error_covariance
-    x.leashed_for = 0.0 if first else x.leashed_for + elapsed
-    if first or x.leashed_for > _LEASH_TIME:
-        x.leashed_for = 0.0
-        _copy_rows(leash[0], leash[1])
-        for i in range(3):
-            leash[1, 0, i], leash[1, 1, i] = x.gyro_bias_B[i], x.accelerometer_bias_B[i]
-            for sensor in range(2):
-                at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
-                walk = config.gyro_walk if sensor == 0 else config.accelerometer_walk
-                least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
-                leash[1, 2 + sensor, i] = P[at, at] + least**2
-        if first:
-            _copy_rows(leash[0], leash[1])
-    for sensor in range(2):
-        bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
-        for i in range(3):
-            at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + i
-            middle, learned = leash[0, sensor, i], max(0.0, leash[0, 2 + sensor, i] - P[at, at])
-            reach = _LEASH * math.sqrt(learned)
-            _set_bias(x, sensor, i, min(max(bias[i], middle - reach), middle + reach))
-
-
-@njit(cache=True)
-def _set_bias(x: np.ndarray, sensor: int, axis: int, value: float) -> None:
-    """Sets a bias of the gyro (0) or the accelerometer (1), and moves with it what is known by it.
-
-    What the filter took for a bias it also took for a tilt.
-    """
-    at = (_GYRO_BIAS if sensor == 0 else _ACCELEROMETER_BIAS) + axis
-    bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
-    P, change = x.error_covariance, value - bias[axis]
-    if change != 0.0 and P[at, at] > 0.0:
-        _correct(x, P[at] * (change / P[at, at]))
-
-
-@njit(cache=True)
-def _copy_rows(to: np.ndarray, source: np.ndarray) -> None:
-    """Fills a matrix. (numba takes ten times as long to compile `to[:] = source`.)"""
-    for i in range(to.shape[0]):
-        for j in range(to.shape[1]):
-            to[i, j] = source[i, j]
-
-
-@njit(cache=True)
-def _put_biases(to: np.ndarray, x: np.ndarray) -> None:
-    """Fills (2, 3) with the biases of gyro and accelerometer in base axes."""
-    put(to[0], vector(x.gyro_bias_B))
-    put(to[1], vector(x.accelerometer_bias_B))
-
-
-@njit(cache=True)
-def _remember_biases(x: np.ndarray, is_doubtful: bool, first: bool, elapsed: float) -> None:
-    """While sensors are doubtful the IMU's biases are those from before they began to fail."""
-    kept = x.kept_biases
-    if first:
-        _put_biases(kept[0], x)
-        _put_biases(kept[1], x)
-        x.kept_for = 0.0
-    elif is_doubtful:
-        _copy_rows(kept[1], kept[0])
-        for sensor in range(2):
-            for axis in range(3):
-                _set_bias(x, sensor, axis, kept[0, sensor, axis])
-        x.kept_for = 0.0
-    else:
-        x.kept_for += elapsed
-        if x.kept_for > _MEMORY:
-            _copy_rows(kept[0], kept[1])
-            _put_biases(kept[1], x)
-            x.kept_for = 0.0
-
-
-@njit(cache=True)
 def _conclude(
-    x: np.ndarray,
+    x: Record,
     w_raw: Vector,
     wrench: np.ndarray,
-    measured: np.ndarray,
-    model: np.ndarray,
-    known: np.ndarray,
+    measured: Record,
+    model: Record,
+    known: Record,
 ) -> None:
     """Fills what follows from the state: the base, the centre of mass and the ZMP."""
     P, R = x.error_covariance, rotation(x.rotation)
@@ -1061,23 +449,12 @@ def _conclude(
         put(x.zmp, (zmp_x / total, zmp_y / total))
     # The group's errors turn with the attitude's: v - v_hat = xi_v + phi x v.
     for i in range(3):
-        x.attitude_std[i] = math.sqrt(max(0.0, P[_ATTITUDE + i, _ATTITUDE + i]))
-        x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[_GYRO_BIAS + i, _GYRO_BIAS + i]))
-        at = _ACCELEROMETER_BIAS + i
+        x.attitude_std[i] = math.sqrt(max(0.0, P[ATTITUDE + i, ATTITUDE + i]))
+        x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[GYRO_BIAS + i, GYRO_BIAS + i]))
+        at = ACCELEROMETER_BIAS + i
         x.acceleration_bias_std[i] = math.sqrt(max(0.0, P[at, at]))
-        x.velocity_std[i] = _moved_std(P, _VELOCITY, i, velocity)
-        x.position_std[i] = _moved_std(P, _POSITION, i, position)
-
-
-@njit(cache=True)
-def _moved_std(P: np.ndarray, block: int, i: int, a: Vector) -> float:
-    """Standard deviation of component i of error[block] + attitude error x a."""
-    j, k = (i + 1) % 3, (i + 2) % 3
-    # Component i of phi x a is phi_j a_k - phi_k a_j.
-    m, s, t = block + i, _ATTITUDE + j, _ATTITUDE + k
-    variance = P[m, m] + a[k] ** 2 * P[s, s] + a[j] ** 2 * P[t, t]
-    variance += 2.0 * (a[k] * P[m, s] - a[j] * P[m, t] - a[j] * a[k] * P[s, t])
-    return math.sqrt(max(0.0, variance))
+        x.velocity_std[i] = moved_std(P, VELOCITY, i, velocity)
+        x.position_std[i] = moved_std(P, POSITION, i, position)
 
 
 class InvariantBaseFilter(RecursiveEstimator):
@@ -1170,7 +547,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             mount=record(**vars(ImuMount(robot))),
             pads=record(position=pads.position, foot=pads.foot),
             is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
-            force_variance=sensors.force_noise**2 * len(pads.foot),
+            force_variance=required(sensors.force_noise, "force_noise") ** 2 * len(pads.foot),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
             gravity=plant.gravity_field().gravity_vector(),
             start=record(tilt=0.2, velocity=0.1, acceleration=0.05),
@@ -1196,7 +573,7 @@ class InvariantBaseFilter(RecursiveEstimator):
 def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
     """Type of the posterior of `InvariantBaseFilter`."""
     feet = len(robot.description.sides)
-    n = _FEET + 6 * feet
+    n = FEET + 6 * feet
     triples = (
         "angular_velocity",
         "base_position",
@@ -1232,12 +609,12 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         foot_standing=(feet,),
         foot_position=(feet, 3),
         foot_orientation=(feet, 4),
-        foot_agreement=(feet, _TOLD, 3),
-        foot_restlessness=(feet, _TOLD, 3),
-        foot_habit=(feet, _TOLD, 3),
+        foot_agreement=(feet, TOLD, 3),
+        foot_restlessness=(feet, TOLD, 3),
+        foot_habit=(feet, TOLD, 3),
         foot_age=(feet,),
-        foot_innovation=(feet, _TOLD, 3),
-        foot_innovation_variance=(feet, _TOLD, 3),
+        foot_innovation=(feet, TOLD, 3),
+        foot_innovation_variance=(feet, TOLD, 3),
         error_covariance=(n, n),
         kept_biases=(2, 2, 3),
         kept_for=(),

@@ -16,6 +16,8 @@ AGREEMENT_TIME, AGREEMENT = 0.02, 3.0
 NOISE_TIME, LARGEST_SHARE = 0.3, 9.0
 # The same where a tick tells of several numbers; and the least that it may tell.
 _SEVERAL_TIME, SMALLEST_SHARE = 0.1, 1e-3
+# The least that feet and forces are taken to err, as a share of the variance believed.
+LEAST_HABIT = 0.01
 # Means of the logarithm of a mean square of so many normal numbers of variance one: psi(k / 2) -
 # log(k / 2) with the digamma function psi.
 LOG_OF_ONE, LOG_OF_THREE, LOG_OF_SIX = -1.2704, -0.3690, -0.1758

@@ -187,7 +187,7 @@ class RecursiveEstimator(LeafSystem):
         self._has_status, self._shortest = "status" in posterior_type.names, clock.shortest
         start = np.zeros(size_of(posterior_type))
         as_record(start, posterior_type)["time"] = math.nan
-        self._last = self.DeclareDiscreteState(start)
+        self._last = DiscreteStateIndex(self.DeclareDiscreteState(start))
         # Types of the records on its input ports.
         self.record_inputs: dict[str, np.dtype] = {}
         self._remembered: list[RememberedInput | History] = []

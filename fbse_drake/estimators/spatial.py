@@ -190,6 +190,28 @@ def matrix_product(A: Rotation, B: Rotation) -> Rotation:
 
 
 @njit(cache=True)
+def transposed(A: Rotation) -> Rotation:
+    """Its inverse."""
+    return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
+
+
+@njit(cache=True)
+def scaled(factor: float, A: Rotation) -> Rotation:
+    """A matrix times a number."""
+    return (
+        factor * A[0],
+        factor * A[1],
+        factor * A[2],
+        factor * A[3],
+        factor * A[4],
+        factor * A[5],
+        factor * A[6],
+        factor * A[7],
+        factor * A[8],
+    )
+
+
+@njit(cache=True)
 def conjugate(q: Quaternion) -> Quaternion:
     """The inverse of a unit quaternion."""
     return q[0], -q[1], -q[2], -q[3]
