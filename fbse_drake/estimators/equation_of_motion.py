@@ -11,10 +11,14 @@ from numba import njit
 
 from fbse_drake.estimators.records import Record, record_type
 from fbse_drake.estimators.spatial import (
+    Vector,
+    add,
     cross,
+    dot,
     put,
     rotate,
     rotation,
+    scale,
     skew,
     subtract,
     vector,
@@ -71,27 +75,54 @@ def put_equation_of_motion(
     """
     R_BI, p = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     # a_B = a_I - w_dot x p - w x (w x p), of the IMU's origin I seen from the base's.
-    w, moved = vector(model.velocity), np.empty((3, 3))
-    put(moved, skew(p))
+    w = vector(model.velocity)
     force = subtract(vector(measured.mean.specific_force), vector(attitude.acceleration_bias))
-    linear = np.empty(3)
-    put(linear, subtract(rotate(R_BI, force), cross(w, cross(w, p))))
-    base, joints = model.base_inertia, model.mass_matrix
+    linear = subtract(rotate(R_BI, force), cross(w, cross(w, p)))
+    base, joints, base_bias = model.base_inertia, model.mass_matrix, model.base_bias
     A, of_linear, push = now.inertia, now.of_linear, now.push
-    of_linear[:3] = base[:3, 3:] + moved.T @ np.ascontiguousarray(base[3:, 3:])
-    of_linear[3:] = joints[:, 3:6]
-    A[:3, :3] = base[:3, :3] + moved.T @ np.ascontiguousarray(base[3:, :3]) + of_linear[:3] @ moved
-    A[3:, :3] = joints[:, :3] + of_linear[3:] @ moved
-    A[:3, 3:] = A[3:, :3].T
-    A[3:, 3:] = joints[:, 6:]
-    push[:3] = -model.base_bias[:3] - moved.T @ model.base_bias[3:]
-    push[3:] = torque_command - model.bias
-    push -= of_linear @ linear
+    r, bias = len(push), _about(base_bias, p)
+    for j in range(3):
+        column, of_acceleration = _about(base[:, j], p), _about(base[:, 3 + j], p)
+        for i in range(3):
+            A[i, j], of_linear[i, j] = column[i], of_acceleration[i]
+        push[j] = -bias[j]
+    for i in range(3, r):
+        push[i] = torque_command[i - 3] - model.bias[i - 3]
+        for j in range(3):
+            A[i, j], of_linear[i, j] = joints[i - 3, j], joints[i - 3, 3 + j]
+        for j in range(3, r):
+            A[i, j] = joints[i - 3, 3 + j]
+    for i in range(r):
+        factor = vector(of_linear[i])
+        push[i] -= dot(factor, linear)
+        _move(A[i], factor, p)
+    for i in range(3):
+        for j in range(3, r):
+            A[i, j] = A[j, i]
     for foot in range(len(known.has_pads)):
         J, lever = model.foot_jacobian[foot], now.lever[foot]
-        lever[:, :3] = J[:, :3] + np.ascontiguousarray(J[:, 3:6]) @ moved
-        lever[:, 3:] = J[:, 6:]
+        for i in range(6):
+            for j in range(r):
+                lever[i, j] = J[i, j if j < 3 else 3 + j]
+            _move(lever[i], vector(J[i, 3:6]), p)
         now.turning[foot] = model.foot_bias[foot, 2]
+
+
+@njit(cache=True)
+def _about(wrench: np.ndarray, p: Vector) -> Vector:
+    """Moment of a wrench [moment, force], (6,), about a point."""
+    return add(vector(wrench[:3]), cross(vector(wrench[3:]), p))
+
+
+@njit(cache=True)
+def _move(row: np.ndarray, of_linear: Vector, p: Vector) -> None:
+    """A row that counts the base's angular acceleration first gets what its linear one adds.
+
+    The base's linear acceleration is -w_dot x p, where the point p does not accelerate.
+    """
+    moved = cross(of_linear, p)
+    for i in range(3):
+        row[i] += moved[i]
 
 
 @njit(cache=True)
@@ -112,13 +143,14 @@ def touching(
     """
     result, share = np.zeros(len(mean), dtype=np.bool_), 1.0 - math.exp(-elapsed / _CONTACT_TIME)
     for pad in range(len(mean)):
-        mean[pad] += share * (pad_force[pad] - mean[pad])
-        excess = force_noise[known.pads.foot[pad]]
-        of_force = np.full(3, excess * known.sensors.force_noise**2)
+        force, before = vector(pad_force[pad]), vector(mean[pad])
+        late = add(before, scale(share, subtract(force, before)))
+        put(mean[pad], late)
+        gate = _PAD_GATE * force_noise[known.pads.foot[pad]] * known.sensors.force_noise**2
         # The variance of an exponential mean of white noise.
-        of_mean = share / (2.0 - share) * of_force
-        touches = _pushes(pad_force[pad], of_force, _PAD_GATE)
-        result[pad] = touches or _pushes(mean[pad], of_mean, _PAD_GATE)
+        gate_of_mean = share / (2.0 - share) * gate
+        touches = 0.0 < gate < dot(force, force)
+        result[pad] = touches or 0.0 < gate_of_mean < dot(late, late)
     return result
 
 
@@ -154,7 +186,7 @@ def pushed(
             of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)
         else:
             diagonal = force_noise[foot] * known.wrench_variance[foot]
-            touches = _pushes(wrench[foot], diagonal, _WRENCH_GATE)
+            touches = _pushes(wrench[foot], diagonal)
             of_foot, of_noise = wrench[foot].copy(), np.diag(diagonal)
             if not touches:
                 continue
@@ -165,14 +197,14 @@ def pushed(
 
 
 @njit(cache=True)
-def _pushes(force: np.ndarray, variance: np.ndarray, gate: float) -> bool:
-    """Does a sensor show more than its noise? What does not touch the ground has no force."""
+def _pushes(wrench: np.ndarray, variance: np.ndarray) -> bool:
+    """Does a foot show more than its sensor's noise? What touches nothing has no force."""
     distance = 0.0
-    for i in range(len(force)):
+    for i in range(len(wrench)):
         # A point foot has no moment.
         if variance[i] > 0.0:
-            distance += force[i] ** 2 / variance[i]
-    return distance > gate
+            distance += wrench[i] ** 2 / variance[i]
+    return distance > _WRENCH_GATE
 
 
 @njit(cache=True)

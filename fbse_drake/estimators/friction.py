@@ -192,21 +192,17 @@ class FrictionRegressor:
     def _all_joints(self) -> np.ndarray:
         return np.tile(np.arange(len(self.initial)), 1 + len(self.factors))
 
-    @cached_property
-    def _zero(self) -> np.ndarray:
-        return np.zeros(len(self._all_joints))
-
-    def __call__(
-        self, velocity: np.ndarray
-    ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Basis torque of each parameter, and its slope over the velocity.
+    def __call__(self, velocity: np.ndarray) -> np.ndarray:
+        """Basis torque of each parameter, and its slope over the velocity: (2, parameters, ...).
 
         Of all joints as adopted, then with each factor.
         """
         motion = JointMotion(velocity[self._all_joints])
         torques, slopes = self.effect.basis(motion, self._all_nonlinear)
-        # A slope may be one number for all.
-        return tuple(torques), tuple([slope + self._zero for slope in slopes])
+        law = np.empty((2 * len(torques), len(self._all_joints)))
+        for row, values in enumerate((*torques, *slopes)):
+            law[row] = values  # A slope may be one number for all.
+        return law.reshape(2, len(torques), -1)
 
 
 def recursive_least_squares(
@@ -348,7 +344,7 @@ class RecursiveLeastSquaresEstimator(FrictionEstimator):
         if age == math.inf or (reset and age >= reset * (1 - 1e-9)):
             P[:], age = config.covariance * np.eye(P.shape[1]), 0.0
         posterior["age"] = age
-        phi = np.array(self._regressor(measured["joint_velocity"])[0]).T
+        phi = self._regressor(measured["joint_velocity"])[0].T
         valid = link_torque["valid"] > 0
         if config.swing == "model":
             valid &= measured["support"][self._leg] > 0
@@ -420,15 +416,15 @@ def smooth_velocity(
 
 @njit(cache=True)
 def put_regressor(
-    row: np.ndarray, basis: tuple[np.ndarray, ...], shaped: np.ndarray, joint: int, n: int
+    row: np.ndarray, basis: np.ndarray, shaped: np.ndarray, joint: int, n: int
 ) -> None:
     """Fills the regressor of the weights of one of n joints, see `FrictionRegressor`."""
     k, other = len(basis), n + joint
     for parameter in range(k):
-        row[parameter] = basis[parameter][joint]
+        row[parameter] = basis[parameter, joint]
     while k < len(row) - 1:
         for parameter in shaped:
-            row[k] = basis[parameter][other] - basis[parameter][joint]
+            row[k] = basis[parameter, other] - basis[parameter, joint]
             k += 1
         other += n
 
@@ -440,9 +436,9 @@ def _estimate_friction(
     elapsed: float,
     measured: np.ndarray,
     link_torque: np.ndarray,
-    phi: tuple[np.ndarray, ...],
-    slopes: tuple[np.ndarray, ...],
-    phi_now: tuple[np.ndarray, ...],
+    phi: np.ndarray,
+    slopes: np.ndarray,
+    phi_now: np.ndarray,
     shaped: np.ndarray,
     seen: float,
     known: np.ndarray,

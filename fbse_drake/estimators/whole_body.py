@@ -7,7 +7,7 @@ the torques, not for the one that a noisy encoder shows, and is identified at it
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
@@ -60,6 +60,8 @@ _NOT_FINITE = float(Status.NOT_FINITE)
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
+# Of no delay it is known how long it has shown.
+_NO_DELAY = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -121,11 +123,24 @@ class WholeBody:
         return WholeBodyFilter(self, sensors, robot, **arguments)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _inverse(A: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive definite matrix."""
-    inverse = np.linalg.inv(A)
-    return 0.5 * (inverse + inverse.T)
+    """Inverse of a symmetric positive definite matrix, whose variables are swept one by one.
+
+    For so few of them LAPACK takes three times as long.
+    """
+    n, swept, row = len(A), A.copy(), np.empty(len(A))
+    for k in range(n):
+        row[:] = swept[k]
+        scaling = 1.0 / row[k]
+        for i in range(n):
+            factor = scaling * row[i]
+            for j in range(n):
+                swept[i, j] -= factor * row[j]
+        for j in range(n):
+            swept[k, j] = swept[j, k] = scaling * row[j]
+        swept[k, k] = -scaling
+    return -swept
 
 
 @njit(cache=True)
@@ -151,18 +166,14 @@ def _implicit_step(
     return velocity + inverse @ impulse, inverse
 
 
-# What `FrictionRegressor` says: the basis torques, and their slopes over the velocity.
-_Law: TypeAlias = tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]
-
-
 @njit(cache=True)
-def _linearise(x: Record, velocity: np.ndarray, law: _Law, shaped: np.ndarray) -> None:
+def _linearise(x: Record, velocity: np.ndarray, law: np.ndarray, shaped: np.ndarray) -> None:
     """Fills the linearisation of the friction.
 
     Args:
         velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
     """
-    phi, slopes = law
+    phi, slopes = law[0], law[1]
     n, m = x.weights.shape
     row = np.ones(m + 1)
     for joint in range(n):
@@ -179,46 +190,56 @@ def _linearise(x: Record, velocity: np.ndarray, law: _Law, shaped: np.ndarray) -
         x.law_velocity[joint] = velocity[joint]
 
 
-class _Tick(NamedTuple):
-    """What a tick's forces and equation of motion say, whatever the friction is."""
+def _tick_type(n: int, size: int) -> np.dtype:
+    """What a tick's forces and equation of motion say, whatever the friction is.
 
-    # How long it is [s]; 0 where not all is known that it needs, and the rest means nothing.
-    duration: float
-    # Commands, feet and all that is not friction, (r,) [Nm], and its variance (r, r).
-    push: np.ndarray
-    variance: np.ndarray
-    # What is missed between rare readings: part of that variance, (r,).
-    missed: np.ndarray
-    # Covariance of the tick's impulse, but for the friction's, with the states, (r, size).
-    impulse: np.ndarray
+    `duration` () [s], 0 where not all is known that it needs, and the rest means nothing; `push`
+    (r,), commands, feet and all that is not friction [Nm], and its `variance` (r, r); `missed`
+    (r,), the part of that which is missed between rare readings; `impulse` (r, size), covariance of
+    the tick's impulse, but for the friction's, with the states; and `velocity` (n,) of the joints,
+    where the tick is expected to end.
+    """
+    r = 3 + n
+    return record_type(
+        duration=(), push=(r,), variance=(r, r), missed=(r,), impulse=(r, size), velocity=(n,)
+    )
+
+
+@njit(cache=True)
+def _impulse(x: Record, tick: Record) -> np.ndarray:
+    """Covariance of the tick's impulse, friction included, with the states, (r, size)."""
+    P, impulse, (n, m) = x.covariance, tick.impulse.copy(), x.weights.shape
+    first = len(P) - n * m
+    for joint in range(n):
+        for j in range(m):
+            share = tick.duration * x.regressor[joint, j]
+            for k in range(len(P)):
+                impulse[3 + joint, k] -= share * P[first + m * joint + j, k]
+    return impulse
 
 
 @njit(cache=True)
 def _own_covariance(
-    x: Record, A: np.ndarray, inverse: np.ndarray, tick: _Tick
-) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of the velocities after a step in time, with the states (r, size) and each other.
+    x: Record, A: np.ndarray, inverse: np.ndarray, impulse: np.ndarray, tick: Record
+) -> np.ndarray:
+    """Covariance of the velocities after a step in time, (r, r).
 
     Args:
         x: record with the states before the step and the friction's linearisation.
-        inverse: see `_implicit_step`.
+        inverse: see `_implicit_step`; impulse: see `_impulse`.
     """
-    P, T, (n, m) = x.covariance, tick.duration, x.weights.shape
-    r, size, impulse = 3 + n, len(x.covariance), tick.impulse.copy()
-    for joint in range(n):
-        for j in range(m):
-            at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
-            for k in range(size):
-                impulse[3 + joint, k] -= share * P[at, k]
-    with_states = inverse @ impulse
-    own = np.ascontiguousarray(with_states[:, :r]) @ A - T * with_states[:, r : 2 * r]
+    T, (n, m) = tick.duration, x.weights.shape
+    r = 3 + n
+    own = np.ascontiguousarray(impulse[:, :r]) @ A + T * T * tick.variance
     for i in range(r):
+        for k in range(r):
+            own[i, k] -= T * impulse[i, r + k]
         for joint in range(n):
             for j in range(m):
-                at, share = 2 * r + m * joint + j, T * x.regressor[joint, j]
-                own[i, 3 + joint] -= share * with_states[i, at]
-    own = (own + T * T * (inverse @ tick.variance)) @ inverse
-    return with_states, 0.5 * (own + own.T)
+                share = T * x.regressor[joint, j]
+                own[i, 3 + joint] -= share * impulse[i, 2 * r + m * joint + j]
+    own = inverse @ own @ inverse
+    return 0.5 * (own + own.T)
 
 
 @njit(cache=True)
@@ -232,23 +253,23 @@ def _begin(
     torque_command: np.ndarray,
     past: Past,
     delay: float,
-    has_shown: bool,
+    usual_delay: np.ndarray,
+    tick: Record,
     known: Record,
-) -> tuple[_Tick, np.ndarray]:
+) -> None:
     """Takes over what was known a tick ago, and reads the sensors.
+
+    The law stays linearised where it was last.
 
     Args:
         elapsed: of the tick [s], NaN of the first.
         past: of the ticks before, see `motion_type`.
         delay: by how much the forces are late [s].
-        has_shown: has any delay shown?
-
-    Returns:
-        The tick to which the forces belong that are read now, and the velocities of the joints (n,)
-        at its end, with the law linearised where it was last.
+        usual_delay: for how long each delay has shown [s].
+        tick: that to which the forces belong that are read now; filled, see `_tick_type`.
     """
     x, last, measured, pads = posterior[()], last[()], measured[()], known[()].pads
-    model, attitude, known = model[()], attitude[()], known[()]
+    model, attitude, tick, known = model[()], attitude[()], tick[()], known[()]
     posterior[()] = last
     feet = len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
@@ -280,27 +301,30 @@ def _begin(
         # The last state is of another tick; and until a delay has shown, its laws were learned with
         # forces of another time.
         T = 0.0
-        if not has_shown:
+        if not usual_delay.any():
             _forget_laws(x, known)
     pad_force = measured.mean.pad_force
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     push, variance = pushed(
         then, pad_force, touches, wrench, x.force_noise, x.acceleration_noise, known
     )
-    # What rare readings leave out is as large as they differ.
-    missed = (start_share(T, known.reading) * (push - last.pushed)) ** 2 if T > 0.0 else 0.0 * push
-    for i in range(r):
-        variance[i, i] += missed[i]
     A = np.ascontiguousarray(then.inertia)
-    impulse = A @ x.covariance[:r] - T * x.covariance[r : 2 * r]
-    tick = _Tick(T, push, variance, missed, impulse)
+    tick.duration, tick.push[:], tick.missed[:] = T, push, 0.0
+    if T > 0.0:
+        # What rare readings leave out is as large as they differ.
+        tick.missed[:] = (start_share(T, known.reading) * (push - last.pushed)) ** 2
+    for i in range(r):
+        variance[i, i] += tick.missed[i]
+    tick.variance[:] = variance
+    tick.impulse[:] = A @ x.covariance[:r] - T * x.covariance[r : 2 * r]
     if T == 0.0:
         _forget_motion(x, known)
         if elapsed > 0.0:
             x.joint_acceleration[:] = (now.reading - last.now.reading)[3:] / elapsed
-        return tick, x.velocity[3:].copy()
-    velocity, _ = _implicit_step(x, x.velocity, A, push, T)
-    return tick, velocity[3:].copy()
+        tick.velocity[:] = x.velocity[3:]
+    else:
+        velocity, _ = _implicit_step(x, x.velocity, A, push, T)
+        tick.velocity[:] = velocity[3:]
 
 
 @njit(cache=True)
@@ -326,25 +350,24 @@ def _tick_of_forces(x: Record, past: Past) -> Record:
 def _expect(
     posterior: Record,
     last: Record,
-    tick: _Tick,
-    velocity: np.ndarray,
-    law: _Law,
+    tick: Record,
+    law: np.ndarray,
     shaped: np.ndarray,
     past: Past,
     known: Record,
-) -> np.ndarray:
-    """Where the measurements let expect that the tick ends: velocities of the joints (n,).
+) -> None:
+    """Fills the velocities of the joints that the measurements let expect at the tick's end.
 
     Where the law is steep, velocity and law have to fit each other to be learned.
 
     Args:
-        velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
+        law, shaped: what `FrictionRegressor` says at the velocities of the tick.
     """
-    x, last, known = posterior[()], last[()], known[()]
+    x, last, tick, known = posterior[()], last[()], tick[()], known[()]
     A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
-    _linearise(x, velocity, law, shaped)
+    _linearise(x, tick.velocity, law, shaped)
     expected, inverse = _implicit_step(x, x.velocity, A, tick.push, tick.duration)
-    _, own = _own_covariance(x, A, inverse, tick)
+    own = _own_covariance(x, A, inverse, _impulse(x, tick), tick)
     innovation, S = x.reading - expected, own.copy()
     for i in range(len(S)):
         S[i, i] += x.noise[i] * known.variance[i]
@@ -357,7 +380,7 @@ def _expect(
             largest = _GATE * math.sqrt(S[i, i])
             innovation[i] = min(max(innovation[i], -largest), largest)
     expected += own @ (_inverse(S) @ innovation)
-    return expected[3:].copy()
+    tick.velocity[:] = expected[3:]
 
 
 @njit(cache=True)
@@ -365,7 +388,7 @@ def _update(
     x: Record,
     last: Record,
     then: Record,
-    tick: _Tick,
+    tick: Record,
     measured: Record,
     known: Record,
 ) -> None:
@@ -377,10 +400,11 @@ def _update(
     P, r, T = x.covariance, len(x.velocity), tick.duration
     A = np.ascontiguousarray(then.inertia)
     predicted, inverse = _implicit_step(x, x.velocity, A, tick.push, T)
-    with_states, expected = _own_covariance(x, A, inverse, tick)
-    P[:r] = with_states
-    P[:, :r] = with_states.T
+    impulse = _impulse(x, tick)
+    expected = _own_covariance(x, A, inverse, impulse, tick)
+    P[:r] = inverse @ impulse
     P[:r, :r] = expected
+    _mirror(P, r)
     x.velocity[:], x.pushed[:] = predicted, tick.push
     x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
     learning = _learning(last, known)
@@ -388,6 +412,14 @@ def _update(
     _listen_to_feet(x, last, then, measured, learning, T, known)
     _watch_corrections(x, last, A, correction, expected, T)
     x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T
+
+
+@njit(cache=True)
+def _mirror(P: np.ndarray, r: int) -> None:
+    """Fills the first columns of a symmetric matrix from its first rows."""
+    for i in range(r):
+        for j in range(r, len(P)):
+            P[j, i] = P[i, j]
 
 
 @njit(cache=True)
@@ -522,8 +554,8 @@ def _listen(
     # R S^-1 P is P - P S^-1 P without the difference of large numbers.
     for i in range(r):
         P[i] = (x.noise[i] * known.variance[i] + excess[i]) * gain[i]
-    P[:, :r] = P[:r].T
     P[:r, :r] = 0.5 * (P[:r, :r] + P[:r, :r].T)
+    _mirror(P, r)
     _restore_variance(x, elapsed, known)
     return correction
 
@@ -666,11 +698,9 @@ def _finish(
     posterior: Record,
     last: Record,
     elapsed: float,
-    tick: _Tick,
-    velocity: np.ndarray,
-    law: _Law,
-    velocity_now: np.ndarray,
-    law_now: _Law,
+    tick: Record,
+    law: np.ndarray,
+    law_now: np.ndarray,
     shaped: np.ndarray,
     measured: Record,
     torque_command: np.ndarray,
@@ -680,14 +710,17 @@ def _finish(
     """Updates the state; tells friction and its standard deviation by the law where the tick ends.
 
     Args:
-        velocity, law, shaped: see `_expect`, of where the tick of the forces is expected to end.
-        velocity_now, law_now: the same of the present tick.
+        law, shaped: what `FrictionRegressor` says at the velocities of the tick.
+        law_now: the same at those that are measured now, for forces that are late.
     """
     x, last, measured, known = posterior[()], last[()], measured[()], known[()]
+    tick, velocity_now = tick[()], measured.joint_velocity
     if tick.duration > 0.0:
-        _linearise(x, velocity, law, shaped)
+        _linearise(x, tick.velocity, law, shaped)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
         _make_dissipative(x)
+    if x.late == 0.0:
+        velocity_now, law_now = tick.velocity, law
     _linearise(x, velocity_now, law_now, shaped)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME) if elapsed > 0.0 else 1.0
@@ -841,6 +874,7 @@ class WholeBodyFilter(RecursiveEstimator):
             pad_mean=(len(pads.position), 3),
         )
         super().__init__(posterior_type, clock)
+        self._tick_type = _tick_type(n, 2 * r + n * m)
         gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
         encoder = required(sensors.joint_velocity_noise, "joint_velocity_noise")
         self._known = record(
@@ -879,28 +913,26 @@ class WholeBodyFilter(RecursiveEstimator):
     ) -> None:
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         torque_command, past = self._torque_command.Eval(context), self._past.Eval(context)
-        known, delay, has_shown = self._known, 0.0, False
+        model, regressor, known = self._model.Eval(context), self._regressor, self._known
+        shaped, delay, usual_delay = regressor.shaped, 0.0, _NO_DELAY
         if math.isnan(elapsed):
             last = self._start()
         if self._hears_delay:
-            delay = float(attitude["force_delay"]["delay"])
-            has_shown = bool(attitude["force_delay"]["usual"].any())
-        model, regressor = self._model.Eval(context), self._regressor
-        tick, velocity = _begin(
+            heard = attitude["force_delay"]
+            delay, usual_delay = heard["delay"].item(), heard["usual"]
+        tick = np.empty((), self._tick_type)
+        _begin(
             posterior, last, elapsed, measured, model, attitude, torque_command, past, delay,
-            has_shown, known,
+            usual_delay, tick, known,
         )  # fmt: skip
-        law = regressor(velocity)
-        if tick.duration > 0.0:
-            velocity = _expect(posterior, last, tick, velocity, law, regressor.shaped, past, known)
-            law = regressor(velocity)
-        velocity_now, law_now = velocity, law
-        if posterior["late"] > 0.0:
-            velocity_now = measured["joint_velocity"].copy()
-            law_now = regressor(velocity_now)
+        law = regressor(tick["velocity"])
+        if tick["duration"] > 0.0:
+            _expect(posterior, last, tick, law, shaped, past, known)
+            law = regressor(tick["velocity"])
+        law_now = regressor(measured["joint_velocity"]) if posterior["late"] > 0.0 else law
         _finish(
-            posterior, last, elapsed, tick, velocity, law, velocity_now, law_now,
-            regressor.shaped, measured, torque_command, past, known,
+            posterior, last, elapsed, tick, law, law_now, shaped, measured, torque_command, past,
+            known,
         )  # fmt: skip
 
     def _start(self) -> np.ndarray:
