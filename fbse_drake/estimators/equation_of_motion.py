@@ -191,8 +191,12 @@ def pushed(
             if not touches:
                 continue
         lever = of_tick.lever[foot]
-        push += lever.T @ of_foot
-        variance += lever.T @ (of_noise @ lever)
+        by_noise = of_noise @ lever
+        for k in range(6):
+            for i in range(len(push)):
+                push[i] += lever[k, i] * of_foot[k]
+                for j in range(len(push)):
+                    variance[i, j] += lever[k, i] * by_noise[k, j]
     return push, variance
 
 
