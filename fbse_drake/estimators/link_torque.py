@@ -14,7 +14,7 @@ from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.innovations import LOG_OF_SIX, LOG_OF_THREE, learned_noise
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, Past, RecursiveEstimator, Status, ticks_ago
+from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status, ticks_ago
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
@@ -101,7 +101,7 @@ def _estimate_link_torque(
     acceleration: np.ndarray,
     torque_command: np.ndarray,
     delay: float,
-    past: Past,
+    past: np.ndarray,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
@@ -116,7 +116,7 @@ def _estimate_link_torque(
             feet that they move; and `learns_noise`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
-    model, acceleration, known = model[()], acceleration[()], known[()]
+    model, acceleration, past, known = model[()], acceleration[()], past[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     posterior.late = posterior.duration = 0.0

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
@@ -28,7 +28,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.records import Record, as_record, parts, size_of
+from fbse_drake.estimators.records import Record, as_record, parts, ring_type, size_of
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
@@ -115,19 +115,14 @@ class RememberedInput:
         state.set_value(self.index, self.port.Eval(context))
 
 
-class Past(NamedTuple):
-    """Records of the last ticks, in a ring."""
-
-    # Where the last tick's is.
-    newest: int
-    # Shape (ticks,).
-    of_tick: np.ndarray
-
-
 @njit(cache=True)
-def ticks_ago(past: Past, age: int) -> Record:
-    """What is remembered of the tick that ended so many ticks ago, 1 for the last one."""
-    return past.of_tick[(past.newest + 1 - age) % len(past.of_tick)]
+def ticks_ago(past: Record, age: int) -> Record:
+    """What is remembered of the tick that ended so many ticks ago, 1 for the last one.
+
+    Args:
+        past: see `History`.
+    """
+    return past.of_tick[(int(past.newest) + 1 - age) % len(past.of_tick)]
 
 
 @dataclass(frozen=True)
@@ -138,15 +133,15 @@ class History:
     """
 
     index: DiscreteStateIndex
+    # Of the ring, see `ring_type`.
     kind: np.dtype
     # How many ticks are remembered, and where the posterior has the field.
     ticks: int
     part: slice
 
-    def Eval(self, context: Context) -> Past:
-        """All that is remembered."""
-        values = context.get_discrete_state().value(self.index)
-        return Past(int(values.item(0)), np.ndarray((self.ticks,), self.kind, values[1:]))
+    def Eval(self, context: Context) -> np.ndarray:
+        """All that is remembered, a ring."""
+        return as_record(context.get_discrete_state().value(self.index), self.kind)
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
         """Adds the present tick, if it is one."""
@@ -259,8 +254,8 @@ class RecursiveEstimator(LeafSystem):
 
     def _declare_history(self, field: str, ticks: int) -> History:
         """Declares a state for what a record of the posterior was in the last ticks."""
-        kind = self.posterior_type[field]
-        index = self.DeclareDiscreteState(1 + ticks * size_of(kind))
+        kind = ring_type(self.posterior_type[field], ticks)
+        index = self.DeclareDiscreteState(size_of(kind))
         history = History(index, kind, ticks, parts(self.posterior_type)[field])
         self._remembered.append(history)
         return history
@@ -333,7 +328,9 @@ class RecursiveEstimator(LeafSystem):
         output.SetFromVector(self._posterior.Eval(context)[part])
 
     def _remember(self, context: Context, state: State) -> None:
-        values, posterior = state.get_mutable_discrete_state(), self._posterior.Eval(context)
+        values = state.get_mutable_discrete_state()
+        # (`Eval` would copy it.)
+        posterior = self._posterior.EvalBasicVector(context).value()
         values.set_value(0, posterior)
         for remembered in self._remembered:
             remembered.remember(context, values, posterior)

@@ -35,7 +35,6 @@ from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import (
     Clock,
-    Past,
     RecursiveEstimator,
     Status,
     start_share,
@@ -251,7 +250,7 @@ def _begin(
     model: Record,
     attitude: Record,
     torque_command: np.ndarray,
-    past: Past,
+    past: Record,
     delay: float,
     usual_delay: np.ndarray,
     tick: Record,
@@ -268,10 +267,10 @@ def _begin(
         usual_delay: for how long each delay has shown [s].
         tick: that to which the forces belong that are read now; filled, see `_tick_type`.
     """
-    x, last, measured, pads = posterior[()], last[()], measured[()], known[()].pads
-    model, attitude, tick, known = model[()], attitude[()], tick[()], known[()]
+    x, last, measured, model = posterior[()], last[()], measured[()], model[()]
+    attitude, past, tick, known = attitude[()], past[()], tick[()], known[()]
     posterior[()] = last
-    feet = len(known.wrench_variance)
+    pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
     watch_forces(x, last, elapsed, wrench, known)
     _watch_accelerometer(x, last, elapsed, measured.mean.specific_force, known)
@@ -341,7 +340,7 @@ def _watch_accelerometer(
 
 
 @njit(cache=True)
-def _tick_of_forces(x: Record, past: Past) -> Record:
+def _tick_of_forces(x: Record, past: Record) -> Record:
     """What is known of the tick to which the forces belong that are read now, but for them."""
     return x.now if x.late == 0.0 else ticks_ago(past, int(x.late))
 
@@ -353,7 +352,7 @@ def _expect(
     tick: Record,
     law: np.ndarray,
     shaped: np.ndarray,
-    past: Past,
+    past: Record,
     known: Record,
 ) -> None:
     """Fills the velocities of the joints that the measurements let expect at the tick's end.
@@ -363,7 +362,7 @@ def _expect(
     Args:
         law, shaped: what `FrictionRegressor` says at the velocities of the tick.
     """
-    x, last, tick, known = posterior[()], last[()], tick[()], known[()]
+    x, last, tick, past, known = posterior[()], last[()], tick[()], past[()], known[()]
     A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
     _linearise(x, tick.velocity, law, shaped)
     expected, inverse = _implicit_step(x, x.velocity, A, tick.push, tick.duration)
@@ -704,7 +703,7 @@ def _finish(
     shaped: np.ndarray,
     measured: Record,
     torque_command: np.ndarray,
-    past: Past,
+    past: Record,
     known: Record,
 ) -> None:
     """Updates the state; tells friction and its standard deviation by the law where the tick ends.
@@ -714,7 +713,7 @@ def _finish(
         law_now: the same at those that are measured now, for forces that are late.
     """
     x, last, measured, known = posterior[()], last[()], measured[()], known[()]
-    tick, velocity_now = tick[()], measured.joint_velocity
+    tick, past, velocity_now = tick[()], past[()], measured.joint_velocity
     if tick.duration > 0.0:
         _linearise(x, tick.velocity, law, shaped)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
