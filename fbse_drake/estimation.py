@@ -14,7 +14,7 @@ from fbse_drake.estimators.recursive import start_share
 from fbse_drake.log import Log
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
-from fbse_drake.sampling import state_views
+from fbse_drake.sampling import output_views, state_views
 from fbse_drake.scenario import Scenario, build_robot, dump_scenario, task_plan
 from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
@@ -176,16 +176,17 @@ class Replay:
         self._next_context = estimator.CreateDefaultContext()
         self._next = self._next_context.get_mutable_state()
         self._next_values = self._next_context.get_discrete_state()
-        self._views = [
-            *state_views(estimator, self.context),
-            *state_views(estimator, self._next_context),
-        ]
         self._sources = []
         for i in range(estimator.num_input_ports()):
             port = estimator.get_input_port(i)
             self._sources.append(
                 (port.FixValue(self.context, inputs[port.get_name()][0]), inputs[port.get_name()])
             )
+        self._views = [
+            *state_views(estimator, self.context),
+            *state_views(estimator, self._next_context),
+            *output_views(estimator, self.context),
+        ]
 
     def feed(self, sample: int) -> None:
         """Sets time and inputs to a sample of the log."""

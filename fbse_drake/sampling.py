@@ -6,7 +6,13 @@ plant's state of the next tick, an unrestricted one that of the present tick. Sy
 remember something from tick to tick do so in unrestricted updates.
 """
 
-from pydrake.systems.framework import Context, Diagram, DiscreteValues, System
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiscreteValues,
+    PortDataType,
+    System,
+)
 
 
 def tick_index(time: float, period: float) -> int:
@@ -32,4 +38,21 @@ def state_views(system: System, context: Context) -> list[DiscreteValues]:
         view
         for inner in system.GetSystems()
         for view in state_views(inner, system.GetSubsystemContext(inner, context))
+    ]
+
+
+def output_views(system: System, context: Context) -> list[object]:
+    """Python's views of what the output ports of a system, or of all in a diagram, hold.
+
+    As long as they are kept, a system that fills a port is given these and no new ones, which would
+    cost each of its ticks a microsecond. All ports are evaluated.
+    """
+    if not isinstance(system, Diagram):
+        ports = [system.get_output_port(i) for i in range(system.num_output_ports())]
+        vectors = [port for port in ports if port.get_data_type() == PortDataType.kVectorValued]
+        return [port.EvalBasicVector(context) for port in vectors]
+    return [
+        view
+        for inner in system.GetSystems()
+        for view in output_views(inner, system.GetSubsystemContext(inner, context))
     ]

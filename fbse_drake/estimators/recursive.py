@@ -108,7 +108,7 @@ class RememberedInput:
 
     def Eval(self, context: Context) -> np.ndarray:
         """The value a tick ago."""
-        return context.get_discrete_state(self.index).value()
+        return context.get_discrete_state().value(self.index)
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:  # noqa: ARG002
         """Keeps the present value for the next tick."""
