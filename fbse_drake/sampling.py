@@ -6,13 +6,7 @@ plant's state of the next tick, an unrestricted one that of the present tick. Sy
 remember something from tick to tick do so in unrestricted updates.
 """
 
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    DiscreteValues,
-    PortDataType,
-    System,
-)
+from pydrake.systems.framework import Context, Diagram, DiscreteValues, PortDataType, System
 
 
 def tick_index(time: float, period: float) -> int:

@@ -136,7 +136,7 @@ def touching(
     Args:
         mean: of late, (P, 3) [N]; goes on to this tick.
         pad_force: (P, 3) [N]; elapsed: since the last [s].
-        force_noise, known: see `pushed`.
+        force_noise, known: see `put_push`.
 
     Returns:
         For each pad, (P,).
@@ -155,7 +155,9 @@ def touching(
 
 
 @njit(cache=True)
-def pushed(
+def put_push(
+    push: np.ndarray,
+    variance: np.ndarray,
     of_tick: Record,
     pad_force: np.ndarray,
     pad_touches: np.ndarray,
@@ -163,8 +165,8 @@ def pushed(
     force_noise: np.ndarray,
     acceleration_noise: float,
     known: Record,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The push (r,) in an equation of motion, feet included, and its variance (r, r).
+) -> None:
+    """Fills the push (r,) in an equation of motion, feet included, and its variance (r, r).
 
     A foot that shows no more than its sensors' noise touches nothing.
 
@@ -177,10 +179,11 @@ def pushed(
         known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
             (feet, 6) of each foot, and `pads`, see `FootPads`.
     """
-    push, of_linear = of_tick.push.copy(), of_tick.of_linear
-    variance = (acceleration_noise * known.sensors.acceleration_noise**2) * (
-        of_linear @ of_linear.T
-    )
+    r, noise = len(push), acceleration_noise * known.sensors.acceleration_noise**2
+    for i in range(r):
+        push[i], factor = of_tick.push[i], vector(of_tick.of_linear[i])
+        for j in range(r):
+            variance[i, j] = noise * dot(factor, vector(of_tick.of_linear[j]))
     for foot in range(len(known.has_pads)):
         if known.has_pads[foot]:
             of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)
@@ -193,11 +196,10 @@ def pushed(
         lever = of_tick.lever[foot]
         by_noise = of_noise @ lever
         for k in range(6):
-            for i in range(len(push)):
+            for i in range(r):
                 push[i] += lever[k, i] * of_foot[k]
-                for j in range(len(push)):
+                for j in range(r):
                     variance[i, j] += lever[k, i] * by_noise[k, j]
-    return push, variance
 
 
 @njit(cache=True)

@@ -18,8 +18,8 @@ from fbse_drake.errors import require_not_negative, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.equation_of_motion import (
     motion_type,
-    pushed,
     put_equation_of_motion,
+    put_push,
     touching,
 )
 from fbse_drake.estimators.floating_base import ImuMount, model_type
@@ -130,7 +130,8 @@ def _inverse(A: np.ndarray) -> np.ndarray:
     """
     n, swept, row = len(A), A.copy(), np.empty(len(A))
     for k in range(n):
-        row[:] = swept[k]
+        for j in range(n):
+            row[j] = swept[k, j]
         scaling = 1.0 / row[k]
         for i in range(n):
             factor = scaling * row[i]
@@ -304,25 +305,25 @@ def _begin(
             _forget_laws(x, known)
     pad_force = measured.mean.pad_force
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
-    push, variance = pushed(
-        then, pad_force, touches, wrench, x.force_noise, x.acceleration_noise, known
-    )
-    A = np.ascontiguousarray(then.inertia)
-    tick.duration, tick.push[:], tick.missed[:] = T, push, 0.0
-    if T > 0.0:
-        # What rare readings leave out is as large as they differ.
-        tick.missed[:] = (start_share(T, known.reading) * (push - last.pushed)) ** 2
+    put_push(
+        tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
+        x.acceleration_noise, known,
+    )  # fmt: skip
+    A, tick.duration, share = np.ascontiguousarray(then.inertia), T, start_share(T, known.reading)
+    np.dot(A, x.covariance[:r], tick.impulse)
     for i in range(r):
-        variance[i, i] += tick.missed[i]
-    tick.variance[:] = variance
-    tick.impulse[:] = A @ x.covariance[:r] - T * x.covariance[r : 2 * r]
+        for k in range(len(x.covariance)):
+            tick.impulse[i, k] -= T * x.covariance[r + i, k]
+        # What rare readings leave out is as large as they differ.
+        tick.missed[i] = (share * (tick.push[i] - last.pushed[i])) ** 2
+        tick.variance[i, i] += tick.missed[i]
     if T == 0.0:
         _forget_motion(x, known)
         if elapsed > 0.0:
             x.joint_acceleration[:] = (now.reading - last.now.reading)[3:] / elapsed
         tick.velocity[:] = x.velocity[3:]
     else:
-        velocity, _ = _implicit_step(x, x.velocity, A, push, T)
+        velocity, _ = _implicit_step(x, x.velocity, A, tick.push, T)
         tick.velocity[:] = velocity[3:]
 
 
