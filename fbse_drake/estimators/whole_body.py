@@ -24,13 +24,17 @@ from fbse_drake.estimators.equation_of_motion import (
 )
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
-from fbse_drake.estimators.friction import FrictionRegressor, put_regressor
-from fbse_drake.estimators.innovations import (
-    AGREEMENT_TIME,
-    LOG_OF_ONE,
-    LOG_OF_THREE,
-    learned_noise,
+from fbse_drake.estimators.friction import FrictionRegressor
+from fbse_drake.estimators.implicit_friction import (
+    implicit_step,
+    impulse_covariance,
+    inverse_of,
+    linearise,
+    mirror,
+    own_covariance,
 )
+from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_THREE, learned_noise
+from fbse_drake.estimators.law_learning import forget_laws, learning_states, make_dissipative
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import (
@@ -42,23 +46,21 @@ from fbse_drake.estimators.recursive import (
 )
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import put, rotate, rotation, subtract, vector
+from fbse_drake.estimators.whole_body_updates import (
+    DOUBT_TIME,
+    GATE,
+    NOTICED,
+    confirmed,
+    forget_lacking,
+    is_contradicted,
+    listen,
+    listen_to_feet,
+    watch_corrections,
+)
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
-# An innovation counts as little as makes it just likely beyond so many standard deviations, ...
-_GATE = 5.0
-# ... and what the law does not explain, or a tick adds to it, is not known for so long [s].
-_DOUBT_TIME = 0.1
-# Corrections whose mean is beyond so many standard deviations show that torque is lacking, and
-# innovations whose root mean square is that they are no noise; a velocity that is, that a joint
-# moves.
-_NOTICED = 3.0
-# A law is known when it is so many times surer than at the start.
-_LEARNED = 10.0
 _NOT_FINITE = float(Status.NOT_FINITE)
-# A foot that carries less than the first of these shares of the load does not stand, and below the
-# second it moves more easily the less it carries.
-_LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
 # Of no delay it is known how long it has shown.
 _NO_DELAY = np.zeros(0)
 
@@ -122,60 +124,6 @@ class WholeBody:
         return WholeBodyFilter(self, sensors, robot, **arguments)
 
 
-@njit(cache=True)
-def _inverse(A: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive definite matrix."""
-    inverse = np.linalg.inv(A)
-    return 0.5 * (inverse + inverse.T)
-
-
-@njit(cache=True)
-def _implicit_step(
-    x: Record, velocity: np.ndarray, A: np.ndarray, push: np.ndarray, T: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A Newton step of velocity' = velocity + T A^-1 (push - lacking - friction(velocity')).
-
-    Args:
-        x: record with `lacking` (r,), and the friction's linearisation: `friction_there` (n,) and
-            `slope` (n,) at `law_velocity` (n,).
-        velocity: where the step in time begins, (r,).
-
-    Returns:
-        velocity' (r,), and the inverse (r, r) of A + T slope.
-    """
-    implicit, impulse = A.copy(), T * (push - x.lacking)
-    for joint in range(len(x.slope)):
-        slope, ahead = x.slope[joint], velocity[3 + joint] - x.law_velocity[joint]
-        implicit[3 + joint, 3 + joint] += T * slope
-        impulse[3 + joint] -= T * (x.friction_there[joint] + slope * ahead)
-    inverse = _inverse(implicit)
-    return velocity + inverse @ impulse, inverse
-
-
-@njit(cache=True)
-def _linearise(x: Record, velocity: np.ndarray, law: np.ndarray, shaped: np.ndarray) -> None:
-    """Fills the linearisation of the friction.
-
-    Args:
-        velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
-    """
-    phi, slopes = law[0], law[1]
-    n, m = x.weights.shape
-    row = np.ones(m + 1)
-    for joint in range(n):
-        put_regressor(row, slopes, shaped, joint, n)
-        slope = there = 0.0
-        for k in range(m):
-            slope += row[k] * x.weights[joint, k]
-        put_regressor(row, phi, shaped, joint, n)
-        for k in range(m):
-            x.regressor[joint, k] = row[k]
-            there += row[k] * x.weights[joint, k]
-        # A law that falls would make the step in time unstable.
-        x.slope[joint], x.friction_there[joint] = max(0.0, slope), there
-        x.law_velocity[joint] = velocity[joint]
-
-
 def _tick_type(n: int, size: int) -> np.dtype:
     """What a tick's forces and equation of motion say, whatever the friction is.
 
@@ -189,43 +137,6 @@ def _tick_type(n: int, size: int) -> np.dtype:
     return record_type(
         duration=(), push=(r,), variance=(r, r), missed=(r,), impulse=(r, size), velocity=(n,)
     )
-
-
-@njit(cache=True)
-def _impulse(x: Record, tick: Record) -> np.ndarray:
-    """Covariance of the tick's impulse, friction included, with the states, (r, size)."""
-    P, impulse, (n, m) = x.covariance, tick.impulse.copy(), x.weights.shape
-    first = len(P) - n * m
-    for joint in range(n):
-        for j in range(m):
-            share = tick.duration * x.regressor[joint, j]
-            for k in range(len(P)):
-                impulse[3 + joint, k] -= share * P[first + m * joint + j, k]
-    return impulse
-
-
-@njit(cache=True)
-def _own_covariance(
-    x: Record, A: np.ndarray, inverse: np.ndarray, impulse: np.ndarray, tick: Record
-) -> np.ndarray:
-    """Covariance of the velocities after a step in time, (r, r).
-
-    Args:
-        x: record with the states before the step and the friction's linearisation.
-        inverse: see `_implicit_step`; impulse: see `_impulse`.
-    """
-    T, (n, m) = tick.duration, x.weights.shape
-    r = 3 + n
-    own = np.ascontiguousarray(impulse[:, :r]) @ A + T * T * tick.variance
-    for i in range(r):
-        for k in range(r):
-            own[i, k] -= T * impulse[i, r + k]
-        for joint in range(n):
-            for j in range(m):
-                share = T * x.regressor[joint, j]
-                own[i, 3 + joint] -= share * impulse[i, 2 * r + m * joint + j]
-    own = inverse @ own @ inverse
-    return 0.5 * (own + own.T)
 
 
 @njit(cache=True)
@@ -288,7 +199,7 @@ def _begin(
         # forces of another time.
         T = 0.0
         if not usual_delay.any():
-            _forget_laws(x, known)
+            forget_laws(x, known)
     pad_force = measured.mean.pad_force
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     put_push(
@@ -309,7 +220,7 @@ def _begin(
             x.joint_acceleration[:] = (now.reading - last.now.reading)[3:] / elapsed
         tick.velocity[:] = x.velocity[3:]
     else:
-        velocity, _ = _implicit_step(x, x.velocity, A, tick.push, T)
+        velocity, _ = implicit_step(x, x.velocity, A, tick.push, T)
         tick.velocity[:] = velocity[3:]
 
 
@@ -351,21 +262,21 @@ def _expect(
     """
     x, last, tick, past, known = posterior[()], last[()], tick[()], past[()], known[()]
     A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
-    _linearise(x, tick.velocity, law, shaped)
-    expected, inverse = _implicit_step(x, x.velocity, A, tick.push, tick.duration)
-    own = _own_covariance(x, A, inverse, _impulse(x, tick), tick)
+    linearise(x, tick.velocity, law, shaped)
+    expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
+    own = own_covariance(x, A, inverse, impulse_covariance(x, tick), tick)
     innovation, S = x.reading - expected, own.copy()
     for i in range(len(S)):
         S[i, i] += x.noise[i] * known.variance[i]
-        twice = _confirmed(innovation[i], last.innovation[i]) ** 2
-        if twice > _GATE**2 * S[i, i]:
+        twice = confirmed(innovation[i], last.innovation[i]) ** 2
+        if twice > GATE**2 * S[i, i]:
             # As in the update.
             own[i, i] += twice
             S[i, i] += twice
         else:
-            largest = _GATE * math.sqrt(S[i, i])
+            largest = GATE * math.sqrt(S[i, i])
             innovation[i] = min(max(innovation[i], -largest), largest)
-    expected += own @ (_inverse(S) @ innovation)
+    expected += own @ (inverse_of(S) @ innovation)
     tick.velocity[:] = expected[3:]
 
 
@@ -385,285 +296,19 @@ def _update(
     """
     P, r, T = x.covariance, len(x.velocity), tick.duration
     A = np.ascontiguousarray(then.inertia)
-    predicted, inverse = _implicit_step(x, x.velocity, A, tick.push, T)
-    impulse = _impulse(x, tick)
-    expected = _own_covariance(x, A, inverse, impulse, tick)
+    predicted, inverse = implicit_step(x, x.velocity, A, tick.push, T)
+    impulse = impulse_covariance(x, tick)
+    expected = own_covariance(x, A, inverse, impulse, tick)
     P[:r] = inverse @ impulse
     P[:r, :r] = expected
-    _mirror(P, r)
+    mirror(P, r)
     x.velocity[:], x.pushed[:] = predicted, tick.push
     x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
-    learning = _learning(last, known)
-    correction = _listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
-    _listen_to_feet(x, last, then, measured, learning, T, known)
-    _watch_corrections(x, last, A, correction, expected, T)
+    learning = learning_states(last, known)
+    correction = listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
+    listen_to_feet(x, last, then, measured, learning, T, known)
+    watch_corrections(x, last, A, correction, expected, T)
     x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T
-
-
-@njit(cache=True)
-def _mirror(P: np.ndarray, r: int) -> None:
-    """Fills the first columns of a symmetric matrix from its first rows."""
-    for i in range(r):
-        for j in range(r, len(P)):
-            P[j, i] = P[i, j]
-
-
-@njit(cache=True)
-def _learning(last: Record, known: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
-
-    A joint whose velocity has not been known from zero for some time says nothing of its law:
-    coefficient and velocity, known by their product alone, would drift apart. Of what contradicts a
-    law that is known by now nobody knows whether it is the law or what it is learned from. So it is
-    where torque keeps being lacking in the joint's row, and where innovations are no noise.
-    """
-    learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
-    for joint in range(n):
-        row = 3 + joint
-        rests = last.rested[joint] > _DOUBT_TIME
-        no_noise = last.agreement[row] > _NOTICED**2
-        contradicted = _is_contradicted(last, row) or no_noise
-        if rests or (contradicted and _is_learned(last, joint, known)):
-            learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
-    return learning
-
-
-@njit(cache=True)
-def _is_learned(x: Record, joint: int, known: Record) -> bool:
-    """Is a joint's law, where it is asked, known _LEARNED times as well as at the start?"""
-    n, m = x.weights.shape
-    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
-    for j in range(m):
-        start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
-        for k in range(m):
-            both = x.regressor[joint, j] * x.regressor[joint, k]
-            now += both * x.covariance[first + j, first + k]
-    return now * _LEARNED**2 < start
-
-
-@njit(cache=True)
-def _correct(
-    x: Record, columns: np.ndarray, gain: np.ndarray, innovation: np.ndarray, learning: np.ndarray
-) -> None:
-    """Kalman update, in place.
-
-    States that do not learn are considered, as in a Schmidt-Kalman filter: their uncertainty counts
-    and stays.
-
-    Args:
-        columns: covariance of the innovations (m,) with the states, (m, size).
-        gain: of the states, transposed, (m, size).
-        learning: see `_learning`.
-    """
-    P, r, size = x.covariance, len(x.velocity), len(learning)
-    change, less = learning * (innovation @ gain), columns.T @ gain
-    x.velocity += change[:r]
-    x.lacking += change[r : 2 * r]
-    x.weights += change[2 * r :].reshape(x.weights.shape)
-    for j in range(size):
-        if learning[j] > 0.0:
-            for k in range(size):
-                P[j, k] -= less[j, k]
-        else:
-            for k in range(size):
-                P[j, k] -= learning[k] * less[j, k]
-
-
-@njit(cache=True)
-def _confirmed(now: float, before: float) -> float:
-    """What two ticks say is no outlier: the smaller of them, 0 if they have not the same sign."""
-    return min(abs(now), abs(before)) if now * before > 0.0 else 0.0
-
-
-@njit(cache=True)
-def _is_contradicted(x: Record, row: int) -> bool:
-    """Do the measurements keep saying, beyond chance, that torque is lacking in this row?"""
-    return x.unexplained[row] ** 2 > _GATE**2 * x.unexplained_variance[row]
-
-
-@njit(cache=True)
-def _listen(
-    x: Record,
-    last: Record,
-    missed: np.ndarray,
-    learning: np.ndarray,
-    elapsed: float,
-    known: Record,
-) -> np.ndarray:
-    """Kalman update with gyro and encoders.
-
-    Args:
-        x: record whose velocities are those before the update.
-        missed: what is added to their variances, as pushes between rare readings are missed, (r,).
-        learning: see `_learning`.
-
-    Returns:
-        How they would correct the velocities if no innovation were too large to count, (r,).
-    """
-    P, r = x.covariance, len(x.velocity)
-    innovation, excess = x.reading - x.velocity, np.zeros(r)
-    keep, forget = math.exp(-elapsed / AGREEMENT_TIME), math.exp(-elapsed / _DOUBT_TIME)
-    # The standard deviation of an exponential mean of white squares is the root.
-    beyond_chance = _GATE * math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep))
-    for i in range(r):
-        # How noisy a sensor is shows in its steps, whatever the model is wrong by.
-        step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
-        believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
-        x.noise[i] = learned_noise(last.noise[i], step * step / believed, LOG_OF_ONE, elapsed)
-        S = P[i, i] + x.noise[i] * known.variance[i]
-        share = innovation[i] ** 2 / S
-        # The velocity is elsewhere, and nobody knows why.
-        twice = _confirmed(innovation[i], last.innovation[i]) ** 2
-        if twice > _GATE**2 * S:
-            P[i, i] += twice
-            S += twice
-        x.innovation[i], x.innovation_variance[i] = innovation[i], S
-        x.agreement[i] += (1.0 - keep) * (share - x.agreement[i])
-        # The reading's noise is known from its steps: the velocity's variance is too small.
-        excess_now = (x.agreement[i] - 1.0) * S if x.agreement[i] > 1.0 + beyond_chance else 0.0
-        x.contradiction[i] = max(excess_now, forget * last.contradiction[i])
-        # An innovation counts as little as makes it just likely.
-        excess[i] = max(0.0, (innovation[i] / _GATE) ** 2 - S)
-    columns, expected = P[:r].copy(), P[:r, :r].copy()
-    weight = _inverse(expected + np.diag(x.noise * known.variance))
-    whitened = weight @ innovation
-    correction = expected @ whitened
-    # Mean square, which has the mean 1 and the variance 2 / r.
-    surprise = innovation @ whitened / r
-    if surprise < 1.0 + _GATE * math.sqrt(2.0 / r):
-        surprise = 1.0
-    if excess.max() > 0.0:
-        weight = _inverse(expected + np.diag(x.noise * known.variance + excess))
-    x.surprise = max(surprise, 1.0 + forget * (last.surprise - 1.0))
-    gain = weight @ columns
-    _correct(x, columns, gain, innovation, learning)
-    # R S^-1 P is P - P S^-1 P without the difference of large numbers.
-    for i in range(r):
-        P[i] = (x.noise[i] * known.variance[i] + excess[i]) * gain[i]
-    P[:r, :r] = 0.5 * (P[:r, :r] + P[:r, :r].T)
-    _mirror(P, r)
-    _restore_variance(x, elapsed, known)
-    return correction
-
-
-@njit(cache=True)
-def _restore_variance(x: Record, elapsed: float, known: Record) -> None:
-    """What rounding leaves less uncertain of `lacking` than a tick makes it is as at the start."""
-    P, r, config = x.covariance, len(x.velocity), known.config
-    for i in range(r):
-        walk = config.moment_walk if i < 3 else config.disturbance_walk
-        if P[r + i, r + i] < 1e-3 * walk**2 * elapsed:
-            _forget_lacking(x, i, known)
-
-
-@njit(cache=True)
-def _forget_lacking(x: Record, row: int, known: Record) -> None:
-    """Of the torque that is lacking in a row, no more is known than at the start, and its size."""
-    P, at, config = x.covariance, len(x.velocity) + row, known.config
-    start = config.moment_uncertainty if row < 3 else config.disturbance_uncertainty
-    P[at], P[:, at] = 0.0, 0.0
-    P[at, at] = start**2 + x.lacking[row] ** 2
-
-
-@njit(cache=True)
-def _listen_to_feet(
-    x: Record,
-    last: Record,
-    then: Record,
-    measured: Record,
-    learning: np.ndarray,
-    T: float,
-    known: Record,
-) -> None:
-    """Kalman updates with flat feet that stand: they do not turn about their normals."""
-    P, r, load = x.covariance, len(x.velocity), 0.0
-    for foot in range(len(known.is_flat)):
-        load += max(0.0, x.wrench[foot, 5])
-    for foot in range(len(known.is_flat)):
-        share = x.wrench[foot, 5] / max(load, 1.0)
-        if not known.is_flat[foot] or not measured.support[foot] > 0 or share < _LEAST_LOAD:
-            continue
-        # Where the tick ends, of which the model knows where it began.
-        row = then.lever[foot, 2:3]
-        columns = row @ P[:r]
-        innovation = -(row @ x.velocity) - T * then.turning[foot]
-        believed = (known.config.foot_turning * max(1.0, _FIRM_LOAD / share)) ** 2
-        S = columns[0, :r] @ row[0] + last.foot_noise[foot] * believed
-        surprise = innovation[0] ** 2 / S
-        x.foot_noise[foot] = learned_noise(last.foot_noise[foot], surprise, LOG_OF_ONE, T)
-        # A foot that turns is no measurement.
-        if surprise < _GATE**2:
-            _correct(x, columns, columns / S, innovation, learning)
-
-
-@njit(cache=True)
-def _watch_corrections(
-    x: Record,
-    last: Record,
-    A: np.ndarray,
-    correction: np.ndarray,
-    covariance: np.ndarray,
-    T: float,
-) -> None:
-    """Learns what is lacking from corrections of the velocities that agree from tick to tick.
-
-    As torques they show the row in which it is. A good filter's corrections are white.
-
-    Args:
-        A: inertia (r, r).
-        correction: of the velocities, had no innovation been too large to count, (r,).
-        covariance: of the velocities before they were corrected, (r, r).
-    """
-    P, r = x.covariance, len(x.velocity)
-    keep = math.exp(-T / AGREEMENT_TIME)
-    torque = A @ correction / T
-    halfway = A @ (covariance - P[:r, :r])
-    for i in range(r):
-        variance = max(0.0, halfway[i] @ A[i]) / (T * T)
-        x.correction[i], x.correction_variance[i] = torque[i], variance
-        x.unexplained[i] = keep * last.unexplained[i] + (1.0 - keep) * torque[i]
-        of_last = last.unexplained_variance[i]
-        x.unexplained_variance[i] = keep**2 * of_last + (1.0 - keep) ** 2 * variance
-        excess = x.unexplained[i] ** 2 - _NOTICED**2 * x.unexplained_variance[i]
-        if excess > 0.0:
-            P[r + i, r + i] += (1.0 - keep) * excess
-        twice = _confirmed(torque[i], last.correction[i]) ** 2
-        if twice > _GATE**2 * variance:
-            P[r + i, r + i] += twice
-
-
-@njit(cache=True)
-def _make_dissipative(x: Record) -> None:
-    """Projects laws whose friction pushes a joint, beyond their doubt, on those where it is zero.
-
-    At the velocity that they are linearised at, as an estimate is projected on a constraint (D.
-    Simon, "Kalman filtering with state constraints: a survey of linear and nonlinear algorithms",
-    IET Control Theory & Applications 4, 2010). Where a joint moves little, noise would teach laws
-    that fall at rest or are much too steep there. What is within the doubt stays: of a joint
-    without friction only one side would be taken away, tick by tick.
-    """
-    n, m = x.weights.shape
-    for joint in range(n):
-        row, first = x.regressor[joint], len(x.covariance) + m * (joint - n)
-        torque = row @ x.weights[joint]
-        if torque * x.law_velocity[joint] < 0.0:
-            column = np.ascontiguousarray(x.covariance[first : first + m, first : first + m]) @ row
-            variance = row @ column
-            if torque**2 > variance:
-                x.weights[joint] -= column * (torque / variance)
-
-
-@njit(cache=True)
-def _forget_laws(x: Record, known: Record) -> None:
-    """The laws are those of the start."""
-    P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
-    x.weights[:], x.settled[:] = known.weights, known.weights
-    P[of_laws:] = 0.0
-    P[:, of_laws:] = 0.0
-    for joint in range(n):
-        for k in range(m):
-            at = of_laws + m * joint + k
-            P[at, at] = known.weight_variance[k]
 
 
 @njit(cache=True)
@@ -674,7 +319,7 @@ def _forget_motion(x: Record, known: Record) -> None:
     P[:, :r] = 0.0
     for i in range(r):
         P[i, i] = x.noise[i] * known.variance[i]
-        _forget_lacking(x, i, known)
+        forget_lacking(x, i, known)
     x.velocity[:], x.lacking[:], x.innovation[:] = x.reading, 0.0, 0.0
     x.unexplained[:], x.correction[:] = 0.0, 0.0
 
@@ -702,14 +347,14 @@ def _finish(
     x, last, measured, known = posterior[()], last[()], measured[()], known[()]
     tick, past, velocity_now = tick[()], past[()], measured.joint_velocity
     if tick.duration > 0.0:
-        _linearise(x, tick.velocity, law, shaped)
+        linearise(x, tick.velocity, law, shaped)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
-        _make_dissipative(x)
+        make_dissipative(x)
     if x.late == 0.0:
         velocity_now, law_now = tick.velocity, law
-    _linearise(x, velocity_now, law_now, shaped)
+    linearise(x, velocity_now, law_now, shaped)
     P, (n, m) = x.covariance, x.weights.shape
-    r, keep = 3 + n, math.exp(-elapsed / _DOUBT_TIME) if elapsed > 0.0 else 1.0
+    r, keep = 3 + n, math.exp(-elapsed / DOUBT_TIME) if elapsed > 0.0 else 1.0
     brief = math.exp(-elapsed / AGREEMENT_TIME) if elapsed > 0.0 else 1.0
     for joint in range(n):
         of_velocity, of_lacking, first = 3 + joint, r + 3 + joint, 2 * r + m * joint
@@ -720,7 +365,7 @@ def _finish(
             # Nobody knows more of the velocity now than is measured.
             of_error, slope = x.noise[of_velocity] * known.variance[of_velocity], 0.0
         friction += slope * (x.velocity[of_velocity] - velocity_now[joint])
-        moves = x.velocity[of_velocity] ** 2 > _NOTICED**2 * P[of_velocity, of_velocity]
+        moves = x.velocity[of_velocity] ** 2 > NOTICED**2 * P[of_velocity, of_velocity]
         x.rested[joint] = 0.0 if moves else last.rested[joint] + tick.duration
         # The law's slope changes within the velocity's doubt.
         x.steepest[joint] = max(x.slope[joint], brief * last.steepest[joint])
@@ -742,8 +387,8 @@ def _finish(
             x.residual[joint] = friction
         # What the law does not explain, or learned just now, is not confirmed yet; and nobody
         # knows which of model and measurement is wrong that contradict each other.
-        contradicted = abs(x.unexplained[of_velocity]) if _is_contradicted(x, of_velocity) else 0.0
-        if x.correction[of_velocity] ** 2 > _GATE**2 * x.correction_variance[of_velocity]:
+        contradicted = abs(x.unexplained[of_velocity]) if is_contradicted(x, of_velocity) else 0.0
+        if x.correction[of_velocity] ** 2 > GATE**2 * x.correction_variance[of_velocity]:
             contradicted = max(contradicted, abs(x.correction[of_velocity]))
         doubt = max(abs(lacking) + abs(unsettled), contradicted)
         x.doubt[joint] = max(doubt, keep * last.doubt[joint])

@@ -1,0 +1,77 @@
+"""Which friction laws are learned from a tick, and what they may not be."""
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.records import Record
+from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, NOTICED, is_contradicted
+
+# A law is known when it is so many times surer than at the start.
+_LEARNED = 10.0
+
+
+@njit(cache=True)
+def learning_states(last: Record, known: Record) -> np.ndarray:
+    """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
+
+    A joint whose velocity has not been known from zero for some time says nothing of its law:
+    coefficient and velocity, known by their product alone, would drift apart. Of what contradicts a
+    law that is known by now nobody knows whether it is the law or what it is learned from. So it is
+    where torque keeps being lacking in the joint's row, and where innovations are no noise.
+    """
+    learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
+    for joint in range(n):
+        row = 3 + joint
+        rests = last.rested[joint] > DOUBT_TIME
+        no_noise = last.agreement[row] > NOTICED**2
+        contradicted = is_contradicted(last, row) or no_noise
+        if rests or (contradicted and _is_learned(last, joint, known)):
+            learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
+    return learning
+
+
+@njit(cache=True)
+def _is_learned(x: Record, joint: int, known: Record) -> bool:
+    """Is a joint's law, where it is asked, known _LEARNED times as well as at the start?"""
+    n, m = x.weights.shape
+    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
+    for j in range(m):
+        start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
+        for k in range(m):
+            both = x.regressor[joint, j] * x.regressor[joint, k]
+            now += both * x.covariance[first + j, first + k]
+    return now * _LEARNED**2 < start
+
+
+@njit(cache=True)
+def make_dissipative(x: Record) -> None:
+    """Projects laws whose friction pushes a joint, beyond their doubt, on those where it is zero.
+
+    At the velocity that they are linearised at, as an estimate is projected on a constraint (D.
+    Simon, "Kalman filtering with state constraints: a survey of linear and nonlinear algorithms",
+    IET Control Theory & Applications 4, 2010). Where a joint moves little, noise would teach laws
+    that fall at rest or are much too steep there. What is within the doubt stays: of a joint
+    without friction only one side would be taken away, tick by tick.
+    """
+    n, m = x.weights.shape
+    for joint in range(n):
+        row, first = x.regressor[joint], len(x.covariance) + m * (joint - n)
+        torque = row @ x.weights[joint]
+        if torque * x.law_velocity[joint] < 0.0:
+            column = np.ascontiguousarray(x.covariance[first : first + m, first : first + m]) @ row
+            variance = row @ column
+            if torque**2 > variance:
+                x.weights[joint] -= column * (torque / variance)
+
+
+@njit(cache=True)
+def forget_laws(x: Record, known: Record) -> None:
+    """The laws are those of the start."""
+    P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
+    x.weights[:], x.settled[:] = known.weights, known.weights
+    P[of_laws:] = 0.0
+    P[:, of_laws:] = 0.0
+    for joint in range(n):
+        for k in range(m):
+            at = of_laws + m * joint + k
+            P[at, at] = known.weight_variance[k]
