@@ -54,7 +54,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.estimators.fbse import Fbse
-from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Table

@@ -154,8 +154,8 @@ from .estimators.fbse import Fbse as Fbse
 from .estimators.filtered_model import FilteredModel as FilteredModel
 from .estimators.fixed_friction import FixedFriction as FixedFriction
 from .estimators.floating_base import ImuMount as ImuMount
-from .estimators.friction import ModelAided as ModelAided
-from .estimators.friction import ModelAidedEstimator as ModelAidedEstimator
+from .estimators.model_aided import ModelAided as ModelAided
+from .estimators.model_aided import ModelAidedEstimator as ModelAidedEstimator
 from .estimators.fuzzy import FuzzyFriction as FuzzyFriction
 from .estimators.lugre import LuGreFriction as LuGreFriction
 from .estimators.network_friction import NetworkFriction as NetworkFriction

@@ -16,8 +16,8 @@ from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilt
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.fbse import Fbse
-from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.innovations import LEAST_HABIT, LOG_OF_ONE, SMALLEST_SHARE
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import as_record
 from fbse_drake.estimators.recursive import Status
 from fbse_drake.estimators.standing_foot import _AT_REST, _HABIT_TIME, _WALKING_SPEED

@@ -12,7 +12,7 @@ from fbse_drake.estimation import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import NoEstimator, make_estimator
 from fbse_drake.estimators.fbse import Fbse
-from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.robot.plant import make_robot
 from fbse_drake.sensors.encoders import differentiate

@@ -17,7 +17,7 @@ from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.fixed_friction import FixedFriction
-from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.recursive import RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 

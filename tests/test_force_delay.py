@@ -18,8 +18,8 @@ from fbse_drake.estimators.force_delay import (
     tick_of,
     watch_force_delay,
 )
-from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import record_type, ring_type
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.estimators.spatial import vector

@@ -17,19 +17,17 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.friction import (
-    FrictionRegressor,
-    ModelAided,
-    RecursiveLeastSquares,
-    recursive_least_squares,
-    smooth_velocity,
-    smoothing_time,
-)
+from fbse_drake.estimators.friction_regressor import FrictionRegressor
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.model_aided import ModelAided, smooth_velocity, smoothing_time
+from fbse_drake.estimators.recursive_least_squares import (
+    RecursiveLeastSquares,
+    recursive_least_squares,
+)
 
 GRAVITY = 9.81
 BASE = Base.of()

@@ -19,7 +19,6 @@ from fbse_drake.estimators.base_state import ContactAided
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.friction import ModelAided
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -27,6 +26,7 @@ from fbse_drake.estimators.joint_acceleration import (
     minimum_norm,
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.support import PlannedSupport
 from fbse_drake.scenario import RobotConfig
 

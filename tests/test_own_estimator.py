@@ -23,17 +23,16 @@ from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver, MomentumObserver
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import FloatingBaseModel
-from fbse_drake.estimators.friction import (
-    ModelAided,
-    ModelAidedEstimator,
-    RecursiveLeastSquares,
-    RecursiveLeastSquaresEstimator,
-)
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.model_aided import ModelAided, ModelAidedEstimator
+from fbse_drake.estimators.recursive_least_squares import (
+    RecursiveLeastSquares,
+    RecursiveLeastSquaresEstimator,
+)
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
 from fbse_drake.estimators.true_friction import TrueFrictionSource

@@ -19,7 +19,7 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.equation_of_motion import touching
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.friction import ModelAided
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import record
 from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.report.metrics import friction_error, joint_sides, stance

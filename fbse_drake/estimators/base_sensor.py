@@ -20,9 +20,10 @@ from pydrake.systems.framework import Context, ValueProducer
 from fbse_drake.errors import InputError, require_positive
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
-from fbse_drake.estimators.friction import FrictionConfig, ModelAided
+from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
+from fbse_drake.estimators.recursive_least_squares import RecursiveLeastSquares
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
@@ -41,7 +42,7 @@ class BaseSensor(Estimator):
     measures: ClassVar[str] = "wrench under a fixed base"
 
     # !ModelAided or the paper's !RecursiveLeastSquares.
-    friction: FrictionConfig = field(default_factory=ModelAided)
+    friction: RecursiveLeastSquares | ModelAided = field(default_factory=ModelAided)
     # Noise of the sensor as it is believed, standard deviation of force [N] and moment [Nm].
     force_noise: float = 0.5
     moment_noise: float = 0.05

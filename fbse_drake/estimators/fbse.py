@@ -14,12 +14,13 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.floating_base import FloatingBaseModel
-from fbse_drake.estimators.friction import FrictionConfig, ModelAided, RecursiveLeastSquares
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
+from fbse_drake.estimators.model_aided import ModelAided
+from fbse_drake.estimators.recursive_least_squares import RecursiveLeastSquares
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport, PlannedSupport, SupportConfig
 from fbse_drake.estimators.whole_body import WholeBody
@@ -51,7 +52,7 @@ class Fbse(Estimator):
     support: SupportConfig = field(default_factory=MeasuredSupport)
     joint_acceleration: JointAccelerationConfig = field(default_factory=JointAccelerationConfig)
     # !WholeBody, !ModelAided or the paper's !RecursiveLeastSquares.
-    friction: FrictionConfig | WholeBody = field(default_factory=WholeBody)
+    friction: RecursiveLeastSquares | ModelAided | WholeBody = field(default_factory=WholeBody)
 
     @staticmethod
     def paper() -> "Fbse":

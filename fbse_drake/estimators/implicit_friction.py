@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from fbse_drake.estimators.friction import put_regressor
+from fbse_drake.estimators.friction_regressor import put_regressor
 from fbse_drake.estimators.records import Record
 
 

@@ -24,7 +24,7 @@ from fbse_drake.estimators.equation_of_motion import (
 )
 from fbse_drake.estimators.floating_base import ImuMount, model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
-from fbse_drake.estimators.friction import FrictionRegressor
+from fbse_drake.estimators.friction_regressor import FrictionRegressor
 from fbse_drake.estimators.implicit_friction import (
     implicit_step,
     impulse_covariance,

@@ -9,7 +9,8 @@ from pydrake.common.yaml import yaml_load
 from fbse_drake import schema
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.fbse import Fbse
-from fbse_drake.estimators.friction import FrictionConfig
+from fbse_drake.estimators.model_aided import ModelAided
+from fbse_drake.estimators.recursive_least_squares import RecursiveLeastSquares
 from fbse_drake.estimators.whole_body import WholeBody
 from fbse_drake.log import Log
 from fbse_drake.report.figures.kind import figure_kind
@@ -322,7 +323,7 @@ def _meanings(log: Log) -> str:
     return "".join(meanings)
 
 
-def _friction_config(log: Log) -> FrictionConfig | WholeBody | None:
+def _friction_config(log: Log) -> RecursiveLeastSquares | ModelAided | WholeBody | None:
     """How the log's friction was estimated, by the scenario that it holds; None where that does not
     tell."""
     text = log.meta.get("estimator_scenario", log.meta.get("scenario"))
