@@ -23,20 +23,28 @@ SAMPLES = 1500
 
 
 @cache
-def pendulum(period: float, steps: int, damping: float = DAMPING) -> dict[str, np.ndarray]:
+def pendulum(
+    period: float,
+    steps: int,
+    damping: float = DAMPING,
+    samples: int = SAMPLES,
+    trembling: float = 0.0,
+) -> dict[str, np.ndarray]:
     """A damped pendulum under torques that are held over a period.
 
     Args:
         steps: of semi-implicit Euler in a period, with implicit damping; 0 for the exact motion.
+        trembling: standard deviation of the torques' white part [Nm].
     """
-    time = np.arange(SAMPLES) * period
+    time = np.arange(samples) * period
     torque = 0.35 * np.sin(9 * time) + 0.2 * np.sin(23 * time + 1)
-    state = np.zeros((SAMPLES, 2))
+    torque += trembling * np.random.default_rng(1).standard_normal(samples)
+    state = np.zeros((samples, 2))
 
     def exact(_time: float, x: np.ndarray, held: float) -> list[float]:
         return [x[1], (held - WEIGHT * np.sin(x[0]) - damping * x[1]) / INERTIA]
 
-    for k in range(SAMPLES - 1):
+    for k in range(samples - 1):
         if steps == 0:
             solution = solve_ivp(exact, (0, period), state[k], "DOP853", args=(torque[k],))
             state[k + 1] = solution.y[:, -1]
@@ -106,6 +114,32 @@ def test_nothing_is_left_of_a_log_that_is_rarer_than_the_control(steps: int) -> 
     assert left(command_time=control) < 1.5 * curvature
     held = 0.4 * np.sqrt((np.diff(torque, axis=0) ** 2).mean())
     assert left() == pytest.approx(held, rel=0.1)
+
+
+def test_what_commands_do_between_rows_is_noise_of_known_size() -> None:
+    """A controller that answers the noise of its sensors trembles in every period."""
+    control, every, trembling, noise = 1e-3, 4, 0.05, 2e-2
+    channels = pendulum(control, 1, damping=0.0, samples=16_000, trembling=trembling)
+    rare, period = {name: values[::every] for name, values in channels.items()}, control * every
+    velocity = rare["joint/velocity"]
+    rare["joint/velocity"] = velocity + noise * np.random.default_rng(2).normal(size=velocity.shape)
+    log = log_of(rare, period)
+    believed = scenario(period, velocity_noise=noise)
+    recording = RecordingConfig(block=2 * period)
+    believed = replace(believed, model=RobotConfig("pendulum"), recording=recording)
+
+    def predictor(**said: float) -> Predictor:
+        return Predictor(believed, replace(log, meta=log.meta | said))
+
+    told = predictor(command_time=control)
+    assert told.noise.white[0] == pytest.approx((1 - 1 / every) * trembling**2, rel=0.15)
+    assert told.noise.factor[0] == 1.0
+    white = WhitenedResidual(told.residual)
+    assert np.sqrt(white.sse / white.count) == pytest.approx(1.0, abs=0.1)
+    # What is slow in it would be taken for something that is missing.
+    unseen = Predictor(believed, told.log, replace(told.noise, white=np.zeros(1)))
+    white = WhitenedResidual(unseen.residual)
+    assert np.sqrt(white.sse / white.count) > 10
 
 
 @pytest.mark.parametrize("steps", [0, 1])

@@ -44,6 +44,14 @@ def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
     ]
 
 
+def test_a_signature_that_shows_in_no_row_is_whitened_like_others() -> None:
+    white = white_of(np.ones((20, 2)))
+    nowhere = Signature(np.array([], dtype=int), np.zeros((20, 0, 3)), np.zeros((20, 0)))
+    whitened = white.whiten_signature(nowhere)
+    assert whitened.values.shape == (20, 0, 3)
+    assert whitened.offset.shape == (20, 0)
+
+
 def plain_least_squares(
     white: WhitenedResidual, signatures: Sequence[Signature], held_out: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -166,9 +166,10 @@ class WhitenedResidual:
             values[k] = self.whiten(row, signature.values[:, k])
         offset = signature.offset
         if isinstance(offset, np.ndarray):
-            offset = np.stack(
-                [self.whiten(row, offset[:, k]) for k, row in enumerate(signature.rows)], axis=1
-            )
+            whitened = np.empty_like(offset)
+            for k, row in enumerate(signature.rows):
+                whitened[:, k] = self.whiten(row, offset[:, k])
+            offset = whitened
         # The columns of a row stand together in memory: it is row by row that they meet the data.
         return replace(signature, values=np.moveaxis(values, 0, 1), offset=offset)
 

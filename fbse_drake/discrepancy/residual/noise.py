@@ -171,8 +171,11 @@ def measured_noise(
         channels: that are noisier than the scenario believes; the residual's noise is theirs.
     """
     length, rows = motion.length, residual.value.shape[1]
+    missed = np.zeros(rows)
+    missed[: len(motion.robot.joint_names)] = missed_torque(motion)
     believed = np.maximum(
-        residual.variance - 2 * _ORDER / (_ORDER + 1) * residual.covariance, _ROUNDING
+        residual.variance + missed / length - 2 * _ORDER / (_ORDER + 1) * residual.covariance,
+        _ROUNDING,
     )
     power = noise_power(residual.value, residual.known, believed)
     least = chi2.isf(_FALSE_ALARM / rows, power.freedom) / power.freedom
@@ -181,7 +184,7 @@ def measured_noise(
     noisy = (power.ratio > np.maximum(least, _LEAST**2)) & ~turned
     typical = np.nan_to_num(rms(np.sqrt(believed), residual.known)) ** 2
     ratio = np.where(noisy, power.ratio, 1.0)
-    white = (ratio - 1) * typical * length
+    white = missed + (ratio - 1) * typical * length
 
     torque = motion.torque_variance(motion.blocks.torque_command)
     n = torque.shape[1]
@@ -192,8 +195,25 @@ def measured_noise(
         for row in np.flatnonzero(~noisy[:n]):
             more = 1 + share * torque[row] / length / typical[row]
             if np.log(more / power.ratio[row]) < 2 * np.sqrt(2 / power.freedom[row]):
-                white[row], ratio[row] = share * torque[row], more
+                white[row], ratio[row] = missed[row] + share * torque[row], more
     return Noise(channels, white, np.sqrt(ratio))
+
+
+def missed_torque(motion: RecordedMotion) -> np.ndarray:
+    """Variance of what the commands of each joint do between rows that are rarer than they are
+    given, (n,) [Nm^2].
+
+    A controller answers the noise of its sensors in every period: commands have a white part, of
+    which such a log has samples. Of a mean over N of them, of which the ends are known, the white
+    part of all others is missing, which over many steps leaves 1 - 1/N of its variance.
+    """
+    timing, torque = motion.timing, motion.signals.torque_command
+    unseen = 1.0 - timing.command / timing.period if timing.command > 0 else 0.0
+    if unseen == 0.0:
+        return np.zeros(torque.shape[1])
+    known = np.repeat(motion.measured[:, None], torque.shape[1], axis=1)
+    white = np.nan_to_num(noise_power(torque, known, np.ones(torque.shape)).ratio)
+    return unseen * np.maximum(white - motion.torque_variance(torque).mean(axis=0), 0.0)
 
 
 def noise_finding(motion: RecordedMotion, noise: Noise) -> HygieneFinding | None:
