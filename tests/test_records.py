@@ -1,6 +1,10 @@
 """Posteriors as records: in the vectors that Drake keeps, on ports, and in two contexts at once."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,3 +125,39 @@ def test_the_models_plant_belongs_to_its_context():
     np.testing.assert_array_equal(port.Eval(clone.context), port.Eval(upright.context))
     bent.context.SetTime(1.0)
     np.testing.assert_array_equal(port.Eval(bent.context), before)
+
+
+def test_what_processes_compile_for_other_records_is_not_mistaken_for_each_other(
+    tmp_path: Path,
+) -> None:
+    """The function within is too long to become part of what calls it, and has a name."""
+    (tmp_path / "compiled.py").write_text(
+        """
+import numpy as np
+from numba import njit
+from fbse_drake.estimators.records import record
+
+@njit(cache=True)
+def within(values):
+    x = values[()]
+    return np.linalg.inv(np.diag(np.sort(x.before) + 1.0)).sum() * x.last
+
+@njit(cache=True)
+def last(values):
+    return within(values) / len(values[()].before)
+
+def lasts(*sizes):
+    print([last(record(before=np.zeros(n), last=float(n))) for n in sizes])
+"""
+    )
+
+    def lasts(*sizes: int) -> str:
+        script = f"import compiled; compiled.lasts{sizes}"
+        path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
+        places = {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        command = [sys.executable, "-c", script]
+        return subprocess.check_output(command, env={**os.environ, **places}, text=True)
+
+    assert lasts(1) == "[1.0]\n"
+    assert lasts(4) == "[4.0]\n"
+    assert lasts(1, 4) == "[1.0, 4.0]\n"

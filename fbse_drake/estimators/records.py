@@ -8,12 +8,27 @@ called with the record itself, but numba needs ten times as long to unpack one.)
 
 from dataclasses import is_dataclass
 from functools import cache
+from hashlib import sha256
 from typing import Any, TypeAlias
 
 import numpy as np
+from numba import types
 
 # A record in a compiled function, whose fields are its attributes.
 Record: TypeAlias = Any
+
+
+def _layout(record: types.Record) -> tuple[str, tuple[str, ...]]:
+    """What tells a record from others in the names of functions that are compiled for it.
+
+    numba takes a number that counts the types of a process. Two processes then may give one name to
+    what each compiles for another robot, and whoever loads both from the cache calls the one for
+    the other, with a record in which everything is elsewhere.
+    """
+    return "Record", (sha256(record.name.encode()).hexdigest(),)
+
+
+types.Record.mangling_args = property(_layout)  # type: ignore[assignment, method-assign]
 
 
 def record_type(**fields: tuple[int, ...] | np.dtype) -> np.dtype:
