@@ -30,13 +30,19 @@ class ThisInterpretersKernel(KernelManager):
 
 @pytest.fixture(scope="module")
 def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
-    """One kernel for all, for it takes seconds to import what a notebook needs; with an empty
-    folder instead of the user's own IPython settings."""
-    settings = str(tmp_path_factory.mktemp("ipython"))
+    """One kernel for all, for it takes seconds to import what a notebook needs; with settings of
+    its own instead of the user's."""
+    settings = tmp_path_factory.mktemp("ipython")
+    profile = settings / "profile_default"
+    profile.mkdir()
+    # To find the margins of a picture it is drawn twice.
+    (profile / "ipython_kernel_config.py").write_text(
+        'get_config().InlineBackend.print_figure_kwargs = {"bbox_inches": None}'
+    )
     manager = ThisInterpretersKernel()
     manager.start_kernel(
         extra_arguments=["--HistoryManager.hist_file=:memory:"],
-        env={**os.environ, "MPLBACKEND": "Agg", "IPYTHONDIR": settings},
+        env={**os.environ, "MPLBACKEND": "Agg", "IPYTHONDIR": str(settings)},
     )
     yield manager
     manager.shutdown_kernel(now=True)
@@ -46,11 +52,15 @@ def run(notebook: nbformat.NotebookNode, folder: Path, kernel: KernelManager) ->
     """Runs all cells in `folder`, without what ran in the kernel before; fails with the error of
     the first cell that raises."""
     forget = nbformat.v4.new_code_cell(f"%reset_selective -f ^[^_]\n%cd -q {folder}")
-    try:
-        NotebookClient(nbformat.v4.new_notebook(cells=[forget]), km=kernel).execute()
-        NotebookClient(notebook, km=kernel, timeout=1200).execute()
-    except CellExecutionError as error:
-        pytest.fail(str(error), pytrace=False)
+    for cells in (nbformat.v4.new_notebook(cells=[forget]), notebook):
+        client = NotebookClient(cells, km=kernel, timeout=1200)
+        try:
+            client.execute()
+        except CellExecutionError as error:
+            pytest.fail(str(error), pytrace=False)
+        finally:
+            # Else a thread of it listens for the kernel's heart as long as this process lives.
+            client.kc.stop_channels()
 
 
 def shortened(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:

@@ -35,7 +35,7 @@ def test_standing_feet_carry_the_weight(run: Run):
 
 
 def test_zmp_of_slow_sway_is_the_planned_one(run: Run):
-    log = run("sway", "duration=5", noise=False)
+    log = run("sway", "duration=3.5", noise=False)
     assert np.abs(log["truth/zmp"] - log["reference/zmp"])[200:].max() < 0.01
     assert np.ptp(log["truth/zmp"][:, 1]) > 0.08
 
@@ -82,7 +82,7 @@ def test_pad_forces_are_the_contact_forces():
 
 
 def test_position_loop_has_little_to_do_in_a_slow_frictionless_squat(run: Run):
-    changes = ("duration=5", "reference.frequency=0.15", "robot.effects.joint_friction=null")
+    changes = ("duration=4", "reference.frequency=0.15", "robot.effects.joint_friction=null")
     log = run("squat", *changes, noise=False)
     assert np.all(log["truth/joint/friction_torque"] == 0)
     feedforward = log["reference/joint/feedforward_torque"]
@@ -230,7 +230,12 @@ def test_friction_does_not_ring(run: Run, name: str):
 
 @pytest.mark.parametrize(
     ("name", "duration", "share"),
-    [("squat", 2, 0.97), ("sway", 2, 0.97), ("paper_walk", 3, 0.9), ("hrp2_friction_walk", 2, 0.9)],
+    [
+        ("squat", 1, 0.97),
+        ("sway", 1, 0.97),
+        ("paper_walk", 3, 0.9),
+        ("hrp2_friction_walk", 1.5, 0.9),
+    ],
 )
 def test_closure_with_exactly_solved_contact(run: Run, name: str, duration: float, share: float):
     """Drake's `sap` contact is linear as long as pads keep standing or sliding, and joints between

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from fbse_drake import Log
 from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.estimation import Replay
 from fbse_drake.estimators.base_filter import InvariantBaseFilter, InvariantFilter
 from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.equation_of_motion import touching
@@ -265,6 +266,28 @@ def healthy(run: Run) -> Log:
     return run("paper_walk_fbse", "duration=3")
 
 
+# In the swing of the second step something fails.
+FAILS = 1500
+
+
+@pytest.fixture(scope="module")
+def estimated_with_fault(run: Run, healthy: Log) -> Callable[[Log], Log]:
+    """Estimates of the healthy walk that is spoilt when something fails: until then the same."""
+    before = Replay(WALK, run("paper_walk_fbse", "duration=3").part(slice(0, FAILS)))
+    before.run()
+
+    def estimated(spoilt: Log) -> Log:
+        replay = Replay(WALK, spoilt.part(slice(FAILS, None)))
+        replay.context.SetTimeStateAndParametersFrom(before.context)
+        channels = {
+            name: np.concatenate([healthy[name][:FAILS], values])
+            for name, values in replay.run()[0].items()
+        }
+        return dataclasses.replace(spoilt, channels={**spoilt.channels, **channels})
+
+    return estimated
+
+
 @pytest.mark.parametrize("changes", [(), ("ground.stiffness=1.0e5",), ("seed=3",)])
 def test_friction_in_swing_is_not_the_noise_of_the_encoders(run: Run, changes: tuple[str, ...]):
     """Measured over the filter joint by joint: the hip yaws at a quarter to a half, in stance at
@@ -352,13 +375,15 @@ def test_laws_that_were_learned_with_forces_of_another_time_are_forgotten(run: R
     assert np.abs(friction_error(log)[1000:]).max() < 1.0
 
 
-def test_a_sensor_that_fails_leaves_friction_to_its_law(run: Run, healthy: Log):
+def test_a_sensor_that_fails_leaves_friction_to_its_law(
+    run: Run, estimated_with_fault: Callable[[Log], Log], healthy: Log
+):
     log = run("paper_walk_fbse", "duration=3")
-    rows = slice(1500, 1700)
+    rows = slice(FAILS, FAILS + 200)
     force = log["foot/right/pad_force"].copy()
     force[rows] = 0.0
     broken = dataclasses.replace(log, channels={**log.channels, "foot/right/pad_force": force})
-    result = estimated(broken, WALK, Fbse())
+    result = estimated_with_fault(broken)
     friction = result["estimate/joint/friction_torque"]
     assert np.all(np.isfinite(friction))
     assert coverage(result) > 0.97
@@ -381,15 +406,15 @@ def changed(log: Log, name: str, rows: slice, values: np.ndarray | float) -> Log
 
 @pytest.mark.parametrize("joint", ["right_knee_pitch", "left_ankle_roll"])
 def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
-    run: Run, healthy: Log, joint: str
+    run: Run, estimated_with_fault: Callable[[Log], Log], healthy: Log, joint: str
 ):
     """A command that is larger than the torque by a constant looks like so much more friction."""
     log = run("paper_walk_fbse", "duration=3")
-    number, rows, offset = log.joints.index(joint), slice(1500, 2000), 8.0
+    number, rows, offset = log.joints.index(joint), slice(FAILS, FAILS + 500), 8.0
     command = log["joint/torque_command"][rows].copy()
     command[:, number] += offset
     wrong = changed(log, "joint/torque_command", rows, command)
-    result = estimated(wrong, WALK, Fbse())
+    result = estimated_with_fault(wrong)
     friction, std = (
         np.stack([of[f"estimate/joint/{name}"] for of in (result, healthy)])
         for name in ("friction_torque", "friction_torque_std")
@@ -413,16 +438,18 @@ def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
     assert np.all(as_before[rows.stop + 300 :])
 
 
-def test_laws_outlast_a_delay_of_the_forces_that_begins_later(run: Run):
+def test_laws_outlast_a_delay_of_the_forces_that_begins_later(
+    run: Run, estimated_with_fault: Callable[[Log], Log]
+):
     log = run("paper_walk_fbse", "duration=3")
     late = log
     for side in log.sides:
         name = f"foot/{side}/pad_force"
-        late = changed(late, name, slice(1500, None), log[name][1495:-5])
-    result = estimated(late, WALK, Fbse())
+        late = changed(late, name, slice(FAILS, None), log[name][FAILS - 5 : -5])
+    result = estimated_with_fault(late)
     assert coverage(result) > 0.97
     variance = result["estimate/friction/parameter_variance"]
-    assert np.all(variance[-1] < 1.5 * variance[1500])
+    assert np.all(variance[-1] < 1.5 * variance[FAILS])
 
 
 def test_it_tells_what_the_stages_tell_that_it_stands_for(run: Run, healthy: Log):
@@ -466,10 +493,14 @@ def late_by_5_ms(force: np.ndarray) -> np.ndarray:
     ],
 )
 def test_a_fault_is_in_the_deviation_and_leaves_nothing_behind(
-    run: Run, healthy: Log, channel: str, fault: Callable[[np.ndarray], np.ndarray]
+    run: Run,
+    estimated_with_fault: Callable[[Log], Log],
+    healthy: Log,
+    channel: str,
+    fault: Callable[[np.ndarray], np.ndarray],
 ):
-    log, rows = run("paper_walk_fbse", "duration=3"), slice(1500, 2000)
-    result = estimated(changed(log, channel, rows, fault(log[channel][rows])), WALK, Fbse())
+    log, rows = run("paper_walk_fbse", "duration=3"), slice(FAILS, FAILS + 500)
+    result = estimated_with_fault(changed(log, channel, rows, fault(log[channel][rows])))
     friction, std = (
         np.stack([of[f"estimate/joint/{name}"] for of in (result, healthy)])
         for name in ("friction_torque", "friction_torque_std")
@@ -480,13 +511,15 @@ def test_a_fault_is_in_the_deviation_and_leaves_nothing_behind(
     assert np.all(moved[rows.stop + 500 :] < 3 * std[1, rows.stop + 500 :])
 
 
-def test_noise_of_the_accelerometer_is_learned(run: Run, healthy: Log):
+def test_noise_of_the_accelerometer_is_learned(
+    run: Run, estimated_with_fault: Callable[[Log], Log], healthy: Log
+):
     """Believed to be ten times smaller, it moves a yaw that sticks by more than is stated."""
-    log, rows = run("paper_walk_fbse", "duration=3"), slice(1500, 2500)
+    log, rows = run("paper_walk_fbse", "duration=3"), slice(FAILS, FAILS + 1000)
     noise = np.random.default_rng(3).normal(size=(1000, 3))
     acceleration = log["imu/linear_acceleration"][rows]
     acceleration = acceleration + 10 * USUAL_SENSORS.acceleration_noise * noise
-    result = estimated(changed(log, "imu/linear_acceleration", rows, acceleration), WALK, Fbse())
+    result = estimated_with_fault(changed(log, "imu/linear_acceleration", rows, acceleration))
     friction, std = (
         np.stack([of[f"estimate/joint/{name}"][rows] for of in (result, healthy)])
         for name in ("friction_torque", "friction_torque_std")

@@ -125,7 +125,10 @@ class SensorEffect(Effect):
             read = cls.reading(signals, memory, values, robot)
             signals = SensorSignals(
                 **{
-                    name: signal + getattr(measured, name) - getattr(read, name)
+                    # What it does not distort is what was measured.
+                    name: getattr(measured, name)
+                    if getattr(read, name) is signal
+                    else signal + getattr(measured, name) - getattr(read, name)
                     for name, signal in vars(signals).items()
                 }
             )
