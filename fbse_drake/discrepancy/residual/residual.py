@@ -265,7 +265,7 @@ class Instants:
 
 @dataclass(frozen=True)
 class Timing:
-    """When that holds what a row of a log tells, see `RecordingConfig.rows`; all in [s]."""
+    """When what a row of a log tells is so, see `RecordingConfig.rows`; all in [s]."""
 
     # From one row to the next.
     period: float
