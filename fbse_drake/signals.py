@@ -166,6 +166,9 @@ _TABLE: list[Signal] = [
     estimated("joint/friction_torque_std", "friction", "friction_std", "Nm", ("n",)),
     # 1 where an actuator is called faulty.
     estimated("joint/fault", "friction", "fault", "1", ("n",)),
+    # Reflected inertia that the model lacks.
+    estimated("joint/missing_inertia", "friction", "missing_inertia", "kg m^2", ("n",)),
+    estimated("joint/missing_inertia_std", "friction", "missing_inertia_std", "kg m^2", ("n",)),
     _own("friction", "parameters", shape=("n", "m")),
     _own("friction", "parameter_variance", shape=("n", "m")),
     _own("friction", "innovation"),

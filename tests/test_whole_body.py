@@ -102,7 +102,7 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
     Pads that show nothing but noise have no force; the foot that stands does not turn.
     """
     generator, T, n = np.random.default_rng(1), TICK, 12
-    config = WholeBody(model=LAW, shape_uncertainty=0.0, foot_turning=0.05)
+    config = WholeBody(model=LAW, shape_uncertainty=0.0, inertia_uncertainty=0.0, foot_turning=0.05)
     system = config.system(
         USUAL_SENSORS,
         BASE.robot,

@@ -16,26 +16,26 @@ def inverse_of(A: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def linearise(x: Record, velocity: np.ndarray, law: np.ndarray, shaped: np.ndarray) -> None:
-    """Fills the linearisation of the friction.
+    """Fills the linearisation of the friction, without any acceleration.
 
     Args:
         velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
     """
     phi, slopes = law[0], law[1]
-    n, m = x.weights.shape
-    row = np.ones(m + 1)
+    n, of_law = len(x.weights), x.weights.shape[1] - 1
+    row = np.ones(of_law + 1)
     for joint in range(n):
         put_regressor(row, slopes, shaped, joint, n)
         slope = there = 0.0
-        for k in range(m):
+        for k in range(of_law):
             slope += row[k] * x.weights[joint, k]
         put_regressor(row, phi, shaped, joint, n)
-        for k in range(m):
+        for k in range(of_law):
             x.regressor[joint, k] = row[k]
             there += row[k] * x.weights[joint, k]
         # A law that falls would make the step in time unstable.
         x.slope[joint], x.friction_there[joint] = max(0.0, slope), there
-        x.law_velocity[joint] = velocity[joint]
+        x.law_velocity[joint], x.regressor[joint, of_law] = velocity[joint], 0.0
 
 
 @njit(cache=True)

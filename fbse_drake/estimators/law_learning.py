@@ -55,11 +55,12 @@ def make_dissipative(x: Record) -> None:
     """
     n, m = x.weights.shape
     for joint in range(n):
-        row, first = x.regressor[joint], len(x.covariance) + m * (joint - n)
-        torque = row @ x.weights[joint]
+        row, first = x.regressor[joint, : m - 1], len(x.covariance) + m * (joint - n)
+        last = first + m - 1
+        torque = row @ x.weights[joint, : m - 1]
         if torque * x.law_velocity[joint] < 0.0:
-            column = np.ascontiguousarray(x.covariance[first : first + m, first : first + m]) @ row
-            variance = row @ column
+            column = np.ascontiguousarray(x.covariance[first : first + m, first:last]) @ row
+            variance = row @ column[: m - 1]
             if torque**2 > variance:
                 x.weights[joint] -= column * (torque / variance)
 

@@ -34,8 +34,17 @@ from fbse_drake.estimators.implicit_friction import (
     own_covariance,
 )
 from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_THREE, learned_noise
-from fbse_drake.estimators.law_learning import forget_laws, learning_states, make_dissipative
+from fbse_drake.estimators.law_learning import (
+    forget_laws,
+    learning_states,
+    make_dissipative,
+)
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
+from fbse_drake.estimators.missing_inertia import (
+    full_inertia,
+    make_inertia_possible,
+    put_acceleration,
+)
 from fbse_drake.estimators.records import Record, record, record_type
 from fbse_drake.estimators.recursive import (
     Clock,
@@ -70,8 +79,9 @@ class WholeBody:
     """Extended Kalman filter for velocities and friction laws of the whole robot.
 
     Its states are the angular velocity of the base, the velocities of the joints, the linear
-    parameters of each joint's friction law, and what the equation of motion lacks in each of its
-    rows (wrong masses, friction that follows no law), a random walk. It takes command, foot forces
+    parameters of each joint's friction law, the reflected inertia that the model lacks there, and
+    what the equation of motion lacks in each of its rows (wrong masses, friction that follows no
+    law), a random walk. It takes command, foot forces
     and accelerometer for granted but for their noise; gyro and encoders are measurements, and flat
     feet that stand do not turn. Friction that rises steeply with the velocity is solved implicitly,
     and linearised where the measurements say that a tick ended: velocity and law are learned
@@ -104,6 +114,8 @@ class WholeBody:
     # of such shapes; and the initial standard deviation of each one's weight [Nm].
     factors: list[float] = field(default_factory=lambda: [0.2, 5.0])
     shape_uncertainty: float = 3.0
+    # Initial standard deviation of the reflected inertia that the model lacks in a joint [kg m^2].
+    inertia_uncertainty: float = 0.05
     # Random walk of the torque that a joint's row lacks [Nm/sqrt(s)], and its initial standard
     # deviation [Nm]; and of the moment that the base's rows lack.
     disturbance_walk: float = 0.1
@@ -116,6 +128,7 @@ class WholeBody:
 
     def __post_init__(self) -> None:
         require_not_negative(self, "parameter_uncertainty", "shape_uncertainty")
+        require_not_negative(self, "inertia_uncertainty")
         require_not_negative(self, "disturbance_walk", "disturbance_uncertainty")
         require_not_negative(self, "moment_walk", "moment_uncertainty", "foot_turning")
 
@@ -206,7 +219,7 @@ def _begin(
         tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
         x.acceleration_noise, known,
     )  # fmt: skip
-    A, tick.duration, share = np.ascontiguousarray(then.inertia), T, start_share(T, known.reading)
+    A, tick.duration, share = full_inertia(x, then.inertia), T, start_share(T, known.reading)
     np.dot(A, x.covariance[:r], tick.impulse)
     for i in range(r):
         for k in range(len(x.covariance)):
@@ -261,8 +274,9 @@ def _expect(
         law, shaped: what `FrictionRegressor` says at the velocities of the tick.
     """
     x, last, tick, past, known = posterior[()], last[()], tick[()], past[()], known[()]
-    A = np.ascontiguousarray(_tick_of_forces(x, past).inertia)
+    A = full_inertia(x, _tick_of_forces(x, past).inertia)
     linearise(x, tick.velocity, law, shaped)
+    put_acceleration(x, tick, known)
     expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
     own = own_covariance(x, A, inverse, impulse_covariance(x, tick), tick)
     innovation, S = x.reading - expected, own.copy()
@@ -295,7 +309,7 @@ def _update(
         then: equation of motion of the tick.
     """
     P, r, T = x.covariance, len(x.velocity), tick.duration
-    A = np.ascontiguousarray(then.inertia)
+    A = full_inertia(x, then.inertia)
     predicted, inverse = implicit_step(x, x.velocity, A, tick.push, T)
     impulse = impulse_covariance(x, tick)
     expected = own_covariance(x, A, inverse, impulse, tick)
@@ -348,8 +362,10 @@ def _finish(
     tick, past, velocity_now = tick[()], past[()], measured.joint_velocity
     if tick.duration > 0.0:
         linearise(x, tick.velocity, law, shaped)
+        put_acceleration(x, tick, known)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
         make_dissipative(x)
+        make_inertia_possible(x, known)
     if x.late == 0.0:
         velocity_now, law_now = tick.velocity, law
     linearise(x, velocity_now, law_now, shaped)
@@ -395,6 +411,8 @@ def _finish(
         # The Birge ratio widens what follows from readings that contradict the model.
         variance = max(0.0, variance) * max(x.surprise, x.agreement[of_velocity])
         x.friction_std[joint] = math.sqrt(variance + x.doubt[joint] ** 2)
+        x.missing_inertia[joint] = x.weights[joint, m - 1]
+        x.missing_inertia_std[joint] = math.sqrt(max(0.0, P[first + m - 1, first + m - 1]))
         for k in range(x.parameters.shape[1]):
             x.parameters[joint, k] = x.weights[joint, k]
             x.parameter_variance[joint, k] = P[first + k, first + k]
@@ -418,7 +436,7 @@ class WholeBodyFilter(RecursiveEstimator):
     Inputs: posteriors of `SensorMonitor`, `FloatingBaseModel` over the step and
     `InvariantBaseFilter` (which also tells how late foot forces come) or `AttitudeEstimator`;
     `torque_command` (n,) [Nm] is remembered for the next tick. Fields of the posterior, for n
-    joints, r = 3 + n and m weights of each law:
+    joints, r = 3 + n and m weights of each joint:
 
         friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
         link_torque              (n,)    the last command that is a number, less friction; what
@@ -429,8 +447,10 @@ class WholeBodyFilter(RecursiveEstimator):
         velocity                 (r,)    of the base's turning in its axes, and of the joints
                                          [rad/s]
         lacking                  (r,)    torque that the equation of motion lacks [Nm]
-        weights, settled         (n, m)  parameters and those of other shapes; the same some time
-                                         ago
+        missing_inertia, missing_inertia_std   (n,)  reflected inertia that the model lacks
+                                         [kg m^2]
+        weights, settled         (n, m)  parameters, those of other shapes and the missing inertia;
+                                         the same some time ago
         covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
         innovation, innovation_variance   (r,)  of gyro and encoders [rad/s]
         correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
@@ -479,7 +499,7 @@ class WholeBodyFilter(RecursiveEstimator):
         """
         self._config = config
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
-        n, m = len(robot.joint_names), self._regressor.weights
+        n, m = len(robot.joint_names), self._regressor.weights + 1
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         feet = len(legs)
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
@@ -487,6 +507,7 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
         per_joint += ["doubt", "rested", "law_velocity", "friction_there", "slope", "steepest"]
+        per_joint += ["missing_inertia", "missing_inertia_std"]
         posterior_type = record_type(
             time=(),
             status=(),
@@ -521,6 +542,7 @@ class WholeBodyFilter(RecursiveEstimator):
             weight_variance=self._weight_deviations() ** 2,
             weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
+            rotor_inertia=np.array([robot.rotor_inertia(joint) for joint in robot.joint_names]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model_over_step", model_over_step)
@@ -581,7 +603,9 @@ class WholeBodyFilter(RecursiveEstimator):
         return start
 
     def _weight_deviations(self) -> np.ndarray:
-        """Initial standard deviation of the weights of a law, (m,)."""
-        weights = np.full(self._regressor.weights, self._config.shape_uncertainty)
-        weights[: self._regressor.parameters] = self._config.parameter_uncertainty
+        """Initial standard deviation of the weights of a joint, (m,)."""
+        config, regressor = self._config, self._regressor
+        weights = np.full(regressor.weights + 1, config.shape_uncertainty)
+        weights[: regressor.parameters] = config.parameter_uncertainty
+        weights[-1] = config.inertia_uncertainty
         return weights

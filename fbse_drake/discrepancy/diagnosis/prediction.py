@@ -176,8 +176,11 @@ class Predictor:
         """What the noise of the force sensors puts into the predicted sinking of the soles, per
         unit of compliance squared, (R,).
 
-        Of a noise that is added to the measured forces once more.
+        Of a noise that is added to the measured forces once more. A robot that does not stand has
+        no soles that sink.
         """
+        if not self.robot.has_floating_base:
+            return np.zeros(self.rows)
         force = self.motion.signals.pad_force
         noise = force_noise(
             self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0)

@@ -1,0 +1,46 @@
+"""The reflected inertia that a model lacks in its joints: rotors behind gears are often left out.
+
+It is the last weight of a joint, after those of its friction law. As a regressor of the torque it
+has the joint's acceleration.
+"""
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.records import Record
+from fbse_drake.estimators.whole_body_updates import NOTICED
+
+
+@njit(cache=True)
+def put_acceleration(x: Record, tick: Record, known: Record) -> None:
+    """Fills the regressor: the acceleration of a joint, or 0 where that is no more than noise.
+
+    Noise of a velocity is in its innovation as well, and would be learned as inertia.
+
+    Args:
+        x: record with the `velocity` (r,) where a tick begins.
+        tick: record with that of the joints where it ends, (n,), and its `duration` [s].
+        known: record with the `variance` (r,) of the readings.
+    """
+    for joint in range(len(tick.velocity)):
+        row = 3 + joint
+        change = tick.velocity[joint] - x.velocity[row]
+        noise = 2.0 * x.noise[row] * known.variance[row]
+        accelerates = change**2 > NOTICED**2 * noise
+        x.regressor[joint, -1] = change / tick.duration if accelerates else 0.0
+
+
+@njit(cache=True)
+def full_inertia(x: Record, inertia: np.ndarray) -> np.ndarray:
+    """A model's inertia (r, r) with what it lacks."""
+    result = inertia.copy()
+    for joint in range(len(x.weights)):
+        result[3 + joint, 3 + joint] += x.weights[joint, -1]
+    return result
+
+
+@njit(cache=True)
+def make_inertia_possible(x: Record, known: Record) -> None:
+    """Projects on what can be: a model has no more rotor inertia than it has, see `known`."""
+    for joint in range(len(x.weights)):
+        x.weights[joint, -1] = max(x.weights[joint, -1], -known.rotor_inertia[joint])

@@ -1,0 +1,89 @@
+"""Rotors behind gears that a model leaves out, or has too large: their torque is no friction."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import scenario
+from rig import estimated, rms
+
+from fbse_drake import Log
+from fbse_drake.estimators.fbse import Fbse
+from fbse_drake.estimators.missing_inertia import (
+    full_inertia,
+    make_inertia_possible,
+    put_acceleration,
+)
+from fbse_drake.estimators.records import record
+from fbse_drake.estimators.whole_body import WholeBody
+from fbse_drake.report.metrics import friction_error
+
+Run = Callable[..., Log]
+# Both legs have swung by then.
+WALK = ("paper_walk_fbse", "duration=2.8")
+LEGS = ("hip_roll", "hip_pitch", "knee_pitch", "ankle_pitch")
+
+
+def columns(log: Log) -> list[int]:
+    return [k for k, joint in enumerate(log.joints) if joint.endswith(LEGS)]
+
+
+def coverage(log: Log) -> float:
+    std = log["estimate/joint/friction_torque_std"]
+    return float(np.mean((np.abs(friction_error(log)) < 2.58 * std)[log.time >= 1.0]))
+
+
+@pytest.mark.parametrize("inertia", [0.05, 0.2])
+def test_rotors_that_the_model_lacks_are_found_and_their_torque_is_no_friction(
+    run: Run, inertia: float
+):
+    """Without it the torque that accelerates them, half of the friction and more, is taken for
+    friction."""
+    log = run(*WALK, f"robot.effects.rotors=!ReflectedInertia {{inertia: {{all: {inertia}}}}}")
+    of_legs, late = columns(log), log.time >= 1.2
+    found = log["estimate/joint/missing_inertia"][-1, of_legs]
+    np.testing.assert_allclose(found, inertia, atol=0.005)
+    assert np.all(log["estimate/joint/missing_inertia_std"][-1, of_legs] < 0.1 * inertia)
+    believing = Fbse(friction=WholeBody(inertia_uncertainty=0.0))
+    other = estimated(log, scenario(*WALK), believing)
+    assert not other["estimate/joint/missing_inertia"].any()
+    error, without = (rms(friction_error(one)[late][:, of_legs]) for one in (log, other))
+    assert error < 0.1 * rms(log["truth/joint/friction_torque"][late][:, of_legs])
+    assert error < 0.2 * without
+    assert coverage(log) > 0.98
+
+
+def test_rotors_that_the_robot_lacks_are_found_too(run: Run):
+    """The model's own are taken back; without any, there is nothing to take."""
+    log, walk = run(*WALK), scenario(*WALK)
+    of_legs = columns(log)
+    for believed in (0.0, 0.05):
+        description = replace(walk.robot, rotor_inertia={"all": believed})
+        other = estimated(log, replace(walk, robot=description, model=None), walk.estimator)
+        found = other["estimate/joint/missing_inertia"]
+        assert found.min() >= -believed - 1e-12
+        np.testing.assert_allclose(found[-1, of_legs], -believed, atol=0.005)
+        late = other.time >= 1.2
+        error = rms(friction_error(other)[late][:, of_legs])
+        assert error < 0.1 * rms(log["truth/joint/friction_torque"][late][:, of_legs])
+
+
+def test_noise_of_a_velocity_is_no_acceleration():
+    """Only what is beyond three standard deviations of the change counts."""
+    n, sigma, T = 2, 5e-4, 1e-3
+    known = record(variance=np.full(3 + n, sigma**2))
+    x = record(velocity=np.zeros(3 + n), noise=np.ones(3 + n), regressor=np.ones((n, 3)))
+    tick = record(velocity=np.sqrt(2.0) * sigma * np.array([2.9, -3.1]), duration=T)
+    put_acceleration(x[()], tick[()], known[()])
+    np.testing.assert_allclose(x["regressor"][:, -1], [0.0, tick["velocity"][1] / T])
+    np.testing.assert_array_equal(x["regressor"][:, :-1], 1.0)
+
+
+def test_a_model_lacks_no_less_than_minus_its_own_rotors():
+    x = record(weights=np.array([[1.0, -0.3], [2.0, 0.4]]))
+    known = record(rotor_inertia=np.array([0.1, 0.0]))
+    make_inertia_possible(x[()], known[()])
+    np.testing.assert_array_equal(x["weights"], [[1.0, -0.1], [2.0, 0.4]])
+    inertia = full_inertia(x[()], np.eye(5))
+    np.testing.assert_allclose(inertia, np.diag([1.0, 1.0, 1.0, 0.9, 1.4]))
