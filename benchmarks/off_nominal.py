@@ -75,6 +75,12 @@ def _foot_gain(gain: float) -> Case:
     return Case(f"foot force x {gain:g}, left foot", untold=(effect,))
 
 
+def _rotors(inertia: float) -> Case:
+    """All joints have rotors of this reflected inertia that the model lacks [kg m^2]."""
+    effect = f"robot.effects.rotors=!ReflectedInertia {{inertia: {{all: {inertia}}}}}"
+    return Case(f"rotors of {inertia:g} kg m^2 that the model lacks", untold=(effect,))
+
+
 def _transition(velocity: float) -> Case:
     """HRP-2's walk with a friction model that changes its sign over another velocity [rad/s]."""
     model = f"estimator.friction=!WholeBody {{model: {{transition: {{all: {velocity}}}}}}}"
@@ -99,6 +105,8 @@ CASES = (
     Case("foot forces 5 ms late", untold=("sensors.foot_force.delay=0.005",)),
     _foot_gain(1.02),
     _foot_gain(0.95),
+    _rotors(0.05),
+    _rotors(0.2),
     Case("HRP-2, nominal", ("compensation=!NoCompensation {}",), scenario=_HRP2_WALK),
     _transition(0.002),
     _transition(0.05),

@@ -317,7 +317,8 @@ def _update(
     P[:r, :r] = expected
     mirror(P, r)
     x.velocity[:], x.pushed[:] = predicted, tick.push
-    x.residual[:] = (tick.push - A @ (x.reading - last.reading) / T)[3:]
+    change = x.reading - last.reading
+    x.residual[:] = (tick.push - np.ascontiguousarray(then.inertia) @ change / T)[3:]
     learning = learning_states(last, known)
     correction = listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
     listen_to_feet(x, last, then, measured, learning, T, known)
@@ -441,7 +442,8 @@ class WholeBodyFilter(RecursiveEstimator):
         friction, friction_std   (n,)    the estimate for the tick that ends now [Nm]
         link_torque              (n,)    the last command that is a number, less friction; what
                                          passes the joint to its link [Nm]
-        residual                 (n,)    friction as it is measured in the tick, unfiltered [Nm]
+        residual                 (n,)    friction as it is measured in the tick, unfiltered, with
+                                         the model's own inertia [Nm]
         joint_acceleration       (n,)    mean over the tick [rad/s^2]
         parameters, parameter_variance   (n, ...)  linear parameters of the law
         velocity                 (r,)    of the base's turning in its axes, and of the joints
