@@ -34,7 +34,7 @@ def coverage(log: Log) -> float:
     return float(np.mean((np.abs(friction_error(log)) < 2.58 * std)[log.time >= 1.0]))
 
 
-@pytest.mark.parametrize("inertia", [0.05, 0.2])
+@pytest.mark.parametrize("inertia", [0.05, 0.1])
 def test_rotors_that_the_model_lacks_are_found_and_their_torque_is_no_friction(
     run: Run, inertia: float
 ):

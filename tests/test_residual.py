@@ -1,6 +1,7 @@
 """The residual is what the sensors' noise makes it when nothing is missing, and shows what is
 missing when something is."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.identification.regression import Regression, Signature, WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import EXCESS, leftover_structure
 from fbse_drake.discrepancy.residual.residual import Residual, Row, block_means, rms
+from fbse_drake.effects.effect import library
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, load_scenario
@@ -72,6 +74,16 @@ def test_the_noise_floor_follows_the_sensors(walk: tuple[Scenario, Log]) -> None
     assert Predictor(forces, log).residual.noise_floor[rows["base/force_z"]] == pytest.approx(
         50 * np.sqrt(8 / 10), rel=0.02
     )
+
+
+def test_soft_ground_is_nothing_to_a_robot_that_hangs(run: Callable[..., Log]) -> None:
+    """Neither its soles sink nor does that add noise, whatever the model says of the ground."""
+    log, scenario = run("leg_swing_gantry", "duration=0.5"), load_scenario("leg_swing_gantry")
+    soft = {"ground": library()["GroundCompliance"](compliance=1e-5)}
+    model = replace(scenario.believed, effects=scenario.believed.effects | soft)
+    hard, soft = (Predictor(s, log).residual for s in (scenario, replace(scenario, model=model)))
+    np.testing.assert_array_equal(soft.value, hard.value)
+    np.testing.assert_array_equal(soft.variance, hard.variance)
 
 
 def test_more_noise_of_the_feet_than_is_believed_is_measured_and_no_structure(

@@ -115,7 +115,7 @@ class WholeBody:
     factors: list[float] = field(default_factory=lambda: [0.2, 5.0])
     shape_uncertainty: float = 3.0
     # Initial standard deviation of the reflected inertia that the model lacks in a joint [kg m^2].
-    inertia_uncertainty: float = 0.05
+    inertia_uncertainty: float = 0.03
     # Random walk of the torque that a joint's row lacks [Nm/sqrt(s)], and its initial standard
     # deviation [Nm]; and of the moment that the base's rows lack.
     disturbance_walk: float = 0.1
