@@ -20,6 +20,7 @@ from fbse_drake.estimators.records import as_record, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.estimators.sensor_monitor import SensorMonitor, SensorMonitorConfig
 from fbse_drake.estimators.support import MeasuredSupport
+from fbse_drake.report.metrics import friction_error
 from fbse_drake.robot.plant import Robot, make_robot
 from fbse_drake.walking.reference import make_plan
 from fbse_drake.wiring import release
@@ -129,6 +130,12 @@ def part(log: Log, seconds: float) -> Log:
 def estimated(log: Log, scenario: Scenario, config: Estimator, **changes: object) -> Log:
     """The log with the estimates of another estimator."""
     return estimate(dataclasses.replace(scenario, estimator=config, **changes), log).log
+
+
+def coverage(log: Log) -> float:
+    """Share of time in which the friction is within 2.58 stated deviations of the truth."""
+    std = log["estimate/joint/friction_torque_std"]
+    return float(np.mean((np.abs(friction_error(log)) < 2.58 * std)[log.time >= 1.0]))
 
 
 def inputs_of(log: Log) -> dict[str, np.ndarray]:

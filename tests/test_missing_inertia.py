@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import scenario
-from rig import estimated, rms
+from rig import coverage, estimated, rms
 
 from fbse_drake import Log
 from fbse_drake.estimators.fbse import Fbse
@@ -27,11 +27,6 @@ LEGS = ("hip_roll", "hip_pitch", "knee_pitch", "ankle_pitch")
 
 def columns(log: Log) -> list[int]:
     return [k for k, joint in enumerate(log.joints) if joint.endswith(LEGS)]
-
-
-def coverage(log: Log) -> float:
-    std = log["estimate/joint/friction_torque_std"]
-    return float(np.mean((np.abs(friction_error(log)) < 2.58 * std)[log.time >= 1.0]))
 
 
 @pytest.mark.parametrize("inertia", [0.05, 0.1])

@@ -9,7 +9,7 @@ import pytest
 from conftest import scenario
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
-from rig import BENT, CLOCK, TICK, Base, Rig, estimated, pack, rms
+from rig import BENT, CLOCK, TICK, Base, Rig, coverage, estimated, pack, rms
 from scipy.stats import chi2
 
 from fbse_drake import Log
@@ -249,12 +249,6 @@ def phase_rms(log: Log, error: np.ndarray, role: str, *, swings: bool) -> float:
         if joint.endswith(role)
     ]
     return rms(np.concatenate(values))
-
-
-def coverage(log: Log) -> float:
-    """Share of time in which the friction is within 2.58 stated deviations of the truth."""
-    std = log["estimate/joint/friction_torque_std"]
-    return float(np.mean((np.abs(friction_error(log)) < 2.58 * std)[log.time >= 1.0]))
 
 
 ROLES = ("hip_yaw", "hip_roll", "hip_pitch", "knee_pitch", "ankle_pitch", "ankle_roll")

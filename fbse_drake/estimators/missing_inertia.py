@@ -41,6 +41,10 @@ def full_inertia(x: Record, inertia: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def make_inertia_possible(x: Record, known: Record) -> None:
-    """Projects on what can be: a model has no more rotor inertia than it has, see `known`."""
+    """Projects on what can be: no robot's rotor has a negative inertia.
+
+    Args:
+        known: record with the model's own `rotor_inertia` (n,) [kg m^2].
+    """
     for joint in range(len(x.weights)):
         x.weights[joint, -1] = max(x.weights[joint, -1], -known.rotor_inertia[joint])

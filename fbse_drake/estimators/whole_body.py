@@ -34,11 +34,7 @@ from fbse_drake.estimators.implicit_friction import (
     own_covariance,
 )
 from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_THREE, learned_noise
-from fbse_drake.estimators.law_learning import (
-    forget_laws,
-    learning_states,
-    make_dissipative,
-)
+from fbse_drake.estimators.law_learning import forget_laws, learning_states, make_dissipative
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.missing_inertia import (
     full_inertia,
@@ -81,11 +77,11 @@ class WholeBody:
     Its states are the angular velocity of the base, the velocities of the joints, the linear
     parameters of each joint's friction law, the reflected inertia that the model lacks there, and
     what the equation of motion lacks in each of its rows (wrong masses, friction that follows no
-    law), a random walk. It takes command, foot forces
-    and accelerometer for granted but for their noise; gyro and encoders are measurements, and flat
-    feet that stand do not turn. Friction that rises steeply with the velocity is solved implicitly,
-    and linearised where the measurements say that a tick ended: velocity and law are learned
-    together, and one that does not fit the other would be learned wrong.
+    law), a random walk. It takes command, foot forces and accelerometer for granted but for their
+    noise; gyro and encoders are measurements, and flat feet that stand do not turn. Friction that
+    rises steeply with the velocity is solved implicitly, and linearised where the measurements say
+    that a tick ended: velocity and law are learned together, and one that does not fit the other
+    would be learned wrong.
 
     Foot forces that come late belong to the tick in which they were: the filter is then so many
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
