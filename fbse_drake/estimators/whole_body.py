@@ -136,15 +136,21 @@ class WholeBody:
 def _tick_type(n: int, size: int) -> np.dtype:
     """What a tick's forces and equation of motion say, whatever the friction is.
 
-    `duration` () [s], 0 where not all is known that it needs, and the rest means nothing; `push`
-    (r,), commands, feet and all that is not friction [Nm], and its `variance` (r, r); `missed`
-    (r,), the part of that which is missed between rare readings; `impulse` (r, size), covariance of
-    the tick's impulse, but for the friction's, with the states; and `velocity` (n,) of the joints,
-    where the tick is expected to end.
+    `duration` () [s], 0 where not all is known that it needs, and the rest means nothing; `inertia`
+    (r, r), the model's with what it lacks; `push` (r,), commands, feet and all that is not friction
+    [Nm], and its `variance` (r, r); `missed` (r,), the part of that which is missed between rare
+    readings; `impulse` (r, size), covariance of the tick's impulse, but for the friction's, with
+    the states; and `velocity` (n,) of the joints, where the tick is expected to end.
     """
     r = 3 + n
     return record_type(
-        duration=(), push=(r,), variance=(r, r), missed=(r,), impulse=(r, size), velocity=(n,)
+        duration=(),
+        inertia=(r, r),
+        push=(r,),
+        variance=(r, r),
+        missed=(r,),
+        impulse=(r, size),
+        velocity=(n,),
     )
 
 
@@ -216,6 +222,7 @@ def _begin(
         x.acceleration_noise, known,
     )  # fmt: skip
     A, tick.duration, share = full_inertia(x, then.inertia), T, start_share(T, known.reading)
+    tick.inertia[:] = A
     np.dot(A, x.covariance[:r], tick.impulse)
     for i in range(r):
         for k in range(len(x.covariance)):
@@ -259,7 +266,6 @@ def _expect(
     tick: Record,
     law: np.ndarray,
     shaped: np.ndarray,
-    past: Record,
     known: Record,
 ) -> None:
     """Fills the velocities of the joints that the measurements let expect at the tick's end.
@@ -269,8 +275,8 @@ def _expect(
     Args:
         law, shaped: what `FrictionRegressor` says at the velocities of the tick.
     """
-    x, last, tick, past, known = posterior[()], last[()], tick[()], past[()], known[()]
-    A = full_inertia(x, _tick_of_forces(x, past).inertia)
+    x, last, tick, known = posterior[()], last[()], tick[()], known[()]
+    A = np.ascontiguousarray(tick.inertia)
     linearise(x, tick.velocity, law, shaped)
     put_acceleration(x, tick, known)
     expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
@@ -305,7 +311,7 @@ def _update(
         then: equation of motion of the tick.
     """
     P, r, T = x.covariance, len(x.velocity), tick.duration
-    A = full_inertia(x, then.inertia)
+    A = np.ascontiguousarray(tick.inertia)
     predicted, inverse = implicit_step(x, x.velocity, A, tick.push, T)
     impulse = impulse_covariance(x, tick)
     expected = own_covariance(x, A, inverse, impulse, tick)
@@ -578,7 +584,7 @@ class WholeBodyFilter(RecursiveEstimator):
         )  # fmt: skip
         law = regressor(tick["velocity"])
         if tick["duration"] > 0.0:
-            _expect(posterior, last, tick, law, shaped, past, known)
+            _expect(posterior, last, tick, law, shaped, known)
             law = regressor(tick["velocity"])
         law_now = regressor(measured["joint_velocity"]) if posterior["late"] > 0.0 else law
         _finish(
