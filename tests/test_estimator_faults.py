@@ -204,6 +204,34 @@ def test_wrong_reading_is_noticed(walk: Log, before: Callable[..., tuple], kind:
     assert (moved < 3 * deviation)[HEALED - START :].all()
 
 
+# Wrong pushes, of which no sensor is called wrong, or too late.
+MISLEADING = {
+    "accelerometer late": ("measured_imu", slice(0, 3), lambda x: np.roll(x, 20, axis=0)),
+    "pad at full scale": ("measured_pad_force", slice(0, 3), lambda x: np.full_like(x, 5000.0)),
+    "pad spikes": (
+        "measured_pad_force",
+        slice(0, 3),
+        lambda x: x + np.where(np.arange(len(x)) % 50 == 0, 2500.0, 0.0)[:, None],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MISLEADING)
+def test_wrong_pushes_teach_nothing(walk: Log, before: Callable[..., tuple], kind: str):
+    """They accelerate the model and not the joints. Soon after them, friction and missing inertia
+    are within the deviations that are stated of them from what they are without."""
+    replay, undisturbed = before("best")
+    port, part, wrong = MISLEADING[kind]
+    inputs = inputs_of(walk)
+    inputs[port] = inputs[port].copy()
+    inputs[port][START:END, part] = wrong(inputs[port][START:END, part])
+    result = replay.fork().run(walk.time[START:LAST], from_start(inputs))
+    for name in ("missing_inertia", "friction_torque"):
+        channel = f"estimate/joint/{name}"
+        moved = np.abs(result[channel] - undisturbed[channel])[HEALED - START :]
+        assert (moved < 3 * result[f"{channel}_std"][HEALED - START :]).all(), name
+
+
 def test_unexplained_friction_is_doubted(walk: Log, before: Callable[..., tuple]):
     """A wrong torque command looks like friction; that it moves the estimate is stated."""
     replay, undisturbed = before("best")

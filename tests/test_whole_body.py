@@ -429,7 +429,7 @@ def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
     assert np.all(np.abs(learned) < 3 * np.sqrt(deviation) + 0.05)
     as_before = np.abs(moved) < 3 * std[1]
     assert np.mean(as_before[rows.stop + 50 :]) > 0.99
-    assert np.all(as_before[rows.stop + 300 :])
+    assert np.all(as_before[rows.stop + 450 :])
 
 
 def test_laws_outlast_a_delay_of_the_forces_that_begins_later(

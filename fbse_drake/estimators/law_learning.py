@@ -4,35 +4,49 @@ import numpy as np
 from numba import njit
 
 from fbse_drake.estimators.records import Record
-from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, NOTICED, is_contradicted
+from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, GATE, NOTICED, is_contradicted
 
-# A law is known when it is so many times surer than at the start.
-_LEARNED = 10.0
+# A law is known, and well known, when it is so many times surer than at the start.
+_KNOWN, _WELL_KNOWN = 10.0, 30.0
+# What is contradicted in more than this share of the rows is no lack in one of them.
+_MANY = 0.3
 
 
 @njit(cache=True)
-def learning_states(last: Record, known: Record) -> np.ndarray:
+def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
     """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
     A joint whose velocity has not been known from zero for some time says nothing of its law:
     coefficient and velocity, known by their product alone, would drift apart. Of what contradicts a
     law that is known by now nobody knows whether it is the law or what it is learned from. So it is
-    where torque keeps being lacking in the joint's row, and where innovations are no noise.
+    where torque keeps being lacking in the joint's row, where innovations are no noise, and in a
+    tick whose innovation is an outlier. What contradicts many rows is wrong with the base or with a
+    foot: innovations that are near noise already teach laws that are well known no more.
+
+    Args:
+        x: record with the innovations of this tick.
     """
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
+    doubted = x.contradiction > x.innovation_variance
+    many = doubted.sum() > _MANY * r
     for joint in range(n):
         row = 3 + joint
         rests = last.rested[joint] > DOUBT_TIME
         no_noise = last.agreement[row] > NOTICED**2
-        contradicted = is_contradicted(last, row) or no_noise
-        if rests or (contradicted and _is_learned(last, joint, known)):
+        outlier = x.innovation[row] ** 2 > GATE**2 * x.innovation_variance[row]
+        contradicted = is_contradicted(last, row) or no_noise or outlier
+        if (
+            rests
+            or (contradicted and _is_known(last, joint, _KNOWN, known))
+            or (many and doubted[row] and _is_known(last, joint, _WELL_KNOWN, known))
+        ):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
 
 
 @njit(cache=True)
-def _is_learned(x: Record, joint: int, known: Record) -> bool:
-    """Is a joint's law, where it is asked, known _LEARNED times as well as at the start?"""
+def _is_known(x: Record, joint: int, times: float, known: Record) -> bool:
+    """Is a joint's law, where it is asked, known so many times as well as at the start?"""
     n, m = x.weights.shape
     first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
     for j in range(m):
@@ -40,7 +54,7 @@ def _is_learned(x: Record, joint: int, known: Record) -> bool:
         for k in range(m):
             both = x.regressor[joint, j] * x.regressor[joint, k]
             now += both * x.covariance[first + j, first + k]
-    return now * _LEARNED**2 < start
+    return now * times**2 < start
 
 
 @njit(cache=True)

@@ -58,6 +58,7 @@ from fbse_drake.estimators.whole_body_updates import (
     confirmed,
     forget_lacking,
     is_contradicted,
+    judge,
     listen,
     listen_to_feet,
     watch_corrections,
@@ -321,8 +322,10 @@ def _update(
     x.velocity[:], x.pushed[:] = predicted, tick.push
     change = x.reading - last.reading
     x.residual[:] = (tick.push - np.ascontiguousarray(then.inertia) @ change / T)[3:]
-    learning = learning_states(last, known)
-    correction = listen(x, last, T * T * (inverse**2 @ tick.missed), learning, T, known)
+    missed = T * T * (inverse**2 @ tick.missed)
+    excess, weight, correction = judge(x, last, missed, T, known)
+    learning = learning_states(x, last, known)
+    listen(x, excess, weight, learning, T, known)
     listen_to_feet(x, last, then, measured, learning, T, known)
     watch_corrections(x, last, A, correction, expected, T)
     x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T

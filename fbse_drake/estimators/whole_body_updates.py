@@ -63,23 +63,19 @@ def is_contradicted(x: Record, row: int) -> bool:
 
 
 @njit(cache=True)
-def listen(
-    x: Record,
-    last: Record,
-    missed: np.ndarray,
-    learning: np.ndarray,
-    elapsed: float,
-    known: Record,
-) -> np.ndarray:
-    """Kalman update with gyro and encoders.
+def judge(
+    x: Record, last: Record, missed: np.ndarray, elapsed: float, known: Record
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the innovations of gyro and encoders say of the model and of the sensors' noise.
 
     Args:
         x: record whose velocities are those before the update.
         missed: what is added to their variances, as pushes between rare readings are missed, (r,).
-        learning: see `learning_states`.
 
     Returns:
-        How they would correct the velocities if no innovation were too large to count, (r,).
+        By what the variances of the readings (r,) are larger, so that no innovation is too large;
+        the inverse of the innovations' covariance, (r, r); and how they would correct the
+        velocities if none were too large to count, (r,).
     """
     P, r = x.covariance, len(x.velocity)
     innovation, excess = x.reading - x.velocity, np.zeros(r)
@@ -105,7 +101,7 @@ def listen(
         x.contradiction[i] = max(excess_now, forget * last.contradiction[i])
         # An innovation counts as little as makes it just likely.
         excess[i] = max(0.0, (innovation[i] / GATE) ** 2 - S)
-    columns, expected = P[:r].copy(), P[:r, :r].copy()
+    expected = P[:r, :r].copy()
     weight = inverse_of(expected + np.diag(x.noise * known.variance))
     whitened = weight @ innovation
     correction = expected @ whitened
@@ -113,18 +109,37 @@ def listen(
     surprise = innovation @ whitened / r
     if surprise < 1.0 + GATE * math.sqrt(2.0 / r):
         surprise = 1.0
+    x.surprise = max(surprise, 1.0 + forget * (last.surprise - 1.0))
     if excess.max() > 0.0:
         weight = inverse_of(expected + np.diag(x.noise * known.variance + excess))
-    x.surprise = max(surprise, 1.0 + forget * (last.surprise - 1.0))
+    return excess, weight, correction
+
+
+@njit(cache=True)
+def listen(
+    x: Record,
+    excess: np.ndarray,
+    weight: np.ndarray,
+    learning: np.ndarray,
+    elapsed: float,
+    known: Record,
+) -> None:
+    """Kalman update with gyro and encoders.
+
+    Args:
+        excess, weight: see `judge`.
+        learning: see `learning_states`.
+    """
+    P, r = x.covariance, len(x.velocity)
+    columns = P[:r].copy()
     gain = weight @ columns
-    correct(x, columns, gain, innovation, learning)
+    correct(x, columns, gain, x.innovation, learning)
     # R S^-1 P is P - P S^-1 P without the difference of large numbers.
     for i in range(r):
         P[i] = (x.noise[i] * known.variance[i] + excess[i]) * gain[i]
     P[:r, :r] = 0.5 * (P[:r, :r] + P[:r, :r].T)
     mirror(P, r)
     _restore_variance(x, elapsed, known)
-    return correction
 
 
 @njit(cache=True)
