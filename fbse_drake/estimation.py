@@ -3,10 +3,14 @@
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from fbse_drake.effects.effect import spaced
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Estimator, make_estimator
@@ -148,6 +152,8 @@ class Replay:
             robot = build_robot(scenario.believed)
         inputs = _inputs(scenario, robot, log)
         sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
+        believed = partial(scenario.believed.effects_of, names=robot.description, key="model")
+        in_sensors = believed(SensorEffect)
         estimator = make_estimator(
             scenario.estimator,
             robot,
@@ -156,6 +162,8 @@ class Replay:
             every_sample=True,
             reading=_reading_time(scenario, log),
             sensors=sensors,
+            sensor_effects=in_sensors,
+            torque_effects=believed(JointTorqueEffect),
             knows_torque=knows_torque,
             beside=beside,
         )
@@ -169,6 +177,9 @@ class Replay:
                 raise InputError(f"the log has no channel for {where}")
         self.estimator, self.time = estimator, log.time
         self.remarks = scenario.estimator.remarks(sensors)
+        if in_sensors:
+            names = ", ".join(spaced(effect.effect.__name__).lower() for effect in in_sensors)
+            self.remarks += (f"Taken off the readings, as the model has it: {names}.",)
         if scenario.estimator.gives_friction and not estimator.knows_friction:
             self.remarks += ("The friction is not known: the log has no joint/torque_command.",)
         self.context = estimator.CreateDefaultContext()

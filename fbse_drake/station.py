@@ -8,6 +8,7 @@ table of signals (`fbse_drake.signals`).
 
 from collections.abc import Mapping
 from copy import copy
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ from fbse_drake.control.position_loop import PositionLoop
 from fbse_drake.effects.contact import contact_with_effects
 from fbse_drake.effects.implicit import ImplicitLaw, implicit_law
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
-from fbse_drake.effects.sensor import SensorEffect, SensorEffects
+from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.effects.sensor_systems import SensorEffects
 from fbse_drake.effects.system import JointTorqueEffects
 from fbse_drake.errors import InputError, located
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
@@ -104,12 +106,17 @@ class Station(Diagram):
         ports |= add_sensor_effects(builder, scenario, self.robot, ports)
         ports |= add_reference(builder, self.reference, scenario.plant.time_step)
         controller = add_controller(builder, scenario, simulated, ports)
+        believed_effects = partial(
+            scenario.believed.effects_of, names=self.model.description, key="model"
+        )
         self.estimator = make_estimator(
             scenario.estimator,
             self.model,
             period=scenario.control.period,
             plan=self.reference.plan,
             sensors=scenario.believed_sensors,
+            sensor_effects=believed_effects(SensorEffect),
+            torque_effects=believed_effects(JointTorqueEffect),
             reading=scenario.plant.time_step,
         )
         ports |= add_estimator(builder, self.estimator, ports)
@@ -303,15 +310,17 @@ def add_sensor_effects(
         if (port := f"measured_{name}") in ports
     }
     system = SensorEffects(
-        resolved, robot, scenario.control.period, motor_encoders="motor_position" in measured
+        resolved,
+        robot,
+        scenario.control.period,
+        imu="imu" in measured,
+        motor_encoders="motor_position" in measured,
     )
     effects = builder.AddNamedSystem("sensor_effects", system)
     connect_by_name(builder, {**measured, "torque_command": ports["torque_command"]}, effects)
-    # A robot without feet has no forces there to split off.
-    sizes = {name: port.size() for name, port in measured.items() if port.size() > 0}
-    split = builder.AddNamedSystem("distorted", Demultiplexer(list(sizes.values())))
+    split = builder.AddNamedSystem("distorted", Demultiplexer(list(system.sizes.values())))
     builder.Connect(effects.get_output_port(), split.get_input_port())
-    return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(sizes)}
+    return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(system.sizes)}
 
 
 def add_reference(

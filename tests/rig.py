@@ -13,6 +13,8 @@ import numpy as np
 from pydrake.systems.framework import InputPort, System
 
 from fbse_drake import Log, Scenario, resources
+from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.estimation import estimate
 from fbse_drake.estimators.estimator import Estimator, EstimatorDiagram, make_estimator
 from fbse_drake.estimators.floating_base import FloatingBaseModel
@@ -155,7 +157,16 @@ def diagram(config: Estimator, scenario: Scenario) -> EstimatorDiagram:
     robot, _ = make_robot(believed.description, rotor_inertia=believed.rotor_inertia)
     time = np.arange(round(scenario.duration / TICK) + 1) * TICK
     plan = make_plan(scenario.reference, robot, time)
-    estimator = make_estimator(config, robot, period=TICK, plan=plan)
+    effects = partial(believed.effects_of, names=robot.description, key="model")
+    in_sensors, in_joints = effects(SensorEffect), effects(JointTorqueEffect)
+    estimator = make_estimator(
+        config,
+        robot,
+        period=TICK,
+        plan=plan,
+        sensor_effects=in_sensors,
+        torque_effects=in_joints,
+    )
     assert estimator is not None
     return estimator
 

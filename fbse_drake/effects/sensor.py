@@ -5,18 +5,16 @@ the diagnosis asks what an effect would have added.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.effects.effect import Effect, Parameter, ResolvedEffect, in_library
+from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
-from fbse_drake.wiring import weakly
 
 _ANY = (-np.inf, np.inf)
 # How often the effect of a sensor is taken off its signals.
@@ -135,6 +133,25 @@ class SensorEffect(Effect):
         return signals
 
     @classmethod
+    def undone_now(
+        cls,
+        measured: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,
+        robot: Robot,
+        period: float,
+    ) -> SensorSignals:
+        """What the sensors ought to read at one tick if this is what they read.
+
+        Args:
+            measured: of one tick, without leading axes.
+            memory: of that tick, see `remembered`.
+        """
+        of_log = SensorSignals(*(channel[None] for channel in vars(measured).values()))
+        undone = cls.undone(of_log, memory[:, None], values, robot, period)
+        return SensorSignals(*(channel[0] for channel in vars(undone).values()))
+
+    @classmethod
     def distorted(
         cls, signals: SensorSignals, values: ResolvedEffect, robot: Robot, period: float
     ) -> SensorSignals:
@@ -142,6 +159,20 @@ class SensorEffect(Effect):
         return cls.reading(
             signals, cls.memory_over_time(signals, values, robot, period), values, robot
         )
+
+    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedSensorEffect":
+        """See `Effect.resolve`."""
+        resolved = super().resolve(names, key=key)
+        return ResolvedSensorEffect(
+            type(self), resolved.targets, resolved.linear, resolved.nonlinear
+        )
+
+
+@dataclass(frozen=True)
+class ResolvedSensorEffect(ResolvedEffect):
+    """A sensor effect with values per target."""
+
+    effect: type[SensorEffect]
 
 
 def _wrenches(pad_force: np.ndarray, robot: Robot) -> np.ndarray:
@@ -388,6 +419,19 @@ class FootForceLag(SensorEffect):
         return _with_wrenches(
             measured, stays / (1.0 - stays) * np.diff(read, axis=0, prepend=read[:1]), robot
         )
+
+    @classmethod
+    def undone_now(
+        cls,
+        measured: SensorSignals,
+        memory: np.ndarray,
+        values: ResolvedEffect,  # noqa: ARG003
+        robot: Robot,
+        period: float,  # noqa: ARG003
+    ) -> SensorSignals:
+        read_last, stays = np.moveaxis(memory[:6], 0, -1), memory[6][..., None]
+        rise = _wrenches(measured.pad_force, robot) - read_last
+        return _with_wrenches(measured, stays / (1.0 - stays) * rise, robot)
 
 
 def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
@@ -665,100 +709,3 @@ class TransmissionElasticity(SensorEffect):
         for joint, share in enumerate(stays):
             memory[0, 1:, joint] = lfilter([1.0 - share], [1.0, -share], command[:-1, joint])
         return memory
-
-
-class SensorEffects(LeafSystem):
-    """Distorts the readings of the sensors by effects, one after the other.
-
-    .. pydrake_system::
-
-        name: SensorEffects
-        input_ports:
-        - joint_state
-        - imu
-        - pad_force
-        - motor_position
-        - torque_command
-        output_ports:
-        - measured
-
-    `joint_state` is [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific force,
-    angular velocity], shape (6,) [m/s^2, rad/s]; `pad_force` three components pad by pad [N];
-    `motor_position` (n,) [rad] of second encoders, where there are any; `torque_command` (n,) [Nm].
-    `measured` is [joint_state, imu, pad_force, motor_position] as read; it does not depend on the
-    command of its own tick, which is computed from it. Discrete state: each effect's memory.
-    """
-
-    def __init__(
-        self,
-        effects: Sequence[ResolvedEffect],
-        robot: Robot,
-        period: float,
-        *,
-        motor_encoders: bool = False,
-    ):
-        """Declares ports, state and the update.
-
-        Args:
-            effects: sensor effects.
-            robot: whose sensors these are.
-            period: of the control [s].
-            motor_encoders: are there second encoders?
-        """
-        super().__init__()
-        n, pads = (
-            len(robot.joint_names),
-            len(_pads_of(np.zeros(len(robot.description.sides)), robot)),
-        )
-        self._effects, self._robot, self._period = list(effects), robot, period
-        sizes = {"joint_state": 2 * n, "imu": 6, "pad_force": 3 * pads}
-        if motor_encoders:
-            sizes["motor_position"] = n
-        self._readings = [self.DeclareVectorInputPort(name, size) for name, size in sizes.items()]
-        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self._memories = [
-            self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets))
-            for effect in effects
-        ]
-        sources = {self.input_port_ticket(port.get_index()) for port in self._readings} | {
-            self.xd_ticket()
-        }
-        self.DeclareVectorOutputPort("measured", sum(sizes.values()), weakly(self._calc), sources)
-        if any(effect.effect.memory_size for effect in effects):
-            self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
-
-    def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
-        joint_state, imu, pad_force, *second = (port.Eval(context) for port in self._readings)
-        position, velocity = np.split(joint_state, 2)
-        pads = pad_force.reshape(-1, 3)
-        motors = second[0] if second else np.zeros(0)
-        return SensorSignals(position, velocity, imu[:3], imu[3:], pads, torque_command, motors)
-
-    def _memory(self, context: Context, place: int) -> np.ndarray:
-        values = context.get_discrete_state(self._memories[place]).value()
-        return values.reshape(-1, len(self._effects[place].targets))
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        signals = self._signals(context, np.full(self._torque_command.size(), np.nan))
-        for place, effect in enumerate(self._effects):
-            signals = effect.effect.reading(
-                signals, self._memory(context, place), effect, self._robot
-            )
-        read = (
-            signals.joint_position,
-            signals.joint_velocity,
-            signals.specific_force,
-            signals.angular_velocity,
-            signals.pad_force.ravel(),
-            signals.motor_position,
-        )
-        output.SetFromVector(np.concatenate(read))
-
-    def _remember(self, context: Context, state: State) -> None:
-        signals = self._signals(context, self._torque_command.Eval(context))
-        for place, effect in enumerate(self._effects):
-            memory = self._memory(context, place)
-            if effect.effect.memory_size:
-                later = effect.effect.remembered(signals, memory, effect, self._robot, self._period)
-                state.get_mutable_discrete_state(self._memories[place]).set_value(later.ravel())
-            signals = effect.effect.reading(signals, memory, effect, self._robot)

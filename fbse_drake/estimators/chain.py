@@ -1,12 +1,15 @@
 """Estimators wired into one diagram, each fed by what others of it estimate."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.primitives import Demultiplexer
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
+from fbse_drake.effects.joint_torque import ResolvedJointTorque
+from fbse_drake.effects.sensor import ResolvedSensorEffect
+from fbse_drake.effects.sensor_systems import SensorCorrections
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.records import parts, size_of
@@ -26,8 +29,52 @@ class Workshop:
         self.chains = 0
         # Inputs of the diagram by signal.
         self.inputs: dict[str, InputPort] = {}
+        # Readings that something is taken off first, by signal.
+        self.corrected: dict[str, OutputPort] = {}
         # What chains have in common: of what it was made, and its systems by name.
         self.parts: list[tuple[object, dict[str, RecursiveEstimator]]] = []
+
+    def correct(
+        self,
+        effects: Sequence[ResolvedSensorEffect],
+        robot: Robot,
+        clock: Clock,
+        *,
+        knows_torque: bool,
+    ) -> None:
+        """Has effects of the sensors taken off their readings.
+
+        Args:
+            effects: in the order in which they came into the readings.
+            knows_torque: the torque commands are known, else those effects that they have in the
+                sensors are not.
+        """
+        has_imu = robot.description.imu is not None or robot.has_floating_base
+        system = SensorCorrections(effects, robot, clock.period, imu=has_imu)
+        self.builder.AddNamedSystem("sensor_corrections", system)
+        split = self.builder.AddNamedSystem(
+            "corrected_sensors", Demultiplexer(list(system.sizes.values()))
+        )
+        self.builder.Connect(system.get_output_port(), split.get_input_port())
+        command = system.GetInputPort("torque_command")
+        if knows_torque:
+            self.feed("torque_command", command)
+        else:
+            zero = self.builder.AddSystem(ConstantVectorSource(np.zeros(command.size())))
+            self.builder.Connect(zero.get_output_port(), command)
+        for i, name in enumerate(system.sizes):
+            self.feed(f"measured_{name}", system.GetInputPort(name))
+            self.corrected[f"measured_{name}"] = split.get_output_port(i)
+
+    def feed(self, signal: str, port: InputPort) -> None:
+        """Connects an input port to a signal, an input of the whole diagram."""
+        if signal in self.corrected:
+            self.builder.Connect(self.corrected[signal], port)
+        elif signal in self.inputs:
+            self.builder.ConnectToSame(self.inputs[signal], port)
+        else:
+            self.builder.ExportInput(port, signal)
+            self.inputs[signal] = port
 
 
 class Chain:
@@ -46,6 +93,7 @@ class Chain:
         plan: TaskPlan | None,
         *,
         knows_torque: bool,
+        torque_effects: Sequence[ResolvedJointTorque] = (),
         workshop: Workshop | None = None,
     ):
         workshop = workshop or Workshop()
@@ -58,6 +106,8 @@ class Chain:
         self.plan = plan
         # Are the torque commands known?
         self.knows_torque = knows_torque
+        # What the model says of the joints' torques.
+        self.torque_effects = torque_effects
         self.builder = workshop.builder
         self._workshop = workshop
         # Sets names of this chain's systems and ports apart from those of others.
@@ -162,13 +212,8 @@ class Chain:
         self.builder.Connect(self._split(f"{source}_{field}", output, part)[field], port)
 
     def feed(self, signal: str, port: InputPort) -> None:
-        """Connects an input port to a signal, an input of the whole diagram."""
-        inputs = self._workshop.inputs
-        if signal in inputs:
-            self.builder.ConnectToSame(inputs[signal], port)
-        else:
-            self.builder.ExportInput(port, signal)
-            inputs[signal] = port
+        """Connects an input port to a signal: what a sensor measures, or `torque_command`."""
+        self._workshop.feed(signal, port)
 
     def finish(self) -> dict[str, tuple[int, ...]]:
         """Makes inputs and outputs of the diagram of what is to be seen of it.

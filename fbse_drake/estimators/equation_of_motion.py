@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
+from fbse_drake.estimators.believed_torque import believed_torque_type
 from fbse_drake.estimators.records import Record, record_type
 from fbse_drake.estimators.spatial import (
     Vector,
@@ -39,7 +40,8 @@ def motion_type(robot: Robot) -> np.dtype:
     [rad/s]; of inertia a = push + what feet push - friction, with a the base's angular acceleration
     and those of the joints, `inertia` (r, r), `push` (r,), its part `of_linear` (r, 3) in the IMU's
     acceleration, and the `lever` (feet, 6, r) of the wrenches on the soles; and how soles turn
-    about their normals without accelerations, `turning` (feet,) [rad/s^2].
+    about their normals without accelerations, `turning` (feet,) [rad/s^2]; and what the model's own
+    effects take of the joints' torques, `believed`, see `believed_torque_type`.
     """
     r, feet = 3 + len(robot.joint_names), len(robot.description.legs)
     return record_type(
@@ -51,6 +53,7 @@ def motion_type(robot: Robot) -> np.dtype:
         push=(r,),
         lever=(feet, 6, r),
         turning=(feet,),
+        believed=believed_torque_type(r - 3),
     )
 
 

@@ -17,6 +17,8 @@ from typing import ClassVar, TypeVar
 
 from pydrake.systems.framework import Diagram
 
+from fbse_drake.effects.joint_torque import ResolvedJointTorque
+from fbse_drake.effects.sensor import ResolvedSensorEffect
 from fbse_drake.errors import located
 from fbse_drake.estimators.beliefs import USUAL_SENSORS, SensorBeliefs
 from fbse_drake.estimators.chain import Chain, Workshop
@@ -170,6 +172,8 @@ def make_estimator(
     every_sample: bool = False,
     reading: float | None = None,
     sensors: SensorBeliefs = USUAL_SENSORS,
+    sensor_effects: Sequence[ResolvedSensorEffect] = (),
+    torque_effects: Sequence[ResolvedJointTorque] = (),
     knows_torque: bool = True,
     beside: Sequence[Estimator] = (),
 ) -> EstimatorDiagram | None:
@@ -184,6 +188,10 @@ def make_estimator(
         reading: what a reading of accelerometer or foot force is the mean over [s], 0 for a sample;
             by default the tick.
         sensors: what is believed of them where the config says nothing.
+        sensor_effects: what is known to be in their readings, in the order in which it came; it is
+            taken off them.
+        torque_effects: what the model takes of the joints' torques; an `Fbse` that finds its law
+            through the whole body learns what is left beside it.
         knows_torque: the torque commands are known; without them an `Fbse` estimates no friction.
         beside: further ones, see `EstimatorDiagram`.
 
@@ -193,9 +201,19 @@ def make_estimator(
     shortest = 1e-9 if every_sample else period * (1 - 1e-6)
     clock = Clock(period, shortest, period if reading is None else reading)
     workshop, chains = Workshop(), list[Chain]()
+    if sensor_effects:
+        workshop.correct(sensor_effects, robot, clock, knows_torque=knows_torque)
     for one in (config, *beside):
         believed = one.believed_sensors(sensors)
-        chain = Chain(robot, clock, believed, plan, knows_torque=knows_torque, workshop=workshop)
+        chain = Chain(
+            robot,
+            clock,
+            believed,
+            plan,
+            knows_torque=knows_torque,
+            torque_effects=torque_effects,
+            workshop=workshop,
+        )
         one.add(chain)
         chains.append(chain)
     return None if chains[0].is_empty else EstimatorDiagram(*chains)

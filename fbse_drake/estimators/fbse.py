@@ -94,6 +94,8 @@ class Fbse(Estimator):
         if "link_torque" not in friction.stands_for:
             self._add_link_torque(chain)
         make = partial(friction.system, chain.sensors, chain.robot)
+        if friction.allows_for_effects and chain.torque_effects:
+            make = partial(make, torque_effects=chain.torque_effects)
         chain.add("friction", make, **friction.sources)
         for stage in friction.stands_for:
             chain.alias("friction", stage)

@@ -15,18 +15,22 @@ def inverse_of(A: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def linearise(x: Record, velocity: np.ndarray, law: np.ndarray, shaped: np.ndarray) -> None:
+def linearise(
+    x: Record, velocity: np.ndarray, law: np.ndarray, shaped: np.ndarray, believed: Record
+) -> None:
     """Fills the linearisation of the friction, without any acceleration.
 
     Args:
         velocity, law, shaped: of the joints (n,), and what `FrictionRegressor` says there.
+        believed: what the model's own effects take besides, see `believed_torque_type`.
     """
     phi, slopes = law[0], law[1]
     n, of_law = len(x.weights), x.weights.shape[1] - 1
     row = np.ones(of_law + 1)
     for joint in range(n):
         put_regressor(row, slopes, shaped, joint, n)
-        slope = there = 0.0
+        slope, ahead = believed.slope[joint], velocity[joint] - believed.velocity[joint]
+        there = believed.torque[joint] + slope * ahead
         for k in range(of_law):
             slope += row[k] * x.weights[joint, k]
         put_regressor(row, phi, shaped, joint, n)

@@ -58,20 +58,26 @@ def _is_known(x: Record, joint: int, times: float, known: Record) -> bool:
 
 
 @njit(cache=True)
-def make_dissipative(x: Record) -> None:
+def make_dissipative(x: Record, believed: Record) -> None:
     """Projects laws whose friction pushes a joint, beyond their doubt, on those where it is zero.
 
     At the velocity that they are linearised at, as an estimate is projected on a constraint (D.
     Simon, "Kalman filtering with state constraints: a survey of linear and nonlinear algorithms",
     IET Control Theory & Applications 4, 2010). Where a joint moves little, noise would teach laws
     that fall at rest or are much too steep there. What is within the doubt stays: of a joint
-    without friction only one side would be taken away, tick by tick.
+    without friction only one side would be taken away, tick by tick. A law may take off what the
+    model believes too large.
+
+    Args:
+        believed: friction that the model has besides, see `believed_torque_type`.
     """
     n, m = x.weights.shape
     for joint in range(n):
         row, first = x.regressor[joint, : m - 1], len(x.covariance) + m * (joint - n)
         last = first + m - 1
         torque = row @ x.weights[joint, : m - 1]
+        if believed.torque[joint] * x.law_velocity[joint] > 0.0:
+            torque += believed.torque[joint]
         if torque * x.law_velocity[joint] < 0.0:
             column = np.ascontiguousarray(x.covariance[first : first + m, first:last]) @ row
             variance = row @ column[: m - 1]

@@ -40,6 +40,7 @@ class ModelAided:
 
     # Does it go back to the tick that late forces belong to?
     allows_for_delay: ClassVar[bool] = True
+    allows_for_effects: ClassVar[bool] = False
     states_variance: ClassVar[bool] = True
     sources: ClassVar[dict[str, str]] = MEASURED
     stands_for: ClassVar[tuple[str, ...]] = ()

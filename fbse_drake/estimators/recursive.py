@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -152,6 +152,25 @@ class History:
             values[0], values[start : start + len(own)] = newest, own
 
 
+@dataclass(frozen=True)
+class Advanced:
+    """A state beside the posterior that goes on once in a tick."""
+
+    index: DiscreteStateIndex
+    # What it is at the next tick.
+    advance: Callable[[Context], np.ndarray]
+
+    def Eval(self, context: Context) -> np.ndarray:
+        """What it is now."""
+        return context.get_discrete_state().value(self.index)
+
+    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
+        """Goes on, if the present evaluation is a tick."""
+        # (Before the first tick the time is no number.)
+        if not posterior.item(0) <= context.get_discrete_state().value(0).item(0):
+            state.set_value(self.index, self.advance(context))
+
+
 T = TypeVar("T", bound="RecursiveEstimator")
 
 
@@ -185,7 +204,7 @@ class RecursiveEstimator(LeafSystem):
         self._last = DiscreteStateIndex(self.DeclareDiscreteState(start))
         # Types of the records on its input ports.
         self.record_inputs: dict[str, np.dtype] = {}
-        self._remembered: list[RememberedInput | History] = []
+        self._remembered: list[RememberedInput | History | Advanced] = []
         self._later: set[str] = set()
         self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, weakly(self._remember))
         self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
@@ -259,6 +278,14 @@ class RecursiveEstimator(LeafSystem):
         history = History(index, kind, ticks, parts(self.posterior_type)[field])
         self._remembered.append(history)
         return history
+
+    def _declare_advanced(
+        self, start: np.ndarray, advance: Callable[[Context], np.ndarray]
+    ) -> Advanced:
+        """Declares a state that a function takes from each tick to the next."""
+        advanced = Advanced(DiscreteStateIndex(self.DeclareDiscreteState(start)), advance)
+        self._remembered.append(advanced)
+        return advanced
 
     def _declare_posterior(self) -> None:
         """Declares the outputs, which depend on the input ports that are declared by now."""

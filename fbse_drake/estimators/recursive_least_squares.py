@@ -30,6 +30,7 @@ class RecursiveLeastSquares:
     """
 
     allows_for_delay: ClassVar[bool] = False
+    allows_for_effects: ClassVar[bool] = False
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = False
     # What feeds it, by input, and the stages whose work it does as well.

@@ -6,6 +6,7 @@ the torques, not for the one that a noisy encoder shows, and is identified at it
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -14,8 +15,10 @@ from numba import njit
 from pydrake.systems.framework import Context
 
 from fbse_drake.effects.friction import CoulombViscousFriction, FrictionModel
+from fbse_drake.effects.joint_torque import JointMotion, ResolvedJointTorque
 from fbse_drake.errors import require_not_negative, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.believed_torque import BelievedTorque, believed_torque_type
 from fbse_drake.estimators.equation_of_motion import (
     motion_type,
     put_equation_of_motion,
@@ -41,7 +44,7 @@ from fbse_drake.estimators.missing_inertia import (
     make_inertia_possible,
     put_acceleration,
 )
-from fbse_drake.estimators.records import Record, record, record_type
+from fbse_drake.estimators.records import Record, as_record, record, record_type
 from fbse_drake.estimators.recursive import (
     Clock,
     RecursiveEstimator,
@@ -65,6 +68,7 @@ from fbse_drake.estimators.whole_body_updates import (
 )
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
+from fbse_drake.wiring import weakly
 
 _NOT_FINITE = float(Status.NOT_FINITE)
 # Of no delay it is known how long it has shown.
@@ -92,6 +96,8 @@ class WholeBody:
 
     # Does it go back to the tick that late forces belong to?
     allows_for_delay: ClassVar[bool] = True
+    # Does it leave out of its law what effects of the model take of the torques?
+    allows_for_effects: ClassVar[bool] = True
     # Does it know how well it knows the parameters of its model?
     states_variance: ClassVar[bool] = True
     # What feeds it, by input, and the stages whose work it does.
@@ -141,7 +147,8 @@ def _tick_type(n: int, size: int) -> np.dtype:
     (r, r), the model's with what it lacks; `push` (r,), commands, feet and all that is not friction
     [Nm], and its `variance` (r, r); `missed` (r,), the part of that which is missed between rare
     readings; `impulse` (r, size), covariance of the tick's impulse, but for the friction's, with
-    the states; and `velocity` (n,) of the joints, where the tick is expected to end.
+    the states; `velocity` (n,) of the joints, where the tick is expected to end; and `believed`, of
+    the model's own effects, see `believed_torque_type`.
     """
     r = 3 + n
     return record_type(
@@ -152,6 +159,7 @@ def _tick_type(n: int, size: int) -> np.dtype:
         missed=(r,),
         impulse=(r, size),
         velocity=(n,),
+        believed=believed_torque_type(n),
     )
 
 
@@ -164,6 +172,7 @@ def _begin(
     model: Record,
     attitude: Record,
     torque_command: np.ndarray,
+    believed: np.ndarray,
     past: Record,
     delay: float,
     usual_delay: np.ndarray,
@@ -176,6 +185,8 @@ def _begin(
 
     Args:
         elapsed: of the tick [s], NaN of the first.
+        believed: torque loss of the model's own effects, and its slope, at the velocities that are
+            measured, (2, n).
         past: of the ticks before, see `motion_type`.
         delay: by how much the forces are late [s].
         usual_delay: for how long each delay has shown [s].
@@ -195,6 +206,8 @@ def _begin(
     rate = subtract(vector(measured.angular_velocity), vector(attitude.angular_velocity_bias))
     put(now.reading[:3], rotate(rotation(known.mount.R_BI), rate))
     now.reading[3:] = measured.joint_velocity
+    now.believed.torque[:], now.believed.slope[:] = believed[0], believed[1]
+    now.believed.velocity[:] = measured.joint_velocity
     if not np.isfinite(torque_command).all():
         x.status = max(x.status, _NOT_FINITE)
     is_known = x.status == 0.0 and last.status == 0.0
@@ -205,6 +218,8 @@ def _begin(
     x.late = tick_of(elapsed, past, delay) if elapsed > 0.0 else 0.0
     then = _tick_of_forces(x, past)
     x.reading[:] = then.reading
+    tick.believed.torque[:], tick.believed.slope[:] = then.believed.torque, then.believed.slope
+    tick.believed.velocity[:] = then.believed.velocity
     r = len(x.lacking)
     for i in range(r):
         walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
@@ -278,7 +293,7 @@ def _expect(
     """
     x, last, tick, known = posterior[()], last[()], tick[()], known[()]
     A = np.ascontiguousarray(tick.inertia)
-    linearise(x, tick.velocity, law, shaped)
+    linearise(x, tick.velocity, law, shaped, tick.believed)
     put_acceleration(x, tick, known)
     expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
     own = own_covariance(x, A, inverse, impulse_covariance(x, tick), tick)
@@ -367,14 +382,14 @@ def _finish(
     x, last, measured, known = posterior[()], last[()], measured[()], known[()]
     tick, past, velocity_now = tick[()], past[()], measured.joint_velocity
     if tick.duration > 0.0:
-        linearise(x, tick.velocity, law, shaped)
+        linearise(x, tick.velocity, law, shaped, tick.believed)
         put_acceleration(x, tick, known)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
-        make_dissipative(x)
+        make_dissipative(x, tick.believed)
         make_inertia_possible(x, known)
     if x.late == 0.0:
         velocity_now, law_now = tick.velocity, law
-    linearise(x, velocity_now, law_now, shaped)
+    linearise(x, velocity_now, law_now, shaped, x.now.believed)
     P, (n, m) = x.covariance, x.weights.shape
     r, keep = 3 + n, math.exp(-elapsed / DOUBT_TIME) if elapsed > 0.0 else 1.0
     brief = math.exp(-elapsed / AGREEMENT_TIME) if elapsed > 0.0 else 1.0
@@ -498,11 +513,13 @@ class WholeBodyFilter(RecursiveEstimator):
         model_over_step: np.dtype,
         attitude: np.dtype,
         clock: Clock,
+        torque_effects: Sequence[ResolvedJointTorque] = (),
     ):
         """Declares ports and state.
 
         Args:
             measurements, model_over_step, attitude: types of the inputs.
+            torque_effects: of the model; the law that is learned is what is left beside them.
         """
         self._config = config
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
@@ -558,6 +575,11 @@ class WholeBodyFilter(RecursiveEstimator):
         self._torque_command = self._declare_remembered_input("torque_command", n)
         ticks = remembered_ticks(clock) if self._hears_delay else 1
         self._past = self._declare_history("now", ticks)
+        self._believed = BelievedTorque(torque_effects, n, clock.period)
+        if torque_effects:
+            start, advanced = self._believed.start, weakly(self._remembered_of_effects)
+            self._of_effects = self._declare_advanced(start, advanced)
+        self._no_torque = np.zeros((2, n))
         self._declare_posterior()
 
     @staticmethod
@@ -580,10 +602,13 @@ class WholeBodyFilter(RecursiveEstimator):
         if self._hears_delay:
             heard = attitude["force_delay"]
             delay, usual_delay = heard["delay"].item(), heard["usual"]
-        tick = np.empty((), self._tick_type)
+        tick, believed = np.empty((), self._tick_type), self._no_torque
+        if self._believed.effects:
+            memory = self._of_effects.Eval(context)
+            believed = np.array(self._believed.torque_and_slope(memory, self._motion(context)))
         _begin(
-            posterior, last, elapsed, measured, model, attitude, torque_command, past, delay,
-            usual_delay, tick, known,
+            posterior, last, elapsed, measured, model, attitude, torque_command, believed, past,
+            delay, usual_delay, tick, known,
         )  # fmt: skip
         law = regressor(tick["velocity"])
         if tick["duration"] > 0.0:
@@ -594,6 +619,20 @@ class WholeBodyFilter(RecursiveEstimator):
             posterior, last, elapsed, tick, law, law_now, shaped, measured, torque_command, past,
             known,
         )  # fmt: skip
+
+    def _motion(self, context: Context) -> JointMotion:
+        """The tick that ends now, as effects in the joints see it, but for their memories."""
+        last = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        velocity = self._measurements.Eval(context)["joint_velocity"]
+        # What is no number, a status tells.
+        command = np.nan_to_num(self._torque_command.Eval(context))
+        start, load = np.nan_to_num(last["time"]), last["link_torque"]
+        return JointMotion(velocity, command=command, time=start, load=load)
+
+    def _remembered_of_effects(self, context: Context) -> np.ndarray:
+        """What effects in the joints remember at the end of the tick."""
+        position, memory = self._measurements.Eval(context)["joint_position"], self._of_effects
+        return self._believed.remembered(memory.Eval(context), self._motion(context), position)
 
     def _start(self) -> np.ndarray:
         """What is known before the first tick."""

@@ -4,7 +4,7 @@ effects which are taken off the residual."""
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter, welch
@@ -13,9 +13,8 @@ from fbse_drake.discrepancy.residual.noise import measured_noise, measured_senso
 from fbse_drake.discrepancy.residual.residual import RecordedMotion, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.contact import ContactEffect
-from fbse_drake.effects.effect import ResolvedEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
-from fbse_drake.effects.sensor import SensorEffect, SensorSignals
+from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
 from fbse_drake.errors import located
 from fbse_drake.log import Log
 from fbse_drake.scenario import Scenario, build_robot
@@ -49,7 +48,8 @@ class Reading:
         log = with_command(scenario, log, self.robot.description)
         sensors, self.noisier_channels = measured_sensors(scenario.sensors, scenario.recording, log)
         self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
-        for key, effect in scenario.believed.effects.items():
+        # What came last into the readings goes first.
+        for key, effect in reversed(scenario.believed.effects.items()):
             if isinstance(effect, SensorEffect):
                 known = effect.resolve(self.robot.description, key=f"model.effects.{key}")
                 self.motion.signals = self.undone(known, self.remembered(known))
@@ -58,16 +58,17 @@ class Reading:
         """Would another scenario read the log alike?"""
         return self._read_by == _reader(scenario)
 
-    def undone(self, effect: ResolvedEffect, memory: np.ndarray) -> SensorSignals:
+    def undone(self, effect: ResolvedSensorEffect, memory: np.ndarray) -> SensorSignals:
         """Signals that a sensor effect turns into those of the log.
 
         Args:
             memory: see `remembered`.
         """
-        kind = cast(type[SensorEffect], effect.effect)
-        return kind.undone(self.motion.signals, memory, effect, self.robot, self.motion.period)
+        return effect.effect.undone(
+            self.motion.signals, memory, effect, self.robot, self.motion.period
+        )
 
-    def remembered(self, effect: ResolvedEffect) -> np.ndarray:
+    def remembered(self, effect: ResolvedSensorEffect) -> np.ndarray:
         """What a sensor effect remembers over the log, of torques without their white noise: it
         would become an acceleration.
 
@@ -85,8 +86,8 @@ class Reading:
             name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
             for name, values in vars(signals).items()
         }
-        kind = cast(type[SensorEffect], effect.effect)
-        memory = kind.memory_over_time(SensorSignals(**longer), effect, self.robot, motion.period)
+        signals = SensorSignals(**longer)
+        memory = effect.effect.memory_over_time(signals, effect, self.robot, motion.period)
         return memory[:, earlier:]
 
     @cached_property

@@ -1,0 +1,187 @@
+"""Sensor effects in diagrams: put into the readings of a simulated robot, and taken off those that
+an estimator gets."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorSignals
+from fbse_drake.robot.plant import Robot
+from fbse_drake.wiring import weakly
+
+
+class _Readings(LeafSystem):
+    """Passes readings through effects, one after the other.
+
+    Inputs are `joint_state` [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific
+    force, angular velocity], shape (6,) [m/s^2, rad/s]; `pad_force` three components pad by pad
+    [N]; `motor_position` (n,) [rad] of second encoders; each where the robot has it; and
+    `torque_command` (n,) [Nm]. The output, all of the former in this order, does not depend on the
+    command of its own tick, which is computed from it. Discrete state: each effect's memory.
+    """
+
+    # Name of the output port.
+    _gives: str
+
+    def __init__(
+        self,
+        effects: Sequence[ResolvedSensorEffect],
+        robot: Robot,
+        period: float,
+        *,
+        imu: bool = True,
+        motor_encoders: bool = False,
+    ):
+        """Declares ports, state and the update.
+
+        Args:
+            effects: sensor effects, in the order in which they act.
+            robot: whose sensors these are.
+            period: of the control [s].
+            imu: is there an IMU?
+            motor_encoders: are there second encoders?
+        """
+        super().__init__()
+        n = len(robot.joint_names)
+        pads = sum(leg.points for leg in robot.description.legs.values())
+        self._effects, self._robot, self._period = list(effects), robot, period
+        sizes = {
+            "joint_state": 2 * n,
+            "imu": 6 if imu else 0,
+            "pad_force": 3 * pads,
+            "motor_position": n if motor_encoders else 0,
+        }
+        # Those that the robot has.
+        self.sizes = {name: size for name, size in sizes.items() if size > 0}
+        self._readings = {
+            name: self.DeclareVectorInputPort(name, size) for name, size in self.sizes.items()
+        }
+        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
+        self._memories = [
+            self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets))
+            for effect in effects
+        ]
+        sources = {self.input_port_ticket(p.get_index()) for p in self._readings.values()}
+        sources |= {self.xd_ticket()}
+        size = sum(self.sizes.values())
+        self.DeclareVectorOutputPort(self._gives, size, weakly(self._calc), sources)
+        if any(effect.effect.memory_size for effect in effects):
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
+            self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
+
+    @abstractmethod
+    def _passed(
+        self, signals: SensorSignals, memories: Sequence[np.ndarray]
+    ) -> tuple[SensorSignals, list[SensorSignals]]:
+        """Signals behind all effects, and for each effect those that it finds to be true.
+
+        Args:
+            memories: of each effect, (memory_size, targets).
+        """
+
+    def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
+        read = {name: port.Eval(context) for name, port in self._readings.items()}
+        position, velocity = np.split(read["joint_state"], 2)
+        imu = read.get("imu", np.zeros(6))
+        pads = read.get("pad_force", np.zeros(0)).reshape(-1, 3)
+        motors = read.get("motor_position", np.zeros(0))
+        return SensorSignals(position, velocity, imu[:3], imu[3:], pads, torque_command, motors)
+
+    def _memory(self, context: Context) -> list[np.ndarray]:
+        return [
+            context.get_discrete_state(place).value().reshape(-1, len(effect.targets))
+            for place, effect in zip(self._memories, self._effects, strict=True)
+        ]
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        unknown = np.full(self._torque_command.size(), np.nan)
+        signals, _ = self._passed(self._signals(context, unknown), self._memory(context))
+        given = {
+            "joint_state": np.concatenate([signals.joint_position, signals.joint_velocity]),
+            "imu": np.concatenate([signals.specific_force, signals.angular_velocity]),
+            "pad_force": signals.pad_force.ravel(),
+            "motor_position": signals.motor_position,
+        }
+        output.SetFromVector(np.concatenate([given[name] for name in self.sizes]))
+
+    def _remember(self, context: Context, state: State) -> None:
+        memories = self._memory(context)
+        signals = self._signals(context, self._torque_command.Eval(context))
+        _, found = self._passed(signals, memories)
+        for i, effect in enumerate(self._effects):
+            if effect.effect.memory_size:
+                later = effect.effect.remembered(
+                    found[i], memories[i], effect, self._robot, self._period
+                )
+                spoilt = ~np.isfinite(later).all(axis=0)
+                later[:, spoilt] = memories[i][:, spoilt] if _is_read(found[i]) else 0.0
+                state.get_mutable_discrete_state(self._memories[i]).set_value(later.ravel())
+
+
+def _is_read(signals: SensorSignals) -> bool:
+    """Are all readings numbers? Without a command memories stay, without a reading they begin
+    anew."""
+    readings = replace(signals, torque_command=np.zeros(0))
+    return all(np.isfinite(channel).all() for channel in vars(readings).values())
+
+
+class SensorEffects(_Readings):
+    """Distorts the readings of the sensors by effects, one after the other.
+
+    .. pydrake_system::
+
+        name: SensorEffects
+        input_ports:
+        - joint_state
+        - imu
+        - pad_force
+        - motor_position
+        - torque_command
+        output_ports:
+        - measured
+
+    See `_Readings`; `measured` is what is read then.
+    """
+
+    _gives = "measured"
+
+    def _passed(
+        self, signals: SensorSignals, memories: Sequence[np.ndarray]
+    ) -> tuple[SensorSignals, list[SensorSignals]]:
+        found = []
+        for effect, memory in zip(self._effects, memories, strict=True):
+            found.append(signals)
+            signals = effect.effect.reading(signals, memory, effect, self._robot)
+        return signals, found
+
+
+class SensorCorrections(_Readings):
+    """Takes off readings what effects of the sensors, which are known, have put into them.
+
+    .. pydrake_system::
+
+        name: SensorCorrections
+        input_ports:
+        - joint_state
+        - imu
+        - pad_force
+        - torque_command
+        output_ports:
+        - corrected
+
+    See `_Readings`. What is noise in a reading stays, and grows where an effect smoothed it.
+    """
+
+    _gives = "corrected"
+
+    def _passed(
+        self, signals: SensorSignals, memories: Sequence[np.ndarray]
+    ) -> tuple[SensorSignals, list[SensorSignals]]:
+        found = []
+        for effect, memory in reversed(list(zip(self._effects, memories, strict=True))):
+            signals = effect.effect.undone_now(signals, memory, effect, self._robot, self._period)
+            found.append(signals)
+        return signals, found[::-1]
