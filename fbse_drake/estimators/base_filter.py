@@ -32,7 +32,14 @@ from fbse_drake.estimators.foot_force_balance import force_errors, listen_to_for
 from fbse_drake.estimators.force_delay import (
     force_delay_type,
     forget_force_delay,
+    take_force_delay,
     watch_force_delay,
+)
+from fbse_drake.estimators.force_lag import (
+    force_lag_type,
+    forget_force_lag,
+    undo_lag,
+    watch_force_lag,
 )
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.invariant_error import (
@@ -306,8 +313,12 @@ def _estimate_base(
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
     f_mean = rotate(R_BI, vector(measured.mean.specific_force))
     wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
-    mean_force = measured.mean.pad_force
-    mean_wrench = foot_wrenches(mean_force, known.pads.position, known.pads.foot, feet)
+    x.pad_force_read[:] = x.pad_force[:] = measured.mean.pad_force
+    read_wrench = foot_wrenches(x.pad_force, known.pads.position, known.pads.foot, feet)
+    lag = x.force_lag.time_constant
+    if lag > 0.0 and not first and trust.max() == 0 and last.status == 0:
+        undo_lag(x.pad_force, x.pad_force_read, last.pad_force_read, lag, elapsed)
+    mean_wrench = foot_wrenches(x.pad_force, known.pads.position, known.pads.foot, feet)
     weight = known.mass * 9.81
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
     firm = x.foot_standing * known.is_flat
@@ -334,7 +345,7 @@ def _estimate_base(
             force_noise += contradiction * math.sqrt(max(1.0, 2.0 * _UNKNOWN_TIME / elapsed))
         _predict(x, P, w, f, rate_noise**2, elapsed, known)
         add_noise(P, VELOCITY, (force_noise * elapsed) ** 2)
-    force, carried = (0.0, 0.0, 0.0), 0.0
+    force, force_read, carried = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
     load_by_mass = np.empty((feet, 3))
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
@@ -353,6 +364,7 @@ def _estimate_base(
         in_foot = (mean_wrench[foot, 3], mean_wrench[foot, 4], mean_wrench[foot, 5])
         foot_force = rotate(R_BF, in_foot)
         force = add(force, foot_force)
+        force_read = add(force_read, rotate(R_BF, vector(read_wrench[foot, 3:])))
         put(load_by_mass[foot], scale(1.0 / known.mass, foot_force))
         carried += load
     # Velocity of the centre of mass relative to the IMU.
@@ -372,10 +384,15 @@ def _estimate_base(
             shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
             noise, period = sensors.acceleration_noise, known.period
             watch_force_delay(x.force_delay, shown, push, noise, elapsed, period)
+            push_read = scale(1.0 / known.mass, force_read)
+            if watch_force_lag(x.force_lag, shown, push_read, noise, elapsed, period):
+                take_force_delay(x.force_delay, x.force_lag.delay * period)
         else:
             forget_force_delay(x.force_delay)
+            forget_force_lag(x.force_lag)
     else:
         forget_force_delay(x.force_delay)
+        forget_force_lag(x.force_lag)
         if not is_fresh or elapsed > LONGEST_COMPARED_TICK:
             x.check.age = 0.0
             x.check.doubt[:] = 0.0
@@ -513,6 +530,10 @@ class InvariantBaseFilter(RecursiveEstimator):
                                contradicts [s]
         force_delay            what `watch_force_delay` remembers: the `delay` of the foot forces
                                [s], and more, see `force_delay_type`
+        force_lag              what `watch_force_lag` remembers: the `time_constant` of the foot
+                               sensors' low-pass [s], and more, see `force_lag_type`
+        pad_force, pad_force_read      (P, 3)  force on each pad over the tick, and as it was read
+                                       before that low-pass was undone [N]
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
         lost_for               ()      for how long all feet that stand have contradicted the
@@ -573,7 +594,7 @@ class InvariantBaseFilter(RecursiveEstimator):
 def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
     """Type of the posterior of `InvariantBaseFilter`."""
     feet = len(robot.description.sides)
-    n = FEET + 6 * feet
+    n, pads = FEET + 6 * feet, sum(leg.points for leg in robot.description.legs.values())
     triples = (
         "angular_velocity",
         "base_position",
@@ -623,4 +644,6 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         lost_for=(),
         check=cross_check_type(feet),
         force_delay=force_delay_type(clock),
+        force_lag=force_lag_type(clock),
+        **dict.fromkeys(("pad_force", "pad_force_read"), (pads, 3)),
     )

@@ -60,16 +60,17 @@ def force_delay_type(clock: Clock) -> np.dtype:
 
 def delays_of(clock: Clock) -> int:
     """How many delays there are, from none to the longest."""
-    return _delays(clock.period)
+    return delays_of_period(clock.period)
 
 
 def room_for_delays(clock: Clock) -> int:
     """How many ticks are remembered: the delays of the clock, and no fewer than at 0.5 ms."""
-    return max(_delays(clock.period), _delays(_FASTEST_USUAL_PERIOD))
+    return max(delays_of_period(clock.period), delays_of_period(_FASTEST_USUAL_PERIOD))
 
 
 @njit(cache=True)
-def _delays(period: float) -> int:
+def delays_of_period(period: float) -> int:
+    """See `delays_of`."""
     return 1 + math.floor(_LONGEST / period + 1e-6)
 
 
@@ -104,6 +105,13 @@ def forget_force_delay(x: np.ndarray) -> None:
     """
     x.total[:], x.square[:], x.cross[:], x.push_total[:] = 0.0, 0.0, 0.0, 0.0
     x.push_square = x.filled = x.count = 0.0
+
+
+@njit(cache=True)
+def take_force_delay(x: np.ndarray, delay: float) -> None:
+    """Has a delay [s], as it was found otherwise; none has shown before."""
+    forget_force_delay(x)
+    x.usual[:], x.delay = 0.0, delay
 
 
 @njit(cache=True)
@@ -142,7 +150,7 @@ def watch_force_delay(
         x.smooth[0, i] += blend * (acceleration[i] - x.smooth[0, i])
         x.smooth[1, i] += blend * (push[i] - x.smooth[1, i])
     acceleration, push = vector(x.smooth[0]), vector(x.smooth[1])
-    delays = _delays(period)
+    delays = delays_of_period(period)
     for age in range(delays - 1, 0, -1):
         x.shown[age], x.read[age] = x.shown[age - 1], x.read[age - 1]
     put(x.shown[0], acceleration)

@@ -100,6 +100,7 @@ def _estimate_link_torque(
     model: np.ndarray,
     acceleration: np.ndarray,
     torque_command: np.ndarray,
+    pad_force: np.ndarray,
     delay: float,
     past: np.ndarray,
     known: np.ndarray,
@@ -107,6 +108,7 @@ def _estimate_link_torque(
     """One tick of `LinkTorqueEstimator`; fills the posterior.
 
     Args:
+        pad_force: over the tick, without what a low-pass does to it, (P, 3) [N].
         delay: by how much the forces are late [s].
         past: the posterior's `now` in the last ticks, see `History`.
         torque_command: where the tick began, shape (n,) [Nm].
@@ -118,7 +120,7 @@ def _estimate_link_torque(
     posterior, last, measured = posterior[()], last[()], measured[()]
     model, acceleration, past, known = model[()], acceleration[()], past[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
-    wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
+    wrench = foot_wrenches(pad_force, pads.position, pads.foot, feet)
     posterior.late = posterior.duration = 0.0
     watch_forces(posterior, last, elapsed, wrench, known)
     if not np.isfinite(torque_command).all() or not math.isfinite(delay):
@@ -334,17 +336,20 @@ class LinkTorqueEstimator(RecursiveEstimator):
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
     ) -> None:
-        delay = 0.0
+        measured, delay = self._measurements.Eval(context), 0.0
+        pad_force = measured["mean"]["pad_force"]
         if self._base_state is not None:
-            delay = float(self._base_state.Eval(context)["force_delay"]["delay"])
+            heard = self._base_state.Eval(context)
+            delay, pad_force = float(heard["force_delay"]["delay"]), heard["pad_force"]
         _estimate_link_torque(
             posterior,
             last,
             elapsed,
-            self._measurements.Eval(context),
+            measured,
             self._model.Eval(context),
             self._acceleration.Eval(context),
             self._torque_command.Eval(context),
+            pad_force,
             delay,
             self._past.Eval(context),
             self._known,

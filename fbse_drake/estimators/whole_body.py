@@ -173,7 +173,9 @@ def _begin(
     attitude: Record,
     torque_command: np.ndarray,
     believed: np.ndarray,
+    pad_force: np.ndarray,
     past: Record,
+    lag: float,
     delay: float,
     usual_delay: np.ndarray,
     tick: Record,
@@ -187,7 +189,9 @@ def _begin(
         elapsed: of the tick [s], NaN of the first.
         believed: torque loss of the model's own effects, and its slope, at the velocities that are
             measured, (2, n).
+        pad_force: over the tick, without what a low-pass does to it, (P, 3) [N].
         past: of the ticks before, see `motion_type`.
+        lag: time constant of that low-pass [s].
         delay: by how much the forces are late [s].
         usual_delay: for how long each delay has shown [s].
         tick: that to which the forces belong that are read now; filled, see `_tick_type`.
@@ -196,7 +200,7 @@ def _begin(
     attitude, past, tick, known = attitude[()], past[()], tick[()], known[()]
     posterior[()] = last
     pads, feet = known.pads, len(known.wrench_variance)
-    wrench = foot_wrenches(measured.mean.pad_force, pads.position, pads.foot, feet)
+    wrench = foot_wrenches(pad_force, pads.position, pads.foot, feet)
     watch_forces(x, last, elapsed, wrench, known)
     _watch_accelerometer(x, last, elapsed, measured.mean.specific_force, known)
     x.status, now = measured.trust.max(), x.now
@@ -224,14 +228,16 @@ def _begin(
     for i in range(r):
         walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
         x.covariance[r + i, r + i] += walk**2 * elapsed
-    T = then.duration * then.known if is_known else 0.0
-    if x.late != last.late:
+    T, x.lag = then.duration * then.known if is_known else 0.0, lag
+    if (x.lag > 0.0) != (last.lag > 0.0):
+        T = 0.0
+        forget_laws(x, known)
+    elif x.late != last.late:
         # The last state is of another tick; and until a delay has shown, its laws were learned with
         # forces of another time.
         T = 0.0
         if not usual_delay.any():
             forget_laws(x, known)
-    pad_force = measured.mean.pad_force
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     put_push(
         tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
@@ -494,6 +500,7 @@ class WholeBodyFilter(RecursiveEstimator):
         reading                  (r,)    what gyro and encoders read, free of the bias [rad/s]
         late                     ()      how many ticks ago the forces were what is read now: all
                                          but the friction is of that tick
+        lag                      ()      time constant of the foot sensors' low-pass [s]
         now                      what is known of the present tick but for the forces, see
                                  `motion_type`; remembered as long as forces may be late
         doubt                    (n,)    the largest `lacking` of late, with what has been learned
@@ -536,6 +543,7 @@ class WholeBodyFilter(RecursiveEstimator):
             time=(),
             status=(),
             late=(),
+            lag=(),
             surprise=(),
             acceleration_noise=(),
             **dict.fromkeys(("specific_force", "specific_force_change"), (3,)),
@@ -596,19 +604,21 @@ class WholeBodyFilter(RecursiveEstimator):
         measured, attitude = self._measurements.Eval(context), self._attitude.Eval(context)
         torque_command, past = self._torque_command.Eval(context), self._past.Eval(context)
         model, regressor, known = self._model.Eval(context), self._regressor, self._known
-        shaped, delay, usual_delay = regressor.shaped, 0.0, _NO_DELAY
+        shaped, lag, delay, usual_delay = regressor.shaped, 0.0, 0.0, _NO_DELAY
+        pad_force = measured["mean"]["pad_force"]
         if math.isnan(elapsed):
             last = self._start()
         if self._hears_delay:
             heard = attitude["force_delay"]
             delay, usual_delay = heard["delay"].item(), heard["usual"]
+            lag, pad_force = attitude["force_lag"]["time_constant"].item(), attitude["pad_force"]
         tick, believed = np.empty((), self._tick_type), self._no_torque
         if self._believed.effects:
             memory = self._of_effects.Eval(context)
             believed = np.array(self._believed.torque_and_slope(memory, self._motion(context)))
         _begin(
-            posterior, last, elapsed, measured, model, attitude, torque_command, believed, past,
-            delay, usual_delay, tick, known,
+            posterior, last, elapsed, measured, model, attitude, torque_command, believed,
+            pad_force, past, lag, delay, usual_delay, tick, known,
         )  # fmt: skip
         law = regressor(tick["velocity"])
         if tick["duration"] > 0.0:

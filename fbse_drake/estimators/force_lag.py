@@ -1,0 +1,223 @@
+"""How slow the foot sensors' low-pass is: forces that it smooths answer to the acceleration that
+they make in another way than forces that only come late.
+
+Of a first-order low-pass with time constant t the true force is the one that is read, plus t times
+its rate. So the forces' push p, the gain g and offset c that it has, and the acceleration a that
+the other sensors show d ticks before obey p + t dp/dt = g a(d) + c, in which t and g are found by
+least squares for every delay d.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from fbse_drake.estimators.force_delay import delays_of_period, room_for_delays
+from fbse_drake.estimators.records import Record, record_type
+from fbse_drake.estimators.recursive import Clock
+from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract, vector
+
+# Time constants of the two low-passes by which both sides are smoothed, how long these take to
+# settle, and for how long it counts what was measured [s].
+_SMOOTHING, _SETTLED, _MEMORY = (0.005, 0.01), 0.06, 1.0
+# How much of that time it takes to know the noise.
+_LEAST = 0.15
+# The shortest and the longest time constant that is told [s].
+_SHORTEST, _LONGEST = 3e-4, 3e-2
+# How much of the way in which forces change must be explained to tell their lag.
+_EXPLAINED = 0.9
+# How much likelier one of two hypotheses must be to be the one that shows, as the logarithm of the
+# ratio. Where neither does, none has a lag if that is known to this [s].
+_SHOWN, _SHARP = 3.0, 2e-4
+# A sensor's low-pass does not come and go: for how long it counts what has shown [s], how long a
+# lag must have shown to be taken [s], and how many times as long as none.
+_USUAL_TIME, _SEEN, _LONGER = 10.0, 0.1, 2.0
+
+
+def force_lag_type(clock: Clock) -> np.dtype:
+    """What `watch_force_lag` remembers.
+
+    `smooth` (2, 2, 3), accelerations by the other sensors and by the forces behind each of the
+    low-passes; `shown` (room, 3), the former so many ticks ago [m/s^2]; `ticks` since it began;
+    sums over the last time, of `count` ticks: `total` (room, 3), `square`, `cross` and `rate_cross`
+    (room,) of `shown`, of its square and its products with the forces and with their rate, and
+    those of the latter two, `push_total`, `rate_total` (3,), `push_square`, `push_rate` and
+    `rate_square`; `lag_time` and `none_time`, for how long a lag, and that there is none, has shown
+    [s]; the `time_constant` [s], 0 without one, and the `delay` besides [ticks].
+    """
+    room = room_for_delays(clock)
+    shapes = {"smooth": (2, 2, 3), "shown": (room, 3), "total": (room, 3)}
+    shapes |= dict.fromkeys(("square", "cross", "rate_cross"), (room,))
+    shapes |= dict.fromkeys(("push_total", "rate_total"), (3,))
+    numbers = ["ticks", "count", "push_square", "push_rate", "rate_square"]
+    numbers += ["lag_time", "none_time", "time_constant", "delay"]
+    return record_type(**shapes, **dict.fromkeys(numbers, ()))
+
+
+@njit(cache=True)
+def forget_force_lag(x: Record) -> None:
+    """Begins anew; what has been found stays."""
+    x.total[:], x.square[:], x.cross[:], x.rate_cross[:] = 0.0, 0.0, 0.0, 0.0
+    x.push_total[:], x.rate_total[:] = 0.0, 0.0
+    x.push_square = x.push_rate = x.rate_square = x.ticks = x.count = 0.0
+
+
+@njit(cache=True)
+def watch_force_lag(
+    x: Record, acceleration: Vector, push: Vector, noise: float, elapsed: float, period: float
+) -> bool:
+    """One tick.
+
+    Args:
+        x: record of `force_lag_type`, of the tick before; filled.
+        acceleration, push: specific force of the centre of mass by IMU and joints, and by the
+            forces as they are read [m/s^2].
+        noise: of the accelerometer [m/s^2].
+        elapsed, period: of this tick, and of one that is neither early nor late [s].
+
+    Returns:
+        Has a lag been found, or given up?
+    """
+    delays, before = delays_of_period(period), vector(x.smooth[1, 1])
+    for i in range(3):
+        rough = acceleration[i], push[i]
+        for stage in range(2):
+            blend = 1.0 - math.exp(-elapsed / _SMOOTHING[stage]) if x.ticks > 0 else 1.0
+            x.smooth[stage, 0, i] += blend * (rough[0] - x.smooth[stage, 0, i])
+            x.smooth[stage, 1, i] += blend * (rough[1] - x.smooth[stage, 1, i])
+            rough = x.smooth[stage, 0, i], x.smooth[stage, 1, i]
+    for age in range(delays - 1, 0, -1):
+        x.shown[age] = x.shown[age - 1]
+    x.shown[0], read = x.smooth[1, 0], vector(x.smooth[1, 1])
+    rate = scale(1.0 / elapsed, subtract(read, before))
+    x.ticks += 1.0
+    if x.ticks * elapsed < _SETTLED or x.ticks < delays + 1:
+        return False
+    _add_up(x, read, rate, math.exp(-elapsed / _MEMORY), delays)
+    if x.count * elapsed < _LEAST * _MEMORY:
+        return False
+    variation = _both(x.push_square, x.push_total, x.push_total, x.count)
+    best = plain = 0
+    lowest = lowest_plain = math.inf
+    for late in range(delays):
+        mismatch = _mismatch(x, late, _time_constant(x, late))
+        if mismatch < lowest:
+            best, lowest = late, mismatch
+        mismatch = _mismatch(x, late, 0.0)
+        if mismatch < lowest_plain:
+            plain, lowest_plain = late, mismatch
+    time_constant = _time_constant(x, best)
+    smoothing = _SMOOTHING[0] + _SMOOTHING[1]
+    variance = max(noise**2 * period / (2.0 * smoothing), lowest / (3.0 * x.count))
+    # Of the smoothed readings so many are as good as one.
+    variance *= 1.0 + 2.0 * smoothing / period
+    keep, explained = math.exp(-elapsed / _USUAL_TIME), (1.0 - _EXPLAINED) * variation
+    x.lag_time *= keep
+    x.none_time *= keep
+    has_lag = _SHORTEST < time_constant < _LONGEST and lowest < explained
+    lag_shows = has_lag and lowest_plain - lowest > 2.0 * variance * _SHOWN
+    if lag_shows:
+        x.lag_time += elapsed
+    elif lowest_plain < explained and _none_shows(x, plain, lowest_plain, variance):
+        x.none_time += elapsed
+    had_lag, ours = x.time_constant > 0.0, int(x.delay)
+    if not (x.lag_time > _SEEN and x.lag_time > _LONGER * x.none_time):
+        x.time_constant = x.delay = 0.0
+        return had_lag
+    if not lag_shows:
+        return False
+    if had_lag and best != ours:
+        # Delay and lag are much alike.
+        of_ours = _time_constant(x, ours)
+        if _mismatch(x, ours, of_ours) - lowest < 2.0 * variance * _SHOWN:
+            best, time_constant = ours, of_ours
+    x.time_constant, x.delay = time_constant, float(best)
+    return not had_lag or best != ours
+
+
+@njit(cache=True)
+def _add_up(x: Record, read: Vector, rate: Vector, keep: float, delays: int) -> None:
+    """Adds a tick to the sums."""
+    x.count = keep * x.count + 1.0
+    x.push_square = keep * x.push_square + dot(read, read)
+    x.push_rate = keep * x.push_rate + dot(read, rate)
+    x.rate_square = keep * x.rate_square + dot(rate, rate)
+    put(x.push_total, add(scale(keep, vector(x.push_total)), read))
+    put(x.rate_total, add(scale(keep, vector(x.rate_total)), rate))
+    for late in range(delays):
+        shown = vector(x.shown[late])
+        x.square[late] = keep * x.square[late] + dot(shown, shown)
+        x.cross[late] = keep * x.cross[late] + dot(shown, read)
+        x.rate_cross[late] = keep * x.rate_cross[late] + dot(shown, rate)
+        put(x.total[late], add(scale(keep, vector(x.total[late])), shown))
+
+
+@njit(cache=True)
+def _both(product: float, one: np.ndarray, other: np.ndarray, count: float) -> float:
+    """Sum of products about the means, from that of products and those of each, (3,)."""
+    return product - dot(vector(one), vector(other)) / count
+
+
+@njit(cache=True)
+def _of_delay(x: Record, late: int) -> tuple[float, float, float]:
+    """Sums about the means of what was shown so many ticks ago: of its square, and of its products
+    with the forces and with their rate."""
+    square = _both(x.square[late], x.total[late], x.total[late], x.count)
+    cross = _both(x.cross[late], x.total[late], x.push_total, x.count)
+    return max(square, 1e-9), cross, _both(x.rate_cross[late], x.total[late], x.rate_total, x.count)
+
+
+@njit(cache=True)
+def _information(x: Record, late: int) -> float:
+    """Of the time constant, but for the noise's variance: the forces' rate squared, as far as the
+    acceleration of so many ticks ago does not explain it."""
+    square, _, rate_cross = _of_delay(x, late)
+    rate_square = _both(x.rate_square, x.rate_total, x.rate_total, x.count)
+    return max(rate_square - rate_cross**2 / square, 1e-9)
+
+
+@njit(cache=True)
+def _time_constant(x: Record, late: int) -> float:
+    """That of least squares with a delay, at least 0 [s]."""
+    square, cross, rate_cross = _of_delay(x, late)
+    push_rate = _both(x.push_rate, x.push_total, x.rate_total, x.count)
+    return max(0.0, (cross * rate_cross / square - push_rate) / _information(x, late))
+
+
+@njit(cache=True)
+def _mismatch(x: Record, late: int, time_constant: float) -> float:
+    """Sum of squares that a delay [ticks] and a time constant [s] leave, with the best gain."""
+    square, cross, rate_cross = _of_delay(x, late)
+    push = _both(x.push_square, x.push_total, x.push_total, x.count)
+    push_rate = _both(x.push_rate, x.push_total, x.rate_total, x.count)
+    rate = _both(x.rate_square, x.rate_total, x.rate_total, x.count)
+    true = push + 2.0 * time_constant * push_rate + time_constant**2 * rate
+    return true - (cross + time_constant * rate_cross) ** 2 / square
+
+
+@njit(cache=True)
+def _none_shows(x: Record, plain: int, lowest_plain: float, variance: float) -> bool:
+    """Does it show that there is no lag?
+
+    Args:
+        plain, lowest_plain: the best delay without one, and what it leaves.
+    """
+    if x.time_constant > 0.0:
+        ours = _mismatch(x, int(x.delay), x.time_constant)
+        return ours - lowest_plain > 2.0 * variance * _SHOWN
+    return variance < _SHARP**2 * _information(x, plain)
+
+
+@njit(cache=True)
+def undo_lag(
+    result: np.ndarray, read: np.ndarray, before: np.ndarray, time_constant: float, elapsed: float
+) -> None:
+    """Fills the forces (P, 3) that a low-pass has turned into those that are read [N].
+
+    Args:
+        read, before: as they are read, and a tick ago, (P, 3) [N].
+    """
+    for pad in range(len(read)):
+        for i in range(3):
+            rate = (read[pad, i] - before[pad, i]) / elapsed
+            result[pad, i] = read[pad, i] + time_constant * rate
