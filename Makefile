@@ -83,6 +83,7 @@ fuzz: $(INSTALLED)
 fbse: $(INSTALLED)
 	$(VENV)/bin/python -m benchmarks.fbse
 	$(VENV)/bin/python -m benchmarks.off_nominal
+	$(VENV)/bin/python -m benchmarks.completed_model
 	$(VENV)/bin/python -m benchmarks.faults
 	$(VENV)/bin/python -m benchmarks.limit --seeds 10
 	$(VENV)/bin/python -m benchmarks.consistency --seeds 10

@@ -75,6 +75,13 @@ def _foot_gain(gain: float) -> Case:
     return Case(f"foot force x {gain:g}, left foot", untold=(effect,))
 
 
+def _foot_lag(time_constant: float) -> Case:
+    """Both feet's sensors are read through a low-pass of this time constant [s]."""
+    of_feet = ", ".join(f"{side}: {time_constant}" for side in ("left", "right"))
+    effect = f"robot.effects.foot_lag=!FootForceLag {{time_constant: {{{of_feet}}}}}"
+    return Case(f"foot forces behind a low-pass of {1e3 * time_constant:g} ms", untold=(effect,))
+
+
 def _rotors(inertia: float) -> Case:
     """All joints have rotors of this reflected inertia that the model lacks [kg m^2]."""
     effect = f"robot.effects.rotors=!ReflectedInertia {{inertia: {{all: {inertia}}}}}"
@@ -103,6 +110,9 @@ CASES = (
     _biases(0.3, 0.05),
     Case("foot force noise x 3", untold=("sensors.foot_force.noise=1.5",)),
     Case("foot forces 5 ms late", untold=("sensors.foot_force.delay=0.005",)),
+    Case("foot forces 12 ms late", untold=("sensors.foot_force.delay=0.012",)),
+    _foot_lag(0.002),
+    _foot_lag(0.005),
     _foot_gain(1.02),
     _foot_gain(0.95),
     _rotors(0.05),

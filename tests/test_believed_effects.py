@@ -71,12 +71,12 @@ def walked(which: str) -> Log:
     return simulate(with_effects(WALK, effects, "robot", "model")).log
 
 
-def error(log: Log) -> float:
-    """Root mean square of the friction's error over that of the friction, from 1 s on, mean over
-    the joints but the hip yaws."""
+def error(log: Log, start: float = 1.0) -> float:
+    """Root mean square of the friction's error over that of the friction, from a time on [s], mean
+    over the joints but the hip yaws."""
     truth = log["truth/joint/friction_torque"][:-1]
     found = log["estimate/joint/friction_torque"][1:]
-    after = log.time[1:] > 1.0
+    after = log.time[1:] > start
     moving = [not joint.endswith("hip_yaw") for joint in log.joints]
     squares = ((found - truth)[after] ** 2).mean(axis=0) / (truth[after] ** 2).mean(axis=0)
     return float(np.sqrt(squares[moving]).mean())

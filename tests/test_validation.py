@@ -26,6 +26,7 @@ from fbse_drake.discrepancy.diagnosis.validation import (
 )
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.files import write_text
 from fbse_drake.report.sentences import (
     Inputs,
@@ -156,6 +157,11 @@ def test_a_study_is_headed_by_what_was_set_aside(
     assert ("What was fitted suggests that the model lacks Coulomb friction" in outcome) == refuted
     assert ("The model lacked Coulomb friction" in outcome) != refuted
     assert ("before it is used" in steps_after_study(result, inputs)[0].text) == refuted
+    watched = dataclasses.replace(result.scenario, estimator=Fbse())
+    for of_study in (result, dataclasses.replace(result, scenario=watched)):
+        commands = [step.command or "" for step in steps_after_study(of_study, inputs)]
+        estimates = "fbse estimate out/completed.yaml log.npz" in commands
+        assert estimates == (of_study.scenario is watched and not refuted)
     diagnosis = dataclasses.replace(result.diagnoses[0], set_aside=result.set_aside)
     assert ("suggests that the model lacks" in diagnosis_outcome(diagnosis)) == refuted
     command = steps_after_diagnosis(diagnosis, inputs)[0].command

@@ -352,10 +352,13 @@ def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
         # What was found and not added is not to be added by hand either.
         return tuple(_experiments_next(last, ())) or (_NOTHING,)
     command = f"fbse compare {inputs.out}/completed.yaml ANOTHER_LOG"
-    text = "Try the completed model on a log that it has not seen"
+    text, uses = "Try the completed model on a log that it has not seen", []
     if is_refuted(study.set_aside):
         text += ", before it is used for anything: this log does not confirm it"
-    return (Step(f"{text}:", command), *_experiments_next(last, study.found))
+    elif study.scenario.estimator.gives_friction:
+        estimate = f"fbse estimate {inputs.out}/completed.yaml {inputs.logs[0]}"
+        uses.append(Step("Estimate the friction with it:", estimate))
+    return (Step(f"{text}:", command), *uses, *_experiments_next(last, study.found))
 
 
 def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[Step]:
