@@ -15,7 +15,7 @@ from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract
 
 # The longest delay that is looked for, and for how long it counts what gain and bias the forces
 # had, and how noisy they were [s].
-_LONGEST, _MEMORY = 0.02, 0.3
+_LONGEST, _MEMORY = 0.025, 0.3
 # Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
 # the size of what they remember, and one for every rate would take half a minute each to compile.
 _FASTEST_USUAL_PERIOD = 0.0005
@@ -108,6 +108,12 @@ def forget_force_delay(x: np.ndarray) -> None:
 
 
 @njit(cache=True)
+def is_uneven(elapsed: float, period: float) -> bool:
+    """Is a tick too long or too short to compare what was read in ticks before it [s]?"""
+    return abs(elapsed - period) > _UNEVEN * period
+
+
+@njit(cache=True)
 def take_force_delay(x: np.ndarray, delay: float) -> None:
     """Has a delay [s], as it was found otherwise; none has shown before."""
     forget_force_delay(x)
@@ -139,7 +145,7 @@ def watch_force_delay(
         noise: of the accelerometer, that no difference is below [m/s^2].
         elapsed, period: of this tick, and of one that is neither early nor late [s].
     """
-    if abs(elapsed - period) > _UNEVEN * period:
+    if is_uneven(elapsed, period):
         forget_force_delay(x)
         return
     if x.filled == 0:
