@@ -14,7 +14,7 @@ from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Estimator, make_estimator
-from fbse_drake.estimators.recursive import start_share
+from fbse_drake.estimators.recursive import RecursiveEstimator, start_share
 from fbse_drake.log import Log
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
@@ -32,7 +32,8 @@ class EstimationResult(RunResult):
 
     log: Log
     tick_time: np.ndarray
-    # For the reader: what the sensors are believed to be, and what could not be estimated.
+    # For the reader: what the sensors are believed to be, what was found of them, and what could
+    # not be estimated.
     remarks: tuple[str, ...]
     scenario: Scenario
     name: str
@@ -68,13 +69,14 @@ def estimate(
     """
     replay = Replay(scenario, log)
     values, tick_time = replay.run(progress)
+    remarks = replay.remarks + replay.findings()
     release(replay.estimator)
     kept = {
         name: channel for name, channel in log.channels.items() if not name.startswith("estimate/")
     }
     meta = log.meta | {"estimator_scenario": dump_scenario(scenario, name)}
     estimated = Log(kept | values, meta)
-    return EstimationResult(estimated, tick_time, replay.remarks, scenario, name)
+    return EstimationResult(estimated, tick_time, remarks, scenario, name)
 
 
 def friction_estimates(
@@ -210,6 +212,12 @@ class Replay:
         two states.)"""
         self.estimator.CalcForcedUnrestrictedUpdate(self.context, self._next)
         self.context.SetDiscreteState(self._next_values)
+
+    def findings(self) -> tuple[str, ...]:
+        """For the reader: what the estimators have found out of the sensors by now."""
+        systems = [s for s in self.estimator.GetSystems() if isinstance(s, RecursiveEstimator)]
+        found = (s.findings(s.GetMyContextFromRoot(self.context)) for s in systems)
+        return tuple(text for texts in found for text in texts)
 
     def frictions(self) -> list[np.ndarray]:
         """The friction that each of the estimators tells, (N, n) each [Nm]."""

@@ -1,6 +1,7 @@
 """Foot forces that are read through a low-pass: its time constant, and the friction without it."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -13,14 +14,13 @@ from test_force_delay import specific_force
 
 from fbse_drake import simulate
 from fbse_drake.effects.sensor import FootForceLag
-from fbse_drake.estimation import Replay
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.force_lag import (
     force_lag_type,
     forget_force_lag,
     undo_lag,
     watch_force_lag,
 )
-from fbse_drake.estimators.records import as_record
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.estimators.spatial import vector
 
@@ -155,14 +155,13 @@ def test_friction_of_a_walk_whose_foot_sensors_lag(time_constant: float):
     robot = dataclasses.replace(walk.robot, effects={**walk.robot.effects, "lag": lag})
     log = simulate(dataclasses.replace(walk, robot=robot, model=walk.believed)).log
     assert error(log, 1.5) < 0.1
-    replay = Replay(walk, log)
-    system = replay.estimator.GetSubsystemByName("base_state")
-    context = system.GetMyContextFromRoot(replay.context)
-    for sample in range(1500):
-        replay.feed(sample)
-        posterior = as_record(
-            system.GetOutputPort("posterior").Eval(context), system.posterior_type
-        )
-        known = float(posterior["force_lag"]["time_constant"])
-        replay.update()
-    assert known == pytest.approx(time_constant, rel=0.1)
+    remark = estimate(walk, log).remarks[-1]
+    (found_time,) = re.findall(r"low-pass of ([0-9.]+) ms", remark)
+    assert float(found_time) == pytest.approx(1e3 * time_constant, rel=0.1)
+    # Behind the same model there is nothing more to find.
+    completed = dataclasses.replace(
+        walk, model=dataclasses.replace(walk.believed, effects={"l": lag})
+    )
+    told = estimate(completed, log)
+    assert not any("found to be" in text for text in told.remarks)
+    assert error(told.log, 1.0) < 0.06

@@ -61,7 +61,7 @@ from fbse_drake.estimators.invariant_error import (
     turn_to,
     update,
 )
-from fbse_drake.estimators.records import Record, record, record_type
+from fbse_drake.estimators.records import Record, as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
@@ -583,6 +583,14 @@ class InvariantBaseFilter(RecursiveEstimator):
     @staticmethod
     def input_types(robot: Robot) -> dict[str, np.dtype]:
         return {"measurements": measurements_type(robot), "model": model_type(robot)}
+
+    def findings(self, context: Context) -> tuple[str, ...]:
+        x = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        delay, lag = x["force_delay"]["delay"], x["force_lag"]["time_constant"]
+        found = [f"{1e3 * delay:.3g} ms late"] if delay > 0 else []
+        if lag > 0:
+            found.append(f"behind a low-pass of {1e3 * lag:.2g} ms (in a model: !FootForceLag)")
+        return (f"Foot forces were found to be {' and '.join(found)}.",) if found else ()
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray

@@ -309,6 +309,10 @@ class RecursiveEstimator(LeafSystem):
         tickets = {self.input_port_ticket(port.get_index()) for port in inputs}
         return tickets | {self.time_ticket(), self.xd_ticket()}
 
+    def findings(self, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        """For the reader: what it has found out of the sensors by now."""
+        return ()
+
     def input_ports(self) -> list[InputPort]:
         """All of them, in order."""
         return [self.get_input_port(i) for i in range(self.num_input_ports())]
