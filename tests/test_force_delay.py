@@ -181,8 +181,8 @@ def test_the_tick_that_ended_so_long_ago():
 
 
 def test_delays_that_are_looked_for():
-    assert delays_of(CLOCK) == 26
-    assert delays_of(Clock.every(5e-4)) == 51
+    assert delays_of(CLOCK) == 31
+    assert delays_of(Clock.every(5e-4)) == 61
     # Slower sensors than that cannot be late by a whole tick.
     assert delays_of(Clock.every(0.05)) == 1
 
@@ -191,7 +191,7 @@ def test_usual_clocks_share_compiled_functions():
     """These are made for types, and a type holds the sizes of its arrays."""
     for period in (5e-4, 2e-3, 0.01, 0.05):
         assert force_delay_type(Clock.every(period)) is force_delay_type(CLOCK)
-    assert force_delay_type(Clock.every(2.5e-4))["shown"].shape == (101, 3)
+    assert force_delay_type(Clock.every(2.5e-4))["shown"].shape == (121, 3)
 
 
 BASE_STATE = record_type(force_delay=record_type(delay=()), pad_force=(8, 3))

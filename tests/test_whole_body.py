@@ -142,7 +142,7 @@ def test_filter_is_the_textbook_one_on_drakes_equation_of_motion():
         return rig.tick(
             measurements=BASE.measurements(**read(velocity, force)),
             model_over_step=BASE.model_of(**read(start)),
-            attitude=pack(ATTITUDE, rotation=np.eye(3)),
+            attitude=pack(ATTITUDE, rotation=np.eye(3), pad_force=pad_force),
             torque_command=command,
         )
 

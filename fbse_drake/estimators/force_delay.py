@@ -15,7 +15,7 @@ from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract
 
 # The longest delay that is looked for, and for how long it counts what gain and bias the forces
 # had, and how noisy they were [s].
-_LONGEST, _MEMORY = 0.025, 0.3
+_LONGEST, _MEMORY = 0.03, 0.3
 # Slower clocks keep as many ticks as one of this period [s] does: compiled functions are made for
 # the size of what they remember, and one for every rate would take half a minute each to compile.
 _FASTEST_USUAL_PERIOD = 0.0005
