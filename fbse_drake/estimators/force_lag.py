@@ -113,16 +113,19 @@ def watch_force_lag(
     _add_up(x, smooth, rate, spurious, math.exp(-elapsed / _MEMORY), delays)
     if x.count * elapsed < _LEAST * _MEMORY:
         return False
-    best = plain = 0
+    forces, best, plain, time_constant = _of_forces(x), 0, 0, 0.0
     lowest = lowest_plain = math.inf
     for late in range(delays):
-        mismatch = _mismatch(x, late, _time_constant(x, late))
+        shown = _of_delay(x, late)
+        of_delay = _time_constant(forces, shown)
+        mismatch, mismatch_plain = (
+            _mismatch(forces, shown, of_delay),
+            _mismatch(forces, shown, 0.0),
+        )
         if mismatch < lowest:
-            best, lowest = late, mismatch
-        mismatch = _mismatch(x, late, 0.0)
-        if mismatch < lowest_plain:
-            plain, lowest_plain = late, mismatch
-    time_constant = _time_constant(x, best)
+            best, time_constant, lowest = late, of_delay, mismatch
+        if mismatch_plain < lowest_plain:
+            plain, lowest_plain = late, mismatch_plain
     smoothed = 2.0 * _SMOOTHING / period
     variance = max(noise**2 / smoothed, lowest / (3.0 * x.count))
     # Of the smoothed readings so many are as good as one.
@@ -130,7 +133,7 @@ def watch_force_lag(
     keep = math.exp(-elapsed / _USUAL_TIME)
     x.lag_time *= keep
     x.none_time *= keep
-    is_clear = _of_forces(x)[2] > _CLEAR * x.spurious
+    is_clear = forces[2] > _CLEAR * x.spurious
     has_lag = _SHORTEST < time_constant < _LONGEST and _explains(x, best, lowest)
     lag_shows = is_clear and has_lag and lowest_plain - lowest > 2.0 * variance * _SHOWN
     if lag_shows:
@@ -138,7 +141,7 @@ def watch_force_lag(
     elif (
         is_clear
         and _explains(x, plain, lowest_plain)
-        and _none_shows(x, plain, lowest_plain, variance)
+        and _none_shows(x, forces, plain, lowest_plain, variance)
     ):
         x.none_time += elapsed
     had_lag, ours = x.time_constant > 0.0, int(x.delay)
@@ -149,8 +152,9 @@ def watch_force_lag(
         return False
     if had_lag and best != ours:
         # Delay and lag are much alike.
-        of_ours = _time_constant(x, ours)
-        if _mismatch(x, ours, of_ours) - lowest < 2.0 * variance * _SHOWN:
+        shown = _of_delay(x, ours)
+        of_ours = _time_constant(forces, shown)
+        if _mismatch(forces, shown, of_ours) - lowest < 2.0 * variance * _SHOWN:
             best, time_constant = ours, of_ours
     x.time_constant, x.delay = time_constant, float(best)
     return not had_lag or best != ours
@@ -220,10 +224,14 @@ def _of_delay(x: Record, late: int) -> Vector:
 
 
 @njit(cache=True)
-def _time_constant(x: Record, late: int) -> float:
-    """That of least squares with a delay, at least 0 [s]."""
-    push, push_rate, rate = _of_forces(x)
-    _, cross, rate_cross = _of_delay(x, late)
+def _time_constant(forces: Vector, shown: Vector) -> float:
+    """That of least squares with a delay, at least 0 [s].
+
+    Args:
+        forces, shown: see `_of_forces` and `_of_delay`.
+    """
+    push, push_rate, rate = forces
+    _, cross, rate_cross = shown
     of_push, of_rate = cross * rate - rate_cross * push_rate, rate_cross * push - cross * push_rate
     if of_push <= 0.0 or push * rate <= push_rate**2:
         return 0.0
@@ -231,10 +239,11 @@ def _time_constant(x: Record, late: int) -> float:
 
 
 @njit(cache=True)
-def _mismatch(x: Record, late: int, time_constant: float) -> float:
-    """Sum of squares that a delay [ticks] and a time constant [s] leave, with the best gain."""
-    push, push_rate, rate = _of_forces(x)
-    square, cross, rate_cross = _of_delay(x, late)
+def _mismatch(forces: Vector, shown: Vector, time_constant: float) -> float:
+    """Sum of squares that a delay and a time constant [s] leave, with the best gain; see
+    `_time_constant`."""
+    push, push_rate, rate = forces
+    square, cross, rate_cross = shown
     true = push + 2.0 * time_constant * push_rate + time_constant**2 * rate
     return square - max(0.0, cross + time_constant * rate_cross) ** 2 / max(true, 1e-9)
 
@@ -246,16 +255,18 @@ def _explains(x: Record, late: int, mismatch: float) -> bool:
 
 
 @njit(cache=True)
-def _none_shows(x: Record, plain: int, lowest_plain: float, variance: float) -> bool:
+def _none_shows(
+    x: Record, forces: Vector, plain: int, lowest_plain: float, variance: float
+) -> bool:
     """Does it show that there is no lag?
 
     Args:
         plain, lowest_plain: the best delay without one, and what it leaves.
     """
     if x.time_constant > 0.0:
-        ours = _mismatch(x, int(x.delay), x.time_constant)
+        ours = _mismatch(forces, _of_delay(x, int(x.delay)), x.time_constant)
         return ours - lowest_plain > 2.0 * variance * _SHOWN
-    push, push_rate, rate = _of_forces(x)
+    push, push_rate, rate = forces
     gain = _of_delay(x, plain)[1] / push
     return variance < (gain * _SHARP) ** 2 * (rate - push_rate**2 / push)
 
