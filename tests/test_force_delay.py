@@ -20,8 +20,8 @@ from fbse_drake.estimators.force_delay import (
 )
 from fbse_drake.estimators.link_torque import LinkTorqueEstimator
 from fbse_drake.estimators.model_aided import ModelAided
-from fbse_drake.estimators.records import record_type, ring_type
-from fbse_drake.estimators.recursive import Clock
+from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.recursive import Clock, Past
 from fbse_drake.estimators.spatial import vector
 
 TICK = CLOCK.period
@@ -168,16 +168,14 @@ def test_on_an_uneven_clock_no_delay_is_found():
 
 
 def test_the_tick_that_ended_so_long_ago():
-    past = np.zeros((), ring_type(record_type(duration=()), 4))
-    past["newest"] = 3
-    assert tick_of(0.0, past[()], 3.0) == 4  # None is remembered yet.
+    ring = np.zeros(4, record_type(duration=()))
+    assert tick_of(0.0, Past(3, ring), 3.0) == 4  # None is remembered yet.
     # The newest is the second; the one before it is the first, and the one before that the last.
-    past["newest"] = 1
-    past["of_tick"]["duration"] = [2.0, 1.0, 1.0, 1.0]
-    assert [tick_of(1.0, past[()], delay) for delay in (0.0, 1.1, 1.9, 2.9, 3.1, 5.0)] == [
+    ring["duration"], past = [2.0, 1.0, 1.0, 1.0], Past(1, ring)
+    assert [tick_of(1.0, past, delay) for delay in (0.0, 1.1, 1.9, 2.9, 3.1, 5.0)] == [
         0, 1, 2, 2, 3, 4,
     ]  # fmt: skip
-    assert tick_of(1.0, past[()], math.nan) == 0
+    assert tick_of(1.0, past, math.nan) == 0
 
 
 def test_delays_that_are_looked_for():

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numba import njit
 
-from fbse_drake.estimators.records import Record, record_type
-from fbse_drake.estimators.recursive import Clock, ticks_ago
+from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.recursive import Clock, Past, ticks_ago
 from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, subtract, vector
 
 # The longest delay that is looked for, and for how long it counts what gain and bias the forces
@@ -80,14 +80,14 @@ def remembered_ticks(clock: Clock) -> int:
 
 
 @njit(cache=True)
-def tick_of(elapsed: float, past: Record, delay: float) -> int:
+def tick_of(elapsed: float, past: Past, delay: float) -> int:
     """How many ticks ago one ended that ended so long ago [s].
 
     The nearest of those that are remembered; the present one if the delay is no number.
 
     Args:
         elapsed: how long the present tick took [s].
-        past: what is remembered of the ticks before, with their `duration` [s], see `History`.
+        past: what is remembered of the ticks before, with their `duration` [s].
     """
     age, best, nearest = elapsed, 0, abs(delay)
     for tick in range(1, len(past.of_tick) + 1):

@@ -14,7 +14,7 @@ from fbse_drake.estimators.floating_base import model_type
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.innovations import LOG_OF_SIX, LOG_OF_THREE, learned_noise
 from fbse_drake.estimators.records import record, record_type
-from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status, ticks_ago
+from fbse_drake.estimators.recursive import Clock, Past, RecursiveEstimator, Status, ticks_ago
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.robot.plant import Robot, grasp_map
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches, leg_of_joint
@@ -102,7 +102,7 @@ def _estimate_link_torque(
     torque_command: np.ndarray,
     pad_force: np.ndarray,
     delay: float,
-    past: np.ndarray,
+    past: Past,
     known: np.ndarray,
 ) -> None:
     """One tick of `LinkTorqueEstimator`; fills the posterior.
@@ -110,7 +110,7 @@ def _estimate_link_torque(
     Args:
         pad_force: over the tick, without what a low-pass does to it, (P, 3) [N].
         delay: by how much the forces are late [s].
-        past: the posterior's `now` in the last ticks, see `History`.
+        past: the posterior's `now` in the last ticks.
         torque_command: where the tick began, shape (n,) [Nm].
         known: record with the numbers of `SensorBeliefs` as `noise`; `pads`, see `FootPads`;
             `wrench_variance` (feet, 6) of each foot's measured wrench [(Nm)^2, N^2] as believed;
@@ -118,7 +118,7 @@ def _estimate_link_torque(
             feet that they move; and `learns_noise`.
     """
     posterior, last, measured = posterior[()], last[()], measured[()]
-    model, acceleration, past, known = model[()], acceleration[()], past[()], known[()]
+    model, acceleration, known = model[()], acceleration[()], known[()]
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(pad_force, pads.position, pads.foot, feet)
     posterior.late = posterior.duration = 0.0

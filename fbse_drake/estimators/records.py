@@ -41,11 +41,6 @@ def record_type(**fields: tuple[int, ...] | np.dtype) -> np.dtype:
     return _only(np.dtype([(n, k if isinstance(k, np.dtype) else (float, k)) for n, k in kinds]))
 
 
-def ring_type(kind: np.dtype, places: int) -> np.dtype:
-    """The type of a ring of records: those `of_tick` (places,), and the place of the `newest`."""
-    return _only(np.dtype([("newest", float), ("of_tick", kind, (places,))]))
-
-
 def size_of(kind: np.dtype) -> int:
     """How many numbers a record has."""
     return kind.itemsize // np.dtype(float).itemsize

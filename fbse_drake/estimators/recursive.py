@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -28,7 +28,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from fbse_drake.errors import InputError, located
-from fbse_drake.estimators.records import Record, as_record, parts, ring_type, size_of
+from fbse_drake.estimators.records import Record, as_record, parts, size_of
 from fbse_drake.robot.plant import Robot
 from fbse_drake.wiring import weakly
 
@@ -115,33 +115,41 @@ class RememberedInput:
         state.set_value(self.index, self.port.Eval(context))
 
 
-@njit(cache=True)
-def ticks_ago(past: Record, age: int) -> Record:
-    """What is remembered of the tick that ended so many ticks ago, 1 for the last one.
+class Past(NamedTuple):
+    """Records of the last ticks, in a ring. (An array of them is of one type, however many there
+    are: functions are compiled once for all tick rates.)"""
 
-    Args:
-        past: see `History`.
-    """
-    return past.of_tick[(int(past.newest) + 1 - age) % len(past.of_tick)]
+    # Place of the last one.
+    newest: int
+    of_tick: np.ndarray
+
+
+@njit(cache=True)
+def ticks_ago(past: Past, age: int) -> Record:
+    """What is remembered of the tick that ended so many ticks ago, 1 for the last one."""
+    return past.of_tick[(past.newest + 1 - age) % len(past.of_tick)]
 
 
 @dataclass(frozen=True)
 class History:
     """A field of the posterior, a record, as it was in the last ticks; zero before the first.
 
-    A ring of its own, of which a tick writes one place: what is long need not be copied.
+    A ring of its own, of which a tick writes one place: what is long need not be copied. The state
+    is the place of the newest, then the ring.
     """
 
     index: DiscreteStateIndex
-    # Of the ring, see `ring_type`.
+    # Of the record.
     kind: np.dtype
     # How many ticks are remembered, and where the posterior has the field.
     ticks: int
     part: slice
 
-    def Eval(self, context: Context) -> np.ndarray:
-        """All that is remembered, a ring."""
-        return as_record(context.get_discrete_state().value(self.index), self.kind)
+    def Eval(self, context: Context) -> Past:
+        """All that is remembered."""
+        values = context.get_discrete_state().value(self.index)
+        ring = np.ndarray((self.ticks,), self.kind, values, values.itemsize)
+        return Past(int(values.item(0)), ring)
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
         """Adds the present tick, if it is one."""
@@ -273,8 +281,8 @@ class RecursiveEstimator(LeafSystem):
 
     def _declare_history(self, field: str, ticks: int) -> History:
         """Declares a state for what a record of the posterior was in the last ticks."""
-        kind = ring_type(self.posterior_type[field], ticks)
-        index = self.DeclareDiscreteState(size_of(kind))
+        kind = self.posterior_type[field]
+        index = self.DeclareDiscreteState(1 + ticks * size_of(kind))
         history = History(index, kind, ticks, parts(self.posterior_type)[field])
         self._remembered.append(history)
         return history

@@ -47,6 +47,7 @@ from fbse_drake.estimators.missing_inertia import (
 from fbse_drake.estimators.records import Record, as_record, record, record_type
 from fbse_drake.estimators.recursive import (
     Clock,
+    Past,
     RecursiveEstimator,
     Status,
     start_share,
@@ -174,7 +175,7 @@ def _begin(
     torque_command: np.ndarray,
     believed: np.ndarray,
     pad_force: np.ndarray,
-    past: Record,
+    past: Past,
     lag: float,
     delay: float,
     usual_delay: np.ndarray,
@@ -190,14 +191,14 @@ def _begin(
         believed: torque loss of the model's own effects, and its slope, at the velocities that are
             measured, (2, n).
         pad_force: over the tick, without what a low-pass does to it, (P, 3) [N].
-        past: of the ticks before, see `motion_type`.
+        past: of the ticks before, records as of `motion_type`.
         lag: time constant of that low-pass [s].
         delay: by how much the forces are late [s].
         usual_delay: for how long each delay has shown [s].
         tick: that to which the forces belong that are read now; filled, see `_tick_type`.
     """
     x, last, measured, model = posterior[()], last[()], measured[()], model[()]
-    attitude, past, tick, known = attitude[()], past[()], tick[()], known[()]
+    attitude, tick, known = attitude[()], tick[()], known[()]
     posterior[()] = last
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(pad_force, pads.position, pads.foot, feet)
@@ -276,7 +277,7 @@ def _watch_accelerometer(
 
 
 @njit(cache=True)
-def _tick_of_forces(x: Record, past: Record) -> Record:
+def _tick_of_forces(x: Record, past: Past) -> Record:
     """What is known of the tick to which the forces belong that are read now, but for them."""
     return x.now if x.late == 0.0 else ticks_ago(past, int(x.late))
 
@@ -376,7 +377,7 @@ def _finish(
     shaped: np.ndarray,
     measured: Record,
     torque_command: np.ndarray,
-    past: Record,
+    past: Past,
     known: Record,
 ) -> None:
     """Updates the state; tells friction and its standard deviation by the law where the tick ends.
@@ -386,7 +387,7 @@ def _finish(
         law_now: the same at those that are measured now, for forces that are late.
     """
     x, last, measured, known = posterior[()], last[()], measured[()], known[()]
-    tick, past, velocity_now = tick[()], past[()], measured.joint_velocity
+    tick, velocity_now = tick[()], measured.joint_velocity
     if tick.duration > 0.0:
         linearise(x, tick.velocity, law, shaped, tick.believed)
         put_acceleration(x, tick, known)
@@ -656,6 +657,8 @@ class WholeBodyFilter(RecursiveEstimator):
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
         start["covariance"] = np.diag(deviations**2)
+        # As a posterior is: functions are compiled once for both.
+        start.flags.writeable = False
         return start
 
     def _weight_deviations(self) -> np.ndarray:
