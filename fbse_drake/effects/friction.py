@@ -27,6 +27,15 @@ def smooth_sign(
     return tanh, (1.0 - tanh * tanh) / transition
 
 
+def _tanh_each_once(rates: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """tanh(rates * velocity). A search tries many sets of rates, (m, G, 1, 1), that differ in one:
+    what repeats is evaluated once."""
+    if rates.ndim < 4 or rates.shape[2:] != (1, 1):
+        return np.tanh(rates * velocity)
+    values, place = np.unique(rates, return_inverse=True)
+    return np.tanh(values[:, None, None] * velocity)[place.reshape(rates.shape[:2])]
+
+
 @in_library
 @dataclass(frozen=True)
 class CoulombFriction(JointTorqueEffect):
@@ -193,7 +202,7 @@ class StribeckFriction(JointTorqueEffect):
         motion: JointMotion, nonlinear: np.ndarray
     ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
         # Rows: gamma2, gamma3, gamma5.
-        tanh = np.tanh(nonlinear * motion.velocity)
+        tanh = _tanh_each_once(nonlinear, motion.velocity)
         slope = nonlinear * (1.0 - tanh * tanh)
         return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
 

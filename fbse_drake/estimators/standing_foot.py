@@ -1,6 +1,8 @@
 """What a foot that stands tells of the base, and how far it is trusted."""
 
 import math
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numba import njit
@@ -43,8 +45,9 @@ from fbse_drake.estimators.spatial import (
     vector,
 )
 
-# What a standing foot tells.
-FOOT_POSITION, FOOT_ORIENTATION, FOOT_VELOCITY, FOOT_RATE, TOLD = range(5)
+# What a standing foot tells, and how many things that are. (numpy integers, see `invariant_error`.)
+FOOT_POSITION, FOOT_ORIENTATION, FOOT_VELOCITY, FOOT_RATE = cast(Sequence[int], np.arange(4))
+TOLD = 4
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
 _AT_REST, _WALKING_SPEED = 0.1, 0.03

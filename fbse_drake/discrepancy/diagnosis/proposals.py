@@ -69,6 +69,9 @@ class Proposals:
             share: so much of what is required is enough.
         """
         fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
+        # First, for the other effects are being predicted beside.
+        for effect in dictionary.joint_effects:
+            fits.grid(effect)
         if rows is None:
             rows = np.arange(len(beside.scale))
         enough = share * fits.threshold[1]
