@@ -27,6 +27,7 @@ from fbse_drake.effects.contact import (
     ContactEffect,
     FootCreep,
     GroundCompliance,
+    GroundSlope,
     PadContact,
     pad_contact,
     spring_force,
@@ -44,6 +45,7 @@ from fbse_drake.effects.joint_torque import (
 from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.robot.plant import gravity_on_slope
 from fbse_drake.scenario import Scenario, build_robot
 from fbse_drake.sensors.foot_force import force_noise
 
@@ -56,6 +58,8 @@ _ROUNDING = 1e-9
 _EVALUATIONS = 8
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
+# Effects of which it is known what they add with any values, not only per unit near none.
+_CURVED = (InertiaEffect, GeometryEffect, SensorEffect, GroundSlope)
 
 
 class Predictor:
@@ -145,6 +149,7 @@ class Predictor:
         for known in self._known:
             residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
+            residual = residual.minus(self._on_slope(self._believed_slope))
             residual = residual.minus(self.ground_gives_way())
             residual = replace(
                 residual,
@@ -218,8 +223,8 @@ class Predictor:
         return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
 
     def predict(self, effect: ResolvedEffect) -> np.ndarray:
-        """What an effect adds to the residual, (B, R). Inertia and sensor effects of the model are
-        in the residual already."""
+        """What an effect adds to the residual, (B, R). Inertia and sensor effects and slopes of the
+        model are in the residual already."""
         result = np.zeros((len(self.motion.time), self.rows))
         if issubclass(effect.effect, JointTorqueEffect):
             rows = self.rows_of(effect.effect, np.arange(len(effect.targets)))
@@ -227,7 +232,7 @@ class Predictor:
             columns = self.joint_columns(effect.effect, effect.nonlinear[:, joint], rows)
             amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
             result[:, rows] = np.einsum("pbn,pn->bn", columns, amounts[:, joint])
-        elif issubclass(effect.effect, ContactEffect):
+        elif issubclass(effect.effect, ContactEffect) and not issubclass(effect.effect, _CURVED):
             signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
             result[:, signature.rows] = signature.values @ effect.linear[:, 0]
         return result
@@ -382,7 +387,7 @@ class Predictor:
             rows = self.rows_of(effect, np.array([joint]))
             values = np.repeat(nonlinear[:, None], len(rows), axis=1)
             return Signature(rows, np.moveaxis(self.joint_columns(effect, values, rows), 0, 2))
-        if issubclass(effect, ContactEffect):
+        if issubclass(effect, ContactEffect) and not issubclass(effect, _CURVED):
             values = self._contact_columns(effect)
         else:
             point = self._expansion_point(effect, target)
@@ -521,14 +526,14 @@ class Predictor:
         nonlinear: np.ndarray,
         elsewhere: Signature,
     ) -> Signature:
-        """The signature of an inertia, geometry or sensor effect about values of its parameters,
-        for what it adds is not quite linear.
+        """The signature of an effect about values of its parameters, where what it adds is not quite
+        linear.
 
         Args:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
-            elsewhere: the signature about zero; it stays that of a contact effect.
+            elsewhere: the signature about zero; it stays that of any other effect.
         """
-        if not issubclass(effect, InertiaEffect | GeometryEffect | SensorEffect):
+        if not issubclass(effect, _CURVED):
             return elsewhere
         values, offset = self._slopes(effect, target, linear, nonlinear)
         rows = elsewhere.rows
@@ -543,8 +548,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What an inertia, geometry or sensor effect adds per unit of each parameter about some
-        values, (B, R, p), and what it adds with these values beyond that, (B, R)."""
+        """What one of these effects adds per unit of each parameter about some values, (B, R, p), and
+        what it adds with these values beyond that, (B, R)."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
         slopes = []
@@ -565,8 +570,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """What an inertia, geometry or sensor effect with these values adds to the residual, (B,
-        R); an inertia effect also if the sensors' noise were in its regressors once more."""
+        """What one of these effects with these values adds to the residual, (B, R); an inertia
+        effect also if the sensors' noise were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -579,6 +584,9 @@ class Predictor:
         changed = effect.from_values([target], values)
         if issubclass(effect, InertiaEffect):
             return self._inertia_addition(changed, noisier=noisier)
+        if issubclass(effect, GroundSlope):
+            here = self._believed_slope
+            return self._on_slope(here + linear) - self._on_slope(here)
         if issubclass(effect, GeometryEffect):
             return self._residual_at_blocks - self._with(changed).residual(self._smooth_blocks)
         # By taking the effect off the signals.
@@ -706,6 +714,29 @@ class Predictor:
         return pad_contact(
             self.scenario.believed.description, self.scenario.ground, self.scenario.plant
         )
+
+    @cached_property
+    def _believed_slope(self) -> np.ndarray:
+        """Of the model's ground, (2,) [rad], see `Ground.slope`."""
+        known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
+        return np.sum([self.scenario.ground.slope, *known], axis=0)
+
+    def _on_slope(self, slope: np.ndarray) -> np.ndarray:
+        """What standing soles read beyond what they do on level ground, (B, R), if they head along
+        world x.
+
+        Args:
+            slope: see `Ground.slope`, (2,) [rad].
+        """
+        result, up = np.zeros((len(self.motion.time), self.rows)), np.array([0.0, 0.0, 1.0])
+        if not self.robot.has_floating_base:
+            return result
+        g = self.motion.equation.gravity
+        place = next(k for k, row in enumerate(self.motion.rows) if row.kind == "kinematic")
+        for _ in self.robot.description.sides:
+            result[:, place + 3 : place + 6] = g * (gravity_on_slope(up, slope.tolist()) - up)
+            place += 6
+        return result
 
     def ground_gives_way(self) -> np.ndarray:
         """What the model's own ground adds: it gives way a little under the soles and lets them
