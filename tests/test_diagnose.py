@@ -351,6 +351,21 @@ def test_two_effects_at_once_are_both_found() -> None:
     }
 
 
+def test_feet_that_all_read_too_much_are_not_taken_for_weak_motors_and_a_heavier_robot() -> None:
+    """A trunk that is heavier explains more than one foot does, and then every motor is weaker."""
+    hidden = "!FootForceGain {gain: {left: 0.05, right: 0.05}}"
+    tried = [*effects(), library()["Payload"]]
+    found = diagnose(Predictor(scenario(), log_with(hidden)), tried)
+    assert found.verdict == "effect_found"
+    assert {(f.effect, f.targets) for f in found.chosen} == {
+        ("FootForceGain", ("left",)),
+        ("FootForceGain", ("right",)),
+    }
+    for finding in found.chosen:
+        low, high = finding.parameters["gain"].interval
+        assert low < 0.05 < high < low + 0.01
+
+
 def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
     """One offset alone explains less than a turned IMU with a moved mass; both together explain
     all."""

@@ -526,8 +526,8 @@ class Predictor:
         nonlinear: np.ndarray,
         elsewhere: Signature,
     ) -> Signature:
-        """The signature of an effect about values of its parameters, where what it adds is not quite
-        linear.
+        """The signature of an effect about values of its parameters, where what it adds is not
+        quite linear.
 
         Args:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
@@ -548,8 +548,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What one of these effects adds per unit of each parameter about some values, (B, R, p), and
-        what it adds with these values beyond that, (B, R)."""
+        """What one of these effects adds per unit of each parameter about some values, (B, R, p),
+        and what it adds with these values beyond that, (B, R)."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
         slopes = []

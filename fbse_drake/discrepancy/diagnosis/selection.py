@@ -76,8 +76,8 @@ def best_additions(
     """What one more candidate makes of an explanation, for every candidate that improves it
     significantly, best first.
 
-    Joints of both legs may be wrong together, and one alone look like something else: `_pairs` are
-    tried too.
+    Joints or feet of all legs may be wrong together, and one alone look like something else:
+    `_pairs` are tried too.
 
     Args:
         rows: only candidates that change one of these; by default all.
@@ -126,11 +126,11 @@ def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
 
 
 def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Candidates in joints that are no joint torque effects, each with its like on the other legs;
-    with values of their own."""
-    alike = dict.fromkeys(
-        map(fits.dictionary.predictor.robot.description.counterparts, fits.dictionary.joints)
-    )
+    """Candidates in joints that are no joint torque effects, and in feet, each with its like on the
+    other legs; with values of their own."""
+    description = fits.dictionary.predictor.robot.description
+    alike = dict.fromkeys(map(description.counterparts, fits.dictionary.joints))
+    alike[tuple(description.sides)] = None
     found = {
         (c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)
     }
