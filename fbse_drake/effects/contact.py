@@ -123,7 +123,8 @@ def _still(samples: int) -> np.ndarray:
 class GroundSlope(ContactEffect):
     """Ground that is tilted by a rotation vector about world x and y.
 
-    In a simulation the world's frame is fixed to the ground, and gravity is turned.
+    In a simulation the world's frame is fixed to the ground, and gravity is turned. A diagnosis
+    takes soles to head along world x; where a robot turns on a slope, it calls that unknown.
     """
 
     description: ClassVar[str] = "The ground is not level."
