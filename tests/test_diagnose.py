@@ -366,6 +366,20 @@ def test_feet_that_all_read_too_much_are_not_taken_for_weak_motors_and_a_heavier
         assert low < 0.05 < high < low + 0.01
 
 
+def test_a_weak_motor_is_found_beside_feet_that_read_too_much() -> None:
+    """In the motor's own row nobody could tell which of the two it is."""
+    feet = "!FootForceGain {gain: {left: 0.05, right: 0.05}}"
+    motor = "robot.effects.motor=!TorqueGain {shortfall: {left_knee_pitch: 0.06}}"
+    log = simulate(walking("seed=11", f"robot.effects.feet={feet}", motor)).log
+    found = diagnose(Predictor(scenario(), log), effects())
+    assert found.verdict == "effect_found"
+    assert {(f.effect, f.targets) for f in found.chosen} == {
+        ("FootForceGain", ("left",)),
+        ("FootForceGain", ("right",)),
+        ("TorqueGain", ("left_knee_pitch",)),
+    }
+
+
 def test_offsets_of_both_hips_are_not_taken_for_a_trunk_that_leans() -> None:
     """One offset alone explains less than a turned IMU with a moved mass; both together explain
     all."""

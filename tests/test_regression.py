@@ -111,11 +111,12 @@ def test_fits_by_inner_products_are_those_of_plain_least_squares(noise: float) -
     np.testing.assert_allclose(fit.held_out_sse, held_out, rtol=1e-6)
 
 
-@pytest.mark.parametrize("tied", [False, True])
-def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool) -> None:
+@pytest.mark.parametrize(("tied", "across"), [(False, False), (True, True), (False, True)])
+def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool, across: bool) -> None:
+    """Also beside columns that are in several rows: in one of them alone they would take all."""
     rng = np.random.default_rng(5)
     known = [Signature(np.array([row]), rng.normal(size=(400, 1, 2))) for row in range(ROWS)]
-    if tied:
+    if across:
         known = [Signature(np.arange(ROWS), rng.normal(size=(400, ROWS, 4)))]
     new = Signature(np.array([1]), rng.normal(size=(400, 1, 2)) + known[0].values[:, -1:, :2])
     white = white_of(rng.normal(size=(400, ROWS)) + known[0].values.sum(axis=(1, 2))[:, None])

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
-from fbse_drake.discrepancy.identification.regression import Regression, Signature
+from fbse_drake.discrepancy.identification.regression import Regression, Signature, connected
 
 # Directions with less than this share of the largest inner product are there by rounding alone.
 _SINGULAR = 1e-12
@@ -38,10 +38,11 @@ class _Beside:
 class Remainder:
     """What an explanation leaves.
 
-    Of new columns x in one row its columns X there leave x - X (X^T X)^-1 X^T x. Columns of inertia
-    however tie all
-    rows together: with all columns X, rows one below the other and weighted, new columns in row r
-    keep x^T x - x^T X_r (X^T X)^-1 X_r^T x of their sum of squares.
+    Of new columns x in one row its columns X there leave x - X (X^T X)^-1 X^T x. Columns that are
+    in several rows however tie these together: what a foot's gain explains of one joint as well as
+    the joint's motor would, it cannot take from it without being wrong in the others. With all
+    columns X that are tied to each other, rows one below the other and weighted, new columns in row
+    r keep x^T x - x^T X_r (X^T X)^-1 X_r^T x of their sum of squares.
     """
 
     def __init__(
@@ -58,15 +59,24 @@ class Remainder:
         Args:
             signatures: of the explanation, whitened, and their parameters.
             scale: what the noise of each row is to be multiplied with, (R,).
-            tied: are all rows tied together?
+            tied: are all rows tied together, by inertia that is fitted along?
         """
         self._regression, self._signatures, self.scale = regression, signatures, scale
         stops = np.cumsum([s.values.shape[2] for s in signatures], dtype=int)
         self._slices = [
             slice(stop - s.values.shape[2], stop) for s, stop in zip(signatures, stops, strict=True)
         ]
-        self._parameters, self._tied = parameters, tied and bool(signatures)
+        self._parameters = parameters
+        groups = [[*range(len(signatures))]] if tied else connected(signatures)
+        # By signature: those that it is tied to, if they are in more than one row.
+        self._tied_to: dict[int, tuple[int, ...]] = {
+            k: tuple(group)
+            for group in groups
+            if tied or len({row for member in group for row in signatures[member].rows}) > 1
+            for k in group
+        }
         self._rows: dict[int, _Beside] = {}
+        self._of_groups: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def beside(self, row: int) -> _Beside:
         """What the explanation has in a row."""
@@ -141,9 +151,9 @@ class Remainder:
         gram, right, fitted = self._row_moments(row, signatures)
         amounts = np.ones(len(right))
         amounts[fitted] = np.concatenate([self._parameters[self._slices[k]] for k in there])
-        if self._tied:
+        if there[0] in self._tied_to:
             at = np.concatenate([np.arange(len(self._parameters))[self._slices[k]] for k in there])
-            inverse, correction = self._of_all
+            inverse, correction = self._of_group(self._tied_to[there[0]])
             root = _root(inverse[np.ix_(at, at)] / self.scale[row])
             return _Beside(signatures, amounts, fitted, root, correction[at])
         root = _inverse_root(gram[np.ix_(fitted, fitted)])
@@ -177,14 +187,18 @@ class Remainder:
                 gram[rows, columns], gram[columns, rows] = block, block.T
         return gram, np.concatenate(rights), fitted
 
-    @cached_property
-    def _of_all(self) -> tuple[np.ndarray, np.ndarray]:
-        """(X^T X)^-1 of all columns in all rows, weighted, and what a fit without any prior would
-        change in the parameters."""
+    def _of_group(self, group: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """(X^T X)^-1 of the columns of some signatures in all rows, weighted, and what a fit
+        without any prior would change in their parameters; zero for the others."""
+        if group not in self._of_groups:
+            self._of_groups[group] = self._fit_of(group)
+        return self._of_groups[group]
+
+    def _fit_of(self, group: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         size = len(self._parameters)
         gram, left = np.zeros((size, size)), np.zeros(size)
         for row in range(len(self.scale)):
-            there = [k for k, s in enumerate(self._signatures) if row in s.rows]
+            there = [k for k in group if row in self._signatures[k].rows]
             if not there:
                 continue
             moments, right, fitted = self._row_moments(
@@ -195,8 +209,12 @@ class Remainder:
             amounts[fitted] = self._parameters[at]
             gram[np.ix_(at, at)] += moments[np.ix_(fitted, fitted)] / self.scale[row]
             left[at] += (right[fitted] - moments[fitted] @ amounts) / self.scale[row]
-        root = _inverse_root(gram)
-        return root @ root.T, root @ (root.T @ left)
+        own = np.concatenate([np.arange(size)[self._slices[k]] for k in group])
+        inverse, change = np.zeros((size, size)), np.zeros(size)
+        root = _inverse_root(gram[np.ix_(own, own)])
+        inverse[np.ix_(own, own)] = root @ root.T
+        change[own] = root @ (root.T @ left[own])
+        return inverse, change
 
 
 def _inverse_root(gram: np.ndarray) -> np.ndarray:
