@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from rig import Base, rms
 
 from fbse_drake import Log
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.residual.residual import (
     EquationOfMotion,
@@ -19,6 +20,7 @@ from fbse_drake.discrepancy.residual.residual import (
     residual_rows,
 )
 from fbse_drake.effects.contact import GroundCompliance
+from fbse_drake.effects.effect import library
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.joint_acceleration import no_slip_condition, still_rows
 from fbse_drake.estimators.records import record
@@ -314,3 +316,22 @@ def test_soft_ground_shows_between_point_feet(run, compliance: float):
     assert error < 0.05 * 2e-6
     assert abs(found - compliance) < 4 * error + 0.05 * compliance
     assert rms(value - found * column) < 1.4
+
+
+def test_four_feet_that_read_too_much_are_not_taken_for_weak_motors_and_payloads(run):
+    """Alone none of the front feet explains anything."""
+    gains = dict.fromkeys(make_robot("quadruped")[0].description.sides, 0.05)
+    feet = f"robot.effects.feet=!FootForceGain {{gain: {gains}}}".replace("'", "")
+    log = run("quadruped_trot", *SHORT, "estimator=!NoEstimator {}", "seed=11", feet)
+    given = scenario("quadruped_trot", *SHORT)
+    names = ("FootForceGain", "TorqueGain", "BodyMass", "Payload", "CoulombFriction")
+    found = diagnose(
+        Predictor(replace(given, model=given.robot), log), [library()[name] for name in names]
+    )
+    assert found.verdict == "effect_found"
+    assert {(f.effect, *f.targets) for f in found.chosen} == {
+        ("FootForceGain", side) for side in gains
+    }
+    for finding in found.chosen:
+        low, high = finding.parameters["gain"].interval
+        assert low < 0.05 < high < low + 0.02

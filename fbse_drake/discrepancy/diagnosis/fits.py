@@ -122,6 +122,21 @@ class Fits:
             for fixed in found
         ]
 
+    @cached_property
+    def feet_alike(self) -> list[tuple[list[Candidate], Signature]]:
+        """For each effect in feet: its candidates in all of them, and the signature of one value
+        for all feet; of robots with more than one."""
+        sides = self.dictionary.predictor.robot.description.sides
+        found: dict[type[Effect], list[Candidate]] = {}
+        for candidate in self.fixed_candidates:
+            if candidate.effect.acts_on == "foot":
+                found.setdefault(candidate.effect, []).append(candidate)
+        return [
+            (feet, _sum([c.signature for c in feet]))
+            for feet in found.values()
+            if 1 < len(feet) == len(sides)
+        ]
+
     def _fixed_candidate(self, effect: type[Effect], fixed: FixedColumns) -> Candidate:
         signature = self.white.whiten_signature(fixed.signature)
         spurious = (
@@ -404,3 +419,15 @@ class Fits:
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""
         return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)
+
+
+def _sum(signatures: Sequence[Signature]) -> Signature:
+    """What several signatures with equally many parameters add with the same values in all."""
+    rows = np.unique(np.concatenate([s.rows for s in signatures]))
+    blocks, parameters = signatures[0].values.shape[0], signatures[0].values.shape[2]
+    values, offset = np.zeros((blocks, len(rows), parameters)), np.zeros((blocks, len(rows)))
+    for s in signatures:
+        places = np.searchsorted(rows, s.rows)
+        values[:, places] += s.values
+        offset[:, places] += s.offset
+    return Signature(rows, values, offset if offset.any() else 0.0)

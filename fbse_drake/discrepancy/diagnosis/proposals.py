@@ -7,7 +7,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
-from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect
@@ -118,6 +118,24 @@ class Proposals:
                     result.append(self._best_on(effect, group, best, beside))
         return result
 
+    def all_feet(self, base: Explanation, promising: Sequence[Candidate]) -> list[list[Candidate]]:
+        """Candidates of one effect in all feet, with values of their own.
+
+        Worth a fit where each is promising alone, or where one value for all feet explains more
+        than the best of them: what all feet read is the robot's weight, and what one of them alone
+        reads too much may be made up for by what the others leave.
+        """
+        beside, found = self.fits.remainder(base), []
+        taken = {c.key for c in base.candidates} | self._barred
+        for feet, alike in self.fits.feet_alike:
+            alone = {c.targets: c for c in promising if c.effect is feet[0].effect}
+            if not alone or any(c.key in taken for c in feet):
+                continue
+            best = max(_gain(beside, c.signature) for c in alone.values())
+            if len(alone) == len(feet) or _gain(beside, alike) > best:
+                found.append([alone.get(c.targets) or self._settled(c, base) for c in feet])
+        return found
+
     def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
         """A candidate made linear about the values that fit best beside an explanation, if it is
         linear only nearby."""
@@ -168,10 +186,8 @@ class Proposals:
     ) -> bool:
         """Is a candidate that is no joint torque effect worth a fit?"""
         beside, s = self.fits.remainder(base), candidate.signature
-        moments = [beside.moments(s, k) for k in range(len(s.rows))]
-        gain = fixed_gain(*_weighted(moments, beside.scale[s.rows]))
-        alone = (fixed_gain(*of_row) for of_row in moments)
-        return gain > share * self.fits.required(candidate) and self._may_reach(
+        alone = (fixed_gain(*beside.moments(s, k)) for k in range(len(s.rows)))
+        return _gain(beside, s) > share * self.fits.required(candidate) and self._may_reach(
             wanted, base, s.rows, alone
         )
 
@@ -254,6 +270,12 @@ class Proposals:
                 chosen[k] = trial[k, int(gain.argmax())]
                 steps[k] *= 2.0 / (_POINTS - 1)
         return chosen
+
+
+def _gain(beside: Remainder, signature: Signature) -> float:
+    """Drop of the sum of squares by columns beside an explanation, roughly."""
+    moments = [beside.moments(signature, k) for k in range(len(signature.rows))]
+    return fixed_gain(*_weighted(moments, beside.scale[signature.rows]))
 
 
 def _weighted(

@@ -76,8 +76,8 @@ def best_additions(
     """What one more candidate makes of an explanation, for every candidate that improves it
     significantly, best first.
 
-    Joints or feet of all legs may be wrong together, and one alone look like something else:
-    `_pairs` are tried too.
+    Joints or feet of all legs may be wrong together, and one alone look like something else: these
+    are tried too.
 
     Args:
         rows: only candidates that change one of these; by default all.
@@ -85,7 +85,11 @@ def best_additions(
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most), []
-    tried = [*([candidate] for candidate in promising), *_pairs(fits, promising)]
+    tried = [
+        *([candidate] for candidate in promising),
+        *_pairs(fits, promising),
+        *proposals.all_feet(base, promising),
+    ]
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
         everything = [*base.candidates, *added]
@@ -126,11 +130,10 @@ def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
 
 
 def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Candidates in joints that are no joint torque effects, and in feet, each with its like on the
-    other legs; with values of their own."""
+    """Candidates in joints that are no joint torque effects, each with its like on the other legs;
+    with values of their own."""
     description = fits.dictionary.predictor.robot.description
     alike = dict.fromkeys(map(description.counterparts, fits.dictionary.joints))
-    alike[tuple(description.sides)] = None
     found = {
         (c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)
     }
