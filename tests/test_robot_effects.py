@@ -504,16 +504,6 @@ def test_forces_and_imu_on_a_slope_know_the_tilted_gravity():
     np.testing.assert_allclose(felt.sum(axis=0) * TICK, gained + upward * time, atol=2e-3)
 
 
-def test_a_sole_on_a_slope_is_predicted_to_be_turned(plain: Robot):
-    time = TICK * np.arange(3)
-    rotation, displacement = GroundSlope.sole_motion(
-        np.zeros((3, 4, 3)), plain.pad_positions("left"), time
-    )
-    turn = Rotation.from_rotvec(np.einsum("pni,p->ni", rotation, [0.04, -0.03]))
-    np.testing.assert_allclose(turn.as_rotvec(), np.tile([0.04, -0.03, 0.0], (3, 1)))
-    assert np.all(displacement == 0)
-
-
 def sole_motion(robot: Robot, log: Log, side: str) -> tuple[np.ndarray, np.ndarray]:
     """True rotation vector and displacement of a sole, against the world."""
     context, rotation = robot.plant.CreateDefaultContext(), np.empty((len(log.time), 3))

@@ -1,7 +1,7 @@
-"""Effects in the contact of soles and ground.
+"""Effects of the ground, and in the contact of soles with it.
 
-To simulate one is to change ground and contact solver; to predict it is to say how a standing sole
-moves because of it.
+To simulate one is to change ground and contact solver; to predict what the contact does is to say
+how a standing sole moves because of it.
 """
 
 import math
@@ -31,8 +31,8 @@ _CREEPING = ("lagged", "similar")
 
 
 @dataclass(frozen=True)
-class ContactEffect(Effect):
-    """Base of the contact effects, which act on the robot as a whole."""
+class GroundEffect(Effect):
+    """Base of the effects of the ground, which act on the robot as a whole."""
 
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
 
@@ -48,6 +48,11 @@ class ContactEffect(Effect):
         Raises:
             InputError: settings with which it cannot be simulated.
         """
+
+
+@dataclass(frozen=True)
+class ContactEffect(GroundEffect):
+    """Base of the contact effects, which move standing soles in proportion to their parameters."""
 
     @staticmethod
     @abstractmethod
@@ -73,7 +78,7 @@ class ContactEffect(Effect):
 def contact_with_effects(
     effects: Iterable[Effect], ground: Ground, plant: MultibodyPlantConfig, description: str
 ) -> tuple[Ground, MultibodyPlantConfig]:
-    """The ground and the plant's settings with the contact effects among some effects.
+    """The ground and the plant's settings with the effects of the ground among some effects.
 
     Args:
         description: of the robot that stands there.
@@ -81,7 +86,7 @@ def contact_with_effects(
     Raises:
         InputError: settings with which an effect cannot be simulated, a robot without pads.
     """
-    effects = [effect for effect in effects if isinstance(effect, ContactEffect)]
+    effects = [effect for effect in effects if isinstance(effect, GroundEffect)]
     if effects:
         friction = _friction(description, ground)
         for effect in effects:
@@ -114,17 +119,13 @@ def _friction(description: str, ground: Ground) -> float:
     return CalcContactFrictionFromSurfaceProperties(of_pad, of_ground).dynamic_friction()
 
 
-def _still(samples: int) -> np.ndarray:
-    return np.zeros((samples, 3))
-
-
 @in_library
 @dataclass(frozen=True)
-class GroundSlope(ContactEffect):
+class GroundSlope(GroundEffect):
     """Ground that is tilted by a rotation vector about world x and y.
 
-    In a simulation the world's frame is fixed to the ground, and gravity is turned. A diagnosis
-    takes soles to head along world x; where a robot turns on a slope, it calls that unknown.
+    In a simulation the world's frame is fixed to the ground, and gravity is turned. To a diagnosis
+    world x is where the base heads when a log begins; how it turns from there the gyro tells.
     """
 
     description: ClassVar[str] = "The ground is not level."
@@ -149,17 +150,6 @@ class GroundSlope(ContactEffect):
         friction: float,  # noqa: ARG002
     ) -> tuple[Ground, MultibodyPlantConfig]:
         return replace(ground, slope=[ground.slope[0] + self.x, ground.slope[1] + self.y]), plant
-
-    @staticmethod
-    def sole_motion(
-        pad_force: np.ndarray,  # noqa: ARG004
-        pad_positions: np.ndarray,  # noqa: ARG004
-        time: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        still = _still(len(time))
-        return np.stack([still + [1.0, 0.0, 0.0], still + [0.0, 1.0, 0.0]]), np.stack(
-            [still, still]
-        )
 
 
 @in_library

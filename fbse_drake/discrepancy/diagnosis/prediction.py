@@ -8,6 +8,7 @@ from functools import cache, cached_property, partial
 import numpy as np
 from pydrake.math import RotationMatrix
 from scipy.ndimage import shift
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.diagnosis.reading import Reading, smoothed
 from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
@@ -58,8 +59,8 @@ _ROUNDING = 1e-9
 _EVALUATIONS = 8
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 5_000_000
-# Effects of which it is known what they add with any values, not only per unit near none.
-_CURVED = (InertiaEffect, GeometryEffect, SensorEffect, GroundSlope)
+# Effects that add in proportion to their linear parameters, however large these are.
+_PROPORTIONAL = (JointTorqueEffect, ContactEffect)
 
 
 class Predictor:
@@ -232,7 +233,7 @@ class Predictor:
             columns = self.joint_columns(effect.effect, effect.nonlinear[:, joint], rows)
             amounts = effect.linear if len(effect.linear) else np.ones((1, len(effect.targets)))
             result[:, rows] = np.einsum("pbn,pn->bn", columns, amounts[:, joint])
-        elif issubclass(effect.effect, ContactEffect) and not issubclass(effect.effect, _CURVED):
+        elif issubclass(effect.effect, ContactEffect):
             signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
             result[:, signature.rows] = signature.values @ effect.linear[:, 0]
         return result
@@ -387,7 +388,7 @@ class Predictor:
             rows = self.rows_of(effect, np.array([joint]))
             values = np.repeat(nonlinear[:, None], len(rows), axis=1)
             return Signature(rows, np.moveaxis(self.joint_columns(effect, values, rows), 0, 2))
-        if issubclass(effect, ContactEffect) and not issubclass(effect, _CURVED):
+        if issubclass(effect, ContactEffect):
             values = self._contact_columns(effect)
         else:
             point = self._expansion_point(effect, target)
@@ -533,7 +534,7 @@ class Predictor:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
             elsewhere: the signature about zero; it stays that of any other effect.
         """
-        if not issubclass(effect, _CURVED):
+        if issubclass(effect, _PROPORTIONAL):
             return elsewhere
         values, offset = self._slopes(effect, target, linear, nonlinear)
         rows = elsewhere.rows
@@ -721,20 +722,35 @@ class Predictor:
         known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
         return np.sum([self.scenario.ground.slope, *known], axis=0)
 
+    @cached_property
+    def _headings(self) -> np.ndarray:
+        """Angle about the vertical by which each sole is turned from where the base headed when the
+        log began, (B, feet) [rad]; by the gyro, and the vertical of a base that does not tilt."""
+        equation, blocks, up = self.motion.equation, self.motion.blocks, self._level[:, 2]
+        rate = blocks.angular_velocity @ equation.R_BI.T @ up
+        turned = (np.cumsum(rate) - 0.5 * rate) * self.motion.length * self.motion.period
+        ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        headings = [
+            np.arctan2(R_BF[:, :, 0] @ np.cross(up, ahead), R_BF[:, :, 0] @ ahead)
+            for R_BF in equation.sole_rotations(blocks.joint_position)
+        ]
+        return turned[:, None] + np.stack(headings, axis=1)
+
     def _on_slope(self, slope: np.ndarray) -> np.ndarray:
-        """What standing soles read beyond what they do on level ground, (B, R), if they head along
-        world x.
+        """What standing soles read beyond what they do on level ground, (B, R).
 
         Args:
             slope: see `Ground.slope`, (2,) [rad].
         """
-        result, up = np.zeros((len(self.motion.time), self.rows)), np.array([0.0, 0.0, 1.0])
-        if not self.robot.has_floating_base:
+        result = np.zeros((len(self.motion.time), self.rows))
+        if not self.robot.has_floating_base or not slope.any():
             return result
-        g = self.motion.equation.gravity
+        up = np.array([0.0, 0.0, self.motion.equation.gravity])
+        more = gravity_on_slope(up, slope.tolist()) - up
         place = next(k for k, row in enumerate(self.motion.rows) if row.kind == "kinematic")
-        for _ in self.robot.description.sides:
-            result[:, place + 3 : place + 6] = g * (gravity_on_slope(up, slope.tolist()) - up)
+        for heading in self._headings.T:
+            R_FW = Rotation.from_euler("z", -heading[:, None])
+            result[:, place + 3 : place + 6] = R_FW.apply(more)
             place += 6
         return result
 

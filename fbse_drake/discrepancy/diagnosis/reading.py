@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter, welch
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
 from fbse_drake.discrepancy.residual.residual import RecordedMotion, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
-from fbse_drake.effects.contact import ContactEffect
+from fbse_drake.effects.contact import GroundEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
 from fbse_drake.errors import located
@@ -148,7 +148,7 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     bodies = {
         name: effect
         for name, effect in model.effects.items()
-        if not isinstance(effect, JointTorqueEffect | ContactEffect)
+        if not isinstance(effect, JointTorqueEffect | GroundEffect)
     }
     recording = scenario.recording
     model = replace(model, effects=bodies)
