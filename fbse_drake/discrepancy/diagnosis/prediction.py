@@ -189,7 +189,7 @@ class Predictor:
             return np.zeros(self.rows)
         force = self.motion.signals.pad_force
         noise = force_noise(
-            self.motion.sensors.foot_force, self.robot, len(force), np.random.default_rng(0)
+            self.motion.sensors_by_row.foot_force, self.robot, len(force), np.random.default_rng(0)
         )
         motions = [
             [
@@ -429,7 +429,8 @@ class Predictor:
     @cached_property
     def _noisier_signals(self) -> SensorSignals:
         """The signals if the sensors' noise were in them once more."""
-        motion, sensors, random = self.motion, self.motion.sensors, np.random.default_rng(0)
+        motion, random = self.motion, np.random.default_rng(0)
+        sensors = motion.sensors_by_row
         noise = {
             "joint_velocity": joint_velocity_noise(sensors),
             "specific_force": sensors.imu.acceleration_noise,

@@ -16,6 +16,7 @@ from fbse_drake.discrepancy.residual.evidence import (
     remark,
     remarks,
 )
+from fbse_drake.discrepancy.residual.held import rows_per_reading
 from fbse_drake.discrepancy.residual.residual import RecordedMotion
 
 # Scatter of the sampling period that is worth a word, and a warning, as shares of it.
@@ -184,7 +185,10 @@ def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
         if changing.any() and (share := float(held[changing].mean())) > _REPEATED:
             late = 500 * evidence.period / (1 - share)
             text = f"{100 * share:.0f} % of its samples repeat the one before: "
-            text += f"it comes {late:.2g} ms late on average; its noise is not white"
+            if name == "joint/torque_command" or rows_per_reading(values) == 1:
+                text += f"it comes {late:.2g} ms late on average; its noise is not white"
+            else:
+                text += "it is interpolated between its readings; what is faster is not seen"
             yield remark("held", "warning", name, 1.0 / (1.0 - share), "samples", text)
 
 

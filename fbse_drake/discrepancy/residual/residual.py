@@ -20,7 +20,8 @@ average of order one, so that each row's covariance is tridiagonal.
 """
 
 import fnmatch
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import combinations, pairwise
@@ -30,6 +31,7 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
+from fbse_drake.discrepancy.residual.held import between_readings, rows_per_reading
 from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.sensor import SensorSignals
@@ -132,7 +134,8 @@ def read_signals(
 ) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
-    Late samples are interpolated; what lies in a gap is marked. Without `joint/velocity` angles are
+    Late samples are interpolated, and what sensors hold between their readings; what lies in a gap
+    is marked. Without `joint/velocity` angles are
     differenced; without `joint/torque_command` torques are 0.
 
     Returns:
@@ -165,6 +168,7 @@ def read_signals(
         return _low_passed(values, recording.cutoff, period, stretches)
 
     def on_grid(values: np.ndarray) -> np.ndarray:
+        values = between_readings(values)
         if even:
             return low_passed(values)
         share = ((grid - time[after - 1]) / (time[after] - time[after - 1])).clip(0.0, 1.0)
@@ -801,10 +805,34 @@ class RecordedMotion:
         return np.where(names.has_motor, noise**2 + (share * torque) ** 2, 0.0)
 
     @cached_property
+    def sensors_by_row(self) -> SensorsConfig:
+        """The sensors with white noise in every row that leaves as much in an average over a block
+        as they do, whose readings may be held for some rows."""
+        imu, feet = self.sensors.imu, self.sensors.foot_force
+
+        def spread(noise: float, names: Iterable[str]) -> float:
+            held = max((rows_per_reading(self.log[n]) for n in names if n in self.log), default=1)
+            return noise * math.sqrt(min(held, self.length))
+
+        of_feet = [name for name in self.log.channels if name.startswith("foot/")]
+        return replace(
+            self.sensors,
+            imu=replace(
+                imu,
+                acceleration_noise=spread(imu.acceleration_noise, ["imu/linear_acceleration"]),
+            ),
+            foot_force=replace(
+                feet,
+                noise=spread(feet.noise, of_feet),
+                moment_noise=spread(feet.moment_noise, of_feet),
+            ),
+        )
+
+    @cached_property
     def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
         """Believed variance of a step's white noise and of the integral over time of what is
         differenced white noise, (B, R) each."""
-        white, differenced = self.equation.noise(self.blocks, self.sensors)
+        white, differenced = self.equation.noise(self.blocks, self.sensors_by_row)
         torque = self.torque_variance(self.blocks.torque_command)
         white[:, : torque.shape[1]] += torque
         return white, differenced

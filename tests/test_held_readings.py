@@ -1,0 +1,98 @@
+"""Sensors that are read more seldom than a log has rows, and held in between."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.residual.held import between_readings, rows_per_reading
+from fbse_drake.effects.effect import library
+from fbse_drake.log import Log
+from fbse_drake.scenario import Scenario
+from tests.conftest import scenario
+
+WALK = ("paper_walk", "duration=3.2", "estimator=!NoEstimator {}", "seed=11")
+# What late forces, angles or motions of the base may be taken for.
+TRIED = (
+    "FootForceLag",
+    "FootForceBias",
+    "TorqueLag",
+    "TorqueDelay",
+    "TorqueGain",
+    "TransmissionElasticity",
+)
+
+
+def held(log: Log, kinds: tuple[str, ...], rows: int) -> Log:
+    """As if the sensors of some channels were read in every so many rows."""
+    latest = np.arange(len(log.time)) // rows * rows
+    channels = {
+        name: values[latest] if name.startswith(kinds) else values
+        for name, values in log.channels.items()
+    }
+    return replace(log, channels=channels)
+
+
+@pytest.fixture(scope="module")
+def believed() -> Scenario:
+    walk = scenario(*WALK)
+    return replace(walk, model=walk.robot)
+
+
+@pytest.mark.parametrize(("rows", "first"), [(2, 0), (5, 3), (10, 9)])
+def test_a_line_is_read_back_from_what_is_held_of_it(rows: int, first: int):
+    row = np.arange(600)
+    line = np.stack([0.3 * row, -2.0 * row], axis=1)
+    # A sensor that was read in rows `first`, `first + rows`, ...
+    latest = (row - first) // rows * rows + first
+    kept = np.stack([0.3 * latest, -2.0 * latest], axis=1)
+    assert rows_per_reading(kept) == rows
+    inner = slice(rows, 600 - rows)
+    np.testing.assert_allclose(between_readings(kept)[inner], line[inner], atol=1e-9)
+    # The last reading is held: nobody knows the next.
+    assert np.all(between_readings(kept)[-1] == kept[-1])
+
+
+def test_readings_that_repeat_by_chance_are_readings():
+    """A foot in the air reads zero again and again."""
+    force = np.maximum(np.sin(0.13 * np.arange(200)), 0.0)
+    kept = np.repeat(force, 3)
+    between = between_readings(kept)
+    np.testing.assert_allclose(between[::3], force, atol=1e-12)
+    np.testing.assert_allclose(between[1:-3:3], (2 * force[:-1] + force[1:]) / 3, atol=1e-12)
+
+
+def test_a_coarse_encoder_and_a_channel_without_change_are_left_as_they_are():
+    coarse = np.round(np.sin(0.01 * np.arange(2000)), 2)
+    for values in (coarse, np.zeros(2000), np.random.default_rng(0).normal(size=2000)):
+        assert rows_per_reading(values) == 1
+        assert between_readings(values) is values
+
+
+@pytest.mark.parametrize(
+    ("kinds", "rows"),
+    [
+        (("foot/",), 5),
+        (("foot/",), 10),
+        (("joint/position", "joint/velocity"), 4),
+        (("foot/", "imu/", "joint/position", "joint/velocity"), 5),
+    ],
+)
+def test_slow_sensors_are_no_effect(
+    run: Callable[..., Log], believed: Scenario, kinds: tuple[str, ...], rows: int
+):
+    """Held forces were taken for lags of feet and ankles, held angles for something unknown."""
+    log = held(run(*WALK), kinds, rows)
+    found = diagnose(Predictor(believed, log), [library()[name] for name in TRIED])
+    assert (found.verdict, found.chosen) == ("nothing_missing", [])
+
+
+def test_a_lag_is_found_behind_slow_sensors(run: Callable[..., Log], believed: Scenario):
+    lag = "robot.effects.lag=!FootForceLag {time_constant: {left: 0.02}}"
+    log = held(run(*WALK, lag), ("foot/",), 5)
+    (finding,) = diagnose(Predictor(believed, log), [library()[n] for n in TRIED]).chosen
+    assert (finding.effect, finding.targets) == ("FootForceLag", ("left",))
+    assert finding.parameters["time_constant"].value == pytest.approx(0.02, rel=0.1)
