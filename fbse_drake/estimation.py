@@ -15,6 +15,7 @@ from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Estimator, make_estimator
 from fbse_drake.estimators.recursive import RecursiveEstimator, start_share
+from fbse_drake.held_readings import rows_of_readings
 from fbse_drake.log import Log
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
@@ -28,7 +29,7 @@ from fbse_drake.wiring import release
 @dataclass(frozen=True, eq=False)
 class EstimationResult(RunResult):
     """A log with the estimates in its `estimate/...` channels, and the time that each tick
-    took [s], shape (N,)."""
+    took [s]."""
 
     log: Log
     tick_time: np.ndarray
@@ -55,6 +56,9 @@ def estimate(
     run in the station.
 
     Only sensor channels are used; `time` is what the log says, so samples may be missing or late.
+    Where joints or feet are read more seldom than the log has rows, and held in between, the
+    estimator ticks when they are read: with held readings it would compare what was not at the same
+    time.
     On the log of a simulation with the same scenario the estimates are those of the simulation.
     Without `joint/velocity` the angles are differentiated and smoothed. Without
     `joint/torque_command` an `Fbse` estimates all but the friction.
@@ -145,6 +149,18 @@ def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
     return scenario.believed_sensors
 
 
+def _ticks(log: Log) -> tuple[str | None, np.ndarray]:
+    """The channel of joints or feet that is read most seldom, if one is not read in every row, and
+    the rows in which it is. (The base moves so slowly that an IMU may be late.)"""
+    slowest, ticks = None, np.arange(len(log.time))
+    for name in log.channels:
+        if name.startswith(("joint/position", "joint/velocity", "foot/")):
+            rows = rows_of_readings(log[name])
+            if len(rows) < len(ticks):
+                slowest, ticks = name, rows
+    return slowest, ticks
+
+
 class Replay:
     """A scenario's estimator and a log that it runs over; see `estimate`."""
 
@@ -152,6 +168,11 @@ class Replay:
         """Builds the estimator, and others that run beside it, see `EstimatorDiagram`."""
         with located("model: "):
             robot = build_robot(scenario.believed)
+        slowest, ticks = _ticks(log)
+        # The tick that each row of the log tells of.
+        self._tick_of_row = np.searchsorted(ticks[1:], np.arange(len(log.time)), side="right")
+        if slowest is not None:
+            log = log.part(slice(int(ticks[0]), None, int(ticks[1] - ticks[0])))
         inputs = _inputs(scenario, robot, log)
         sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
         believed = partial(scenario.believed.effects_of, names=robot.description, key="model")
@@ -179,6 +200,11 @@ class Replay:
                 raise InputError(f"the log has no channel for {where}")
         self.estimator, self.time = estimator, log.time
         self.remarks = scenario.estimator.remarks(sensors)
+        if slowest is not None:
+            self.remarks += (
+                f"{slowest} is read every {1e3 * log.meta['period']:.3g} ms: so often the "
+                "estimator ticks, and its estimates are held in between.",
+            )
         if in_sensors:
             names = ", ".join(spaced(effect.effect.__name__).lower() for effect in in_sensors)
             self.remarks += (f"Taken off the readings, as the model has it: {names}.",)
@@ -228,12 +254,12 @@ class Replay:
             for port, friction in zip(ports, values, strict=True):
                 friction[k] = port.Eval(self.context)
             self.update()
-        return values
+        return [friction[self._tick_of_row] for friction in values]
 
     def run(
         self, progress: Callable[[float], None] | None = None
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Estimates by channel, each (N, ...), and the time that each tick took [s], shape (N,)."""
+        """Estimates by channel, each (N, ...), and the time that each tick took [s]."""
         estimator, context = self.estimator, self.context
         outputs = {name: estimator.GetOutputPort(name) for name in estimator.channels}
         values = {name: np.empty((len(self.time), port.size())) for name, port in outputs.items()}
@@ -253,6 +279,6 @@ class Replay:
             if progress is not None and k % 100 == 0:
                 progress(float(now))
         return {
-            name: value.reshape(len(self.time), *estimator.channels[name])
+            name: value.reshape(len(self.time), *estimator.channels[name])[self._tick_of_row]
             for name, value in values.items()
         }, tick_time

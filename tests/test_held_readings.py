@@ -8,9 +8,11 @@ import pytest
 
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.residual.held import between_readings, rows_per_reading
 from fbse_drake.effects.effect import library
+from fbse_drake.estimation import estimate
+from fbse_drake.held_readings import between_readings, rows_per_reading
 from fbse_drake.log import Log
+from fbse_drake.report.metrics import friction_nrmse
 from fbse_drake.scenario import Scenario
 from tests.conftest import scenario
 
@@ -96,3 +98,31 @@ def test_a_lag_is_found_behind_slow_sensors(run: Callable[..., Log], believed: S
     (finding,) = diagnose(Predictor(believed, log), [library()[n] for n in TRIED]).chosen
     assert (finding.effect, finding.targets) == ("FootForceLag", ("left",))
     assert finding.parameters["time_constant"].value == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "rows"), [(("foot/",), 10), (("joint/position", "joint/velocity"), 4)]
+)
+def test_an_estimator_ticks_when_its_slowest_sensor_is_read(
+    run: Callable[..., Log], kinds: tuple[str, ...], rows: int
+):
+    """As it does over a log that has these rows alone."""
+    walk = ("paper_walk_fbse", "duration=2")
+    log = held(run(*walk), kinds, rows)
+    found = estimate(scenario(*walk), log)
+    alone = estimate(scenario(*walk), log.part(slice(0, None, rows)))
+    for name in ("estimate/joint/friction_torque", "estimate/base/orientation"):
+        assert len(found.log[name]) == len(log.time)
+        np.testing.assert_array_equal(found.log[name][::rows], alone.log[name])
+        np.testing.assert_array_equal(found.log[name][rows - 1 :: rows][:-1], alone.log[name][:-2])
+    assert any(f"is read every {rows} ms" in remark for remark in found.remarks)
+    assert len(alone.remarks) == len(found.remarks) - 1
+
+
+def test_friction_is_told_from_forces_at_100_hz(run: Callable[..., Log]):
+    """When every row counted as a reading, the error was twice the friction."""
+    walk = ("paper_walk_fbse", "duration=4.3")
+    found = estimate(scenario(*walk), held(run(*walk), ("foot/",), 10)).log
+    for phase, errors in friction_nrmse(found).items():
+        without_yaw = [e for joint, e in errors.items() if "hip_yaw" not in joint]
+        assert np.mean(without_yaw) < 0.3, phase

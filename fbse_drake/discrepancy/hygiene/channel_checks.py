@@ -16,8 +16,8 @@ from fbse_drake.discrepancy.residual.evidence import (
     remark,
     remarks,
 )
-from fbse_drake.discrepancy.residual.held import rows_per_reading
 from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.held_readings import rows_per_reading
 
 # Scatter of the sampling period that is worth a word, and a warning, as shares of it.
 _JITTER, _STRONG_JITTER = 0.01, 0.2

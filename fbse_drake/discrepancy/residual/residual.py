@@ -31,12 +31,12 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
-from fbse_drake.discrepancy.residual.held import between_readings, rows_per_reading
 from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.held_readings import between_readings, rows_per_reading
 from fbse_drake.log import Log
 from fbse_drake.robot.dynamics import PlantDynamics
 from fbse_drake.robot.plant import Robot

@@ -22,14 +22,20 @@ def rows_per_reading(values: np.ndarray) -> int:
     return int(np.gcd.reduce(np.diff(changes))) if len(changes) >= _FEWEST_CHANGES else 1
 
 
+def rows_of_readings(values: np.ndarray) -> np.ndarray:
+    """Rows in which a channel (N, ...) is read, also what happens to equal the reading before; all
+    of one whose readings are not held."""
+    held = rows_per_reading(values)
+    first = _changes(values)[0] % held if held > 1 else 0
+    return np.arange(first, len(values), held)
+
+
 def between_readings(values: np.ndarray) -> np.ndarray:
     """Values (N, ...) of a channel, linear between its readings: held ones are late by half the
     time from one to the next on average."""
-    held = rows_per_reading(values)
-    if held == 1:
+    read = rows_of_readings(values)
+    if len(read) == len(values):
         return values
-    # Also those that happen to equal the one before.
-    read = np.arange(_changes(values)[0] % held, len(values), held)
     ends = values[read[0]], values[read[-1]]
     line = interp1d(read, values[read], axis=0, bounds_error=False, fill_value=ends)
     return np.asarray(line(np.arange(len(values))))
