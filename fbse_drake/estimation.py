@@ -172,7 +172,7 @@ class Replay:
         # The tick that each row of the log tells of.
         self._tick_of_row = np.searchsorted(ticks[1:], np.arange(len(log.time)), side="right")
         if slowest is not None:
-            log = log.part(slice(int(ticks[0]), None, int(ticks[1] - ticks[0])))
+            log = log.part(ticks)
         inputs = _inputs(scenario, robot, log)
         sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
         believed = partial(scenario.believed.effects_of, names=robot.description, key="model")

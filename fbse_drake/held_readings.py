@@ -1,33 +1,46 @@
 """Channels of sensors that are read more seldom than a log has rows, and held in between."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.interpolate import interp1d
 
 # Fewer changes of a channel do not tell how often it is read.
 _FEWEST_CHANGES = 20
+# This share of the times from one change to the next must be alike within a row: a sensor's clock
+# need not be the log's, but a coarse encoder changes as its joint turns.
+_REGULAR = 0.9
 
 
-def rows_per_reading(values: np.ndarray) -> int:
-    """Rows of a log for which each reading of a channel is held: 1 for one that is read in every
-    row, at no fixed period, or seldom changes at all.
+def rows_of_readings(values: np.ndarray) -> np.ndarray:
+    """Rows of a log in which a channel is read, also what happens to equal the reading before; all
+    rows of a channel that is read in every row, irregularly, or that seldom changes.
 
     Args:
         values: of the channel, (N, ...).
 
     >>> import numpy as np
-    >>> rows_per_reading(np.repeat(np.arange(30.0), 4))
-    4
+    >>> rows_of_readings(np.repeat(np.arange(30.0), 4))[:4]
+    array([ 0,  4,  8, 12])
     """
-    changes = _changes(values)
-    return int(np.gcd.reduce(np.diff(changes))) if len(changes) >= _FEWEST_CHANGES else 1
+    rows = np.arange(len(values))
+    changes = 1 + np.flatnonzero(np.any(np.diff(values.reshape(len(values), -1), axis=0), axis=1))
+    if len(changes) < _FEWEST_CHANGES:
+        return rows
+    apart = np.diff(changes)
+    usual = int(np.median(apart))
+    if usual == 1 or np.mean(np.abs(apart - usual) <= 1) < _REGULAR:
+        return rows
+    # Between changes that are further apart, readings equal the one before.
+    ends = pairwise([*changes, len(values) + usual // 2])
+    after = (np.arange(start, end - usual // 2, usual) for start, end in ends)
+    return np.concatenate([np.arange(changes[0] % usual, changes[0], usual), *after])
 
 
-def rows_of_readings(values: np.ndarray) -> np.ndarray:
-    """Rows in which a channel (N, ...) is read, also what happens to equal the reading before; all
-    of one whose readings are not held."""
-    held = rows_per_reading(values)
-    first = _changes(values)[0] % held if held > 1 else 0
-    return np.arange(first, len(values), held)
+def rows_per_reading(values: np.ndarray) -> float:
+    """Rows of a log for which each reading of a channel (N, ...) is held, in the mean; 1 for one
+    that is not, see `rows_of_readings`."""
+    return len(values) / len(rows_of_readings(values))
 
 
 def between_readings(values: np.ndarray) -> np.ndarray:
@@ -39,8 +52,3 @@ def between_readings(values: np.ndarray) -> np.ndarray:
     ends = values[read[0]], values[read[-1]]
     line = interp1d(read, values[read], axis=0, bounds_error=False, fill_value=ends)
     return np.asarray(line(np.arange(len(values))))
-
-
-def _changes(values: np.ndarray) -> np.ndarray:
-    """Rows that do not equal the row before."""
-    return 1 + np.flatnonzero(np.any(np.diff(values.reshape(len(values), -1), axis=0), axis=1))

@@ -201,10 +201,12 @@ class Log(Mapping[str, np.ndarray]):
         """Unit of a channel, as `rad/s`."""
         return channel_kind(name)[0]
 
-    def part(self, rows: slice) -> "Log":
-        """Some of its samples; of every k-th the period is k times as long."""
+    def part(self, rows: slice | np.ndarray) -> "Log":
+        """Some of its samples; of every k-th the period is k times as long, k being the median if
+        rows are given one by one."""
         channels = {name: values[rows] for name, values in self.channels.items()}
-        return Log(channels, self.meta | {"period": self.meta["period"] * (rows.step or 1)})
+        apart = (rows.step or 1) if isinstance(rows, slice) else int(np.median(np.diff(rows)))
+        return Log(channels, self.meta | {"period": self.meta["period"] * apart})
 
     def to_pandas(self) -> "pandas.DataFrame":
         """As a data frame, see `fbse_drake.interop.frames`.

@@ -10,7 +10,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.estimation import estimate
-from fbse_drake.held_readings import between_readings, rows_per_reading
+from fbse_drake.held_readings import between_readings, rows_of_readings, rows_per_reading
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import friction_nrmse
 from fbse_drake.scenario import Scenario
@@ -28,9 +28,10 @@ TRIED = (
 )
 
 
-def held(log: Log, kinds: tuple[str, ...], rows: int) -> Log:
-    """As if the sensors of some channels were read in every so many rows."""
-    latest = np.arange(len(log.time)) // rows * rows
+def held(log: Log, kinds: tuple[str, ...], rows: float) -> Log:
+    """As if the sensors of some channels were read every so many rows."""
+    read = np.ceil(np.arange(0, len(log.time), rows)).astype(int)
+    latest = read[np.searchsorted(read, np.arange(len(log.time)), side="right") - 1]
     channels = {
         name: values[latest] if name.startswith(kinds) else values
         for name, values in log.channels.items()
@@ -51,7 +52,8 @@ def test_a_line_is_read_back_from_what_is_held_of_it(rows: int, first: int):
     # A sensor that was read in rows `first`, `first + rows`, ...
     latest = (row - first) // rows * rows + first
     kept = np.stack([0.3 * latest, -2.0 * latest], axis=1)
-    assert rows_per_reading(kept) == rows
+    assert rows_per_reading(kept) == pytest.approx(rows, rel=0.02)
+    np.testing.assert_array_equal(rows_of_readings(kept), np.arange(first, 600, rows))
     inner = slice(rows, 600 - rows)
     np.testing.assert_allclose(between_readings(kept)[inner], line[inner], atol=1e-9)
     # The last reading is held: nobody knows the next.
@@ -78,13 +80,14 @@ def test_a_coarse_encoder_and_a_channel_without_change_are_left_as_they_are():
     ("kinds", "rows"),
     [
         (("foot/",), 5),
-        (("foot/",), 10),
+        (("foot/",), 2.5),
+        (("foot/",), 10.2),
         (("joint/position", "joint/velocity"), 4),
         (("foot/", "imu/", "joint/position", "joint/velocity"), 5),
     ],
 )
 def test_slow_sensors_are_no_effect(
-    run: Callable[..., Log], believed: Scenario, kinds: tuple[str, ...], rows: int
+    run: Callable[..., Log], believed: Scenario, kinds: tuple[str, ...], rows: float
 ):
     """Held forces were taken for lags of feet and ankles, held angles for something unknown."""
     log = held(run(*WALK), kinds, rows)
