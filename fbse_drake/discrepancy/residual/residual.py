@@ -135,8 +135,8 @@ def read_signals(
     """Sensor channels of a log on an even grid of its nominal period.
 
     Late samples are interpolated, and what sensors hold between their readings; what lies in a gap
-    is marked. Without `joint/velocity` angles are
-    differenced; without `joint/torque_command` torques are 0.
+    is marked. Without `joint/velocity` angles are differenced; without `joint/torque_command`
+    torques are 0.
 
     Returns:
         The signals, N samples, and which of them are measured (not interpolated over a gap), shape
