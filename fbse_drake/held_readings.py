@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
-from scipy.interpolate import interp1d
+from scipy.interpolate import make_interp_spline
 
 # Fewer changes of a channel do not tell how often it is read.
 _FEWEST_CHANGES = 20
@@ -49,6 +49,5 @@ def between_readings(values: np.ndarray) -> np.ndarray:
     read = rows_of_readings(values)
     if len(read) == len(values):
         return values
-    ends = values[read[0]], values[read[-1]]
-    line = interp1d(read, values[read], axis=0, bounds_error=False, fill_value=ends)
-    return np.asarray(line(np.arange(len(values))))
+    line = make_interp_spline(read, values[read], k=1)
+    return np.asarray(line(np.arange(len(values)).clip(read[0], read[-1])))

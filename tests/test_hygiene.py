@@ -198,6 +198,11 @@ def test_clipped_torque_and_coarse_velocity_and_held_samples(run: Run) -> None:
     fourth = np.repeat(log["joint/torque_command"][::4], 4, axis=0)[: len(log.time)]
     held = of_kind("held", findings(GANTRY, changed(log, joint__torque_command=fourth)))
     assert held.size == pytest.approx(4, rel=0.05)
+    # A command is meant to be held.
+    assert "late on average" in held.text
+    fourth = np.repeat(log["joint/velocity"][::4], 4, axis=0)[: len(log.time)]
+    held = of_kind("held", findings(GANTRY, changed(log, joint__velocity=fourth)))
+    assert "interpolated between its readings" in held.text
 
 
 def test_filtered_before_it_was_recorded(run: Run) -> None:

@@ -32,7 +32,8 @@ _CREEPING = ("lagged", "similar")
 
 @dataclass(frozen=True)
 class GroundEffect(Effect):
-    """Base of the effects of the ground, which act on the robot as a whole."""
+    """Base of the effects of the ground, which act on the robot as a whole. A diagnosis predicts
+    `GroundSlope` and every `ContactEffect`."""
 
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
 

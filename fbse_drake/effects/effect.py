@@ -9,8 +9,7 @@ thing it is, is said by its base class:
     InertiaEffect       reflected inertia, masses, centres of mass (inertia.py)
     GeometryEffect      lengths of links (geometry.py)
     SensorEffect        what a sensor reads beside the truth (sensor.py)
-    GroundEffect        how the ground lies (contact.py)
-    ContactEffect       how it lets standing soles move (contact.py)
+    ContactEffect       ground and soles (contact.py)
 
 An effect of a user's own is a subclass of one of them behind `@in_library`; from then on YAML files
 can name it and the diagnosis tries it.

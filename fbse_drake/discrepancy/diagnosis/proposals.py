@@ -186,8 +186,10 @@ class Proposals:
     ) -> bool:
         """Is a candidate that is no joint torque effect worth a fit?"""
         beside, s = self.fits.remainder(base), candidate.signature
-        alone = (fixed_gain(*beside.moments(s, k)) for k in range(len(s.rows)))
-        return _gain(beside, s) > share * self.fits.required(candidate) and self._may_reach(
+        moments = _moments(beside, s)
+        gain = fixed_gain(*_weighted(moments, beside.scale[s.rows]))
+        alone = (fixed_gain(*of_row) for of_row in moments)
+        return gain > share * self.fits.required(candidate) and self._may_reach(
             wanted, base, s.rows, alone
         )
 
@@ -272,10 +274,14 @@ class Proposals:
         return chosen
 
 
+def _moments(beside: Remainder, signature: Signature) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Inner products of what an explanation leaves of columns, in each of their rows."""
+    return [beside.moments(signature, k) for k in range(len(signature.rows))]
+
+
 def _gain(beside: Remainder, signature: Signature) -> float:
     """Drop of the sum of squares by columns beside an explanation, roughly."""
-    moments = [beside.moments(signature, k) for k in range(len(signature.rows))]
-    return fixed_gain(*_weighted(moments, beside.scale[signature.rows]))
+    return fixed_gain(*_weighted(_moments(beside, signature), beside.scale[signature.rows]))
 
 
 def _weighted(
