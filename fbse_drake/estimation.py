@@ -103,17 +103,18 @@ def friction_estimates(
     return frictions
 
 
-def _inputs(scenario: Scenario, robot: Robot, log: Log) -> dict[str, np.ndarray]:
-    """What a station's ports told when the log was recorded, (N, size) each, if the log says it."""
+def _inputs(scenario: Scenario, robot: Robot, log: Log, ticks: np.ndarray) -> dict[str, np.ndarray]:
+    """What a station's ports told at some rows of a log, (ticks, size) each, if the log says it; a
+    torque command is the mean over the tick that begins there."""
     if log.joints != robot.joint_names:
         raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
     values = {port: port_values(port, log) for port in ("torque_command", "torque_loss")}
-    inputs = {port: value for port, value in values.items() if value is not None}
-    if "torque_command" in inputs:
-        torque = inputs["torque_command"]
-        inputs["torque_command"] = _torque_over_ticks(scenario, log, torque)
+    inputs = {port: value[ticks] for port, value in values.items() if value is not None}
+    if (torque := values["torque_command"]) is not None:
+        torque = _torque_over_rows(scenario, log, torque)
+        inputs["torque_command"] = _mean_over_ticks(log.time, torque, ticks)
     for sensor in scenario.sensors.by_name.values():
-        inputs |= sensor.readings(robot, log)
+        inputs |= sensor.readings(robot, log.part(ticks))
     return inputs
 
 
@@ -125,8 +126,8 @@ def _reading_time(scenario: Scenario, log: Log) -> float:
     return scenario.plant.time_step if said is None else said
 
 
-def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.ndarray:
-    """Mean of the torque commands over the ticks that begin at a log's rows, (N, n) [Nm].
+def _torque_over_rows(scenario: Scenario, log: Log, torque: np.ndarray) -> np.ndarray:
+    """Mean of the torque commands from each of a log's rows to the next, (N, n) [Nm].
 
     A log that is slower than the control has only samples of what changed in between.
     """
@@ -136,6 +137,19 @@ def _torque_over_ticks(scenario: Scenario, log: Log, torque: np.ndarray) -> np.n
     share = start_share(float(log.meta["period"]), held)
     after = np.concatenate([torque[1:], torque[-1:]])
     return torque + share * (after - torque)
+
+
+def _mean_over_ticks(time: np.ndarray, values: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Mean of values (N, n), each held from its `time` [s] to the next, from each tick to the next.
+
+    Args:
+        ticks: the rows in which they begin.
+    """
+    if len(ticks) == len(time):
+        return values
+    held = np.diff(time, append=2 * time[-1] - time[-2])
+    total = np.add.reduceat(held[:, None] * values, ticks)
+    return total / np.add.reduceat(held, ticks)[:, None]
 
 
 def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
@@ -171,9 +185,9 @@ class Replay:
         slowest, ticks = _ticks(log)
         # The tick that each row of the log tells of.
         self._tick_of_row = np.searchsorted(ticks[1:], np.arange(len(log.time)), side="right")
+        inputs = _inputs(scenario, robot, log, ticks)
         if slowest is not None:
             log = log.part(ticks)
-        inputs = _inputs(scenario, robot, log)
         sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
         believed = partial(scenario.believed.effects_of, names=robot.description, key="model")
         in_sensors = believed(SensorEffect)

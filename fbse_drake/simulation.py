@@ -20,10 +20,11 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSi
 from fbse_drake import signals
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, law_over_time
 from fbse_drake.effects.system import loss_over_time
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, required
 from fbse_drake.estimators.zmp import zero_moment_point
 from fbse_drake.log import Log, plausible_part
 from fbse_drake.results import RunResult
+from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
 from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
@@ -227,8 +228,22 @@ def _advance(
         meshcat.PublishRecording()
     stopped = failure == _INTERRUPTED
     if failure is not None:
-        failure = f"t = {end:.3f} s: {failure}"
+        hint = _undamped(scenario, robot.description) if fell else ""
+        failure = f"t = {end:.3f} s: {failure}{hint}"
     return End(failure, fell, stopped, wall_time)
+
+
+def _undamped(scenario: Scenario, names: RobotDescription) -> str:
+    """For the reader of a fall: the joint that the control damps least, if it does not at all."""
+    reading = required(scenario.sensors.encoders.period, "sensors.encoders.period")
+    damping = scenario.control.damping(names, reading, scenario.plant.time_step)
+    worst = int(np.argmin(damping))
+    if damping[worst] >= 0:
+        return ""
+    return (
+        f"; held readings and commands leave the control a damping of {damping[worst]:.2g} Nms/rad "
+        f"in {names.joint_names[worst]} (see control.kd, control.period, sensors.encoders.period)"
+    )
 
 
 def fall_reason(

@@ -6,6 +6,7 @@ it gives by name; a part that a scenario does not have gives none. What the name
 table of signals (`fbse_drake.signals`).
 """
 
+import math
 from collections.abc import Mapping
 from copy import copy
 from functools import partial
@@ -31,7 +32,7 @@ from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.effects.sensor_systems import SensorEffects
 from fbse_drake.effects.system import JointTorqueEffects
-from fbse_drake.errors import InputError, located
+from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.estimator import EstimatorDiagram, make_estimator
 from fbse_drake.estimators.recursive import Clock
 from fbse_drake.robot.description import RobotDescription, load_description
@@ -112,7 +113,8 @@ class Station(Diagram):
         self.estimator = make_estimator(
             scenario.estimator,
             self.model,
-            period=scenario.control.period,
+            period=_estimation_period(scenario, self.model.description),
+            control=scenario.control.period,
             plan=self.reference.plan,
             sensors=scenario.believed_sensors,
             sensor_effects=believed_effects(SensorEffect),
@@ -351,6 +353,19 @@ def add_controller(
         builder.Connect(port, controller.GetInputPort(name))
     builder.Connect(controller.get_output_port(), robot.torque_command)
     return controller
+
+
+def _estimation_period(scenario: Scenario, names: RobotDescription) -> float:
+    """The fewest whole periods of the control in which all joints and feet are read [s].
+
+    So often an estimator ticks: with held readings it would compare what was not at the same time.
+    (The base moves so slowly that an IMU may be late.)
+    """
+    sensors, control = scenario.sensors, required(scenario.control.period, "control.period")
+    slowest = required(sensors.encoders.period, "sensors.encoders.period")
+    if names.legs:
+        slowest = max(slowest, required(sensors.foot_force.period, "sensors.foot_force.period"))
+    return control * max(math.ceil(slowest / control - 1e-6), 1)
 
 
 def add_estimator(

@@ -109,15 +109,21 @@ def test_a_lag_is_found_behind_slow_sensors(run: Callable[..., Log], believed: S
 def test_an_estimator_ticks_when_its_slowest_sensor_is_read(
     run: Callable[..., Log], kinds: tuple[str, ...], rows: int
 ):
-    """As it does over a log that has these rows alone."""
+    """As it does over a log that has these rows alone, and says what was commanded meanwhile."""
     walk = ("paper_walk_fbse", "duration=2")
     log = held(run(*walk), kinds, rows)
     found = estimate(scenario(*walk), log)
-    alone = estimate(scenario(*walk), log.part(slice(0, None, rows)))
+    read = log.part(slice(0, None, rows))
+    torque = log["joint/torque_command"]
+    means = [torque[start : start + rows].mean(axis=0) for start in range(0, len(torque), rows)]
+    channels = read.channels | {"joint/torque_command": np.array(means)}
+    meta = read.meta | {"command_time": read.meta["period"]}
+    alone = estimate(scenario(*walk), Log(channels, meta))
     for name in ("estimate/joint/friction_torque", "estimate/base/orientation"):
         assert len(found.log[name]) == len(log.time)
-        np.testing.assert_array_equal(found.log[name][::rows], alone.log[name])
-        np.testing.assert_array_equal(found.log[name][rows - 1 :: rows][:-1], alone.log[name][:-2])
+        np.testing.assert_allclose(found.log[name][::rows], alone.log[name], atol=1e-6)
+        held_on = found.log[name][rows - 1 :: rows]
+        np.testing.assert_array_equal(held_on, found.log[name][: -rows + 1 : rows][: len(held_on)])
     assert any(f"is read every {rows} ms" in remark for remark in found.remarks)
     assert len(alone.remarks) == len(found.remarks) - 1
 
@@ -128,4 +134,4 @@ def test_friction_is_told_from_forces_at_100_hz(run: Callable[..., Log]):
     found = estimate(scenario(*walk), held(run(*walk), ("foot/",), 10)).log
     for phase, errors in friction_nrmse(found).items():
         without_yaw = [e for joint, e in errors.items() if "hip_yaw" not in joint]
-        assert np.mean(without_yaw) < 0.3, phase
+        assert np.mean(without_yaw) < 0.25, phase

@@ -25,8 +25,7 @@ class PositionLoopConfig:
     torque_limit: dict[str, float] = field(default_factory=lambda: {"all": 300.0})
     # Is the reference's feed-forward torque (gravity and inertia) added?
     feedforward: bool = True
-    # Period of the control [s]; by default `Scenario.usual_period`. The loop damps by
-    # kd - kp (period - plant step) / 2, for a held command is late.
+    # Period of the control [s]; by default `Scenario.usual_period`. See `damping`.
     period: float | None = None
 
     def __post_init__(self) -> None:
@@ -36,6 +35,20 @@ class PositionLoopConfig:
             for joint, value in values.items():
                 if value < 0:
                     raise InputError(f"{name}.{joint}: expected a number >= 0, found {value:g}")
+
+    def damping(self, names: RobotDescription, reading: float, time_step: float) -> np.ndarray:
+        """How much the loop damps each joint, (n,) [Nms/rad]: kd - kp (T - h) / 2.
+
+        What is read or commanded every T, and held, is late by T / 2 on average; a plant's step h
+        of semi-implicit Euler gives half of it back.
+
+        Args:
+            reading: period of the encoders [s]; T is this one or the control's, the longer one.
+            time_step: of the plant [s].
+        """
+        kp, kd = (names.per_joint(getattr(self, k), key=f"control.{k}") for k in ("kp", "kd"))
+        held = max(required(self.period, "control.period"), reading)
+        return kd - kp * (held - time_step) / 2
 
 
 def position_loop(

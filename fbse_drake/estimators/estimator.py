@@ -170,6 +170,7 @@ def make_estimator(
     period: float,
     plan: TaskPlan | None = None,
     every_sample: bool = False,
+    control: float | None = None,
     reading: float | None = None,
     sensors: SensorBeliefs = USUAL_SENSORS,
     sensor_effects: Sequence[ResolvedSensorEffect] = (),
@@ -185,6 +186,7 @@ def make_estimator(
         plan: for the planned support, and for where the feet stand at the start.
         every_sample: every evaluation at a later time is a tick, whatever the period; for recorded
             logs.
+        control: how often the commands may change [s], by default with each tick.
         reading: what a reading of accelerometer or foot force is the mean over [s], 0 for a sample;
             by default the tick.
         sensors: what is believed of them where the config says nothing.
@@ -199,7 +201,7 @@ def make_estimator(
         InputError: an estimator that does not fit the robot.
     """
     shortest = 1e-9 if every_sample else period * (1 - 1e-6)
-    clock = Clock(period, shortest, period if reading is None else reading)
+    clock = Clock(period, shortest, period if reading is None else reading, control)
     workshop, chains = Workshop(), list[Chain]()
     if sensor_effects:
         workshop.correct(sensor_effects, robot, clock, knows_torque=knows_torque)

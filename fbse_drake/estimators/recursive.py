@@ -66,6 +66,8 @@ class Clock:
     # A reading of accelerometer or foot force is the mean over this time before it [s]; 0 for a
     # sample.
     reading: float = 0.001
+    # How often inputs may change that count for the whole tick, as commands [s]; None: with it.
+    control: float | None = None
 
     @staticmethod
     def every(period: float) -> "Clock":
@@ -87,6 +89,11 @@ def start_share(elapsed: float, reading: float) -> float:
     return 0.5 * (1.0 - reading / elapsed) if elapsed > 1.5 * reading else 0.0
 
 
+def _is_tick(context: Context, posterior: np.ndarray) -> bool:
+    """Is this posterior a new one? (Before the first tick the time is no number.)"""
+    return not posterior.item(0) <= context.get_discrete_state().value(0).item(0)
+
+
 @dataclass(frozen=True)
 class RecordInput:
     """An input port that gets the posterior of another estimator."""
@@ -101,18 +108,24 @@ class RecordInput:
 
 @dataclass(frozen=True)
 class RememberedInput:
-    """An input port whose value of the tick before counts: before the first, it is zero."""
+    """An input port whose mean counts, from the tick before to the present one; zero before the
+    first. The state is the mean, then how many values it is of."""
 
     port: InputPort
     index: DiscreteStateIndex
 
     def Eval(self, context: Context) -> np.ndarray:
-        """The value a tick ago."""
-        return context.get_discrete_state().value(self.index)
+        """The mean since the tick before."""
+        return context.get_discrete_state().value(self.index)[:-1]
 
-    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:  # noqa: ARG002
+    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
         """Keeps the present value for the next tick."""
-        state.set_value(self.index, self.port.Eval(context))
+        values, present = state.get_mutable_value(self.index), self.port.Eval(context)
+        if _is_tick(context, posterior):
+            values[:-1], values[-1] = present, 1.0
+        else:
+            values[-1] += 1.0
+            values[:-1] += (present - values[:-1]) / values[-1]
 
 
 class Past(NamedTuple):
@@ -174,8 +187,7 @@ class Advanced:
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
         """Goes on, if the present evaluation is a tick."""
-        # (Before the first tick the time is no number.)
-        if not posterior.item(0) <= context.get_discrete_state().value(0).item(0):
+        if _is_tick(context, posterior):
             state.set_value(self.index, self.advance(context))
 
 
@@ -214,7 +226,9 @@ class RecursiveEstimator(LeafSystem):
         self.record_inputs: dict[str, np.dtype] = {}
         self._remembered: list[RememberedInput | History | Advanced] = []
         self._later: set[str] = set()
-        self.DeclarePeriodicUnrestrictedUpdateEvent(clock.period, 0.0, weakly(self._remember))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            clock.control or clock.period, 0.0, weakly(self._remember)
+        )
         self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
 
     @staticmethod
@@ -274,7 +288,7 @@ class RecursiveEstimator(LeafSystem):
     def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
         """Declares an input port that the posterior of the next tick depends on, not this one's."""
         port = self.DeclareVectorInputPort(name, size)
-        remembered = RememberedInput(port, self.DeclareDiscreteState(size))
+        remembered = RememberedInput(port, self.DeclareDiscreteState(size + 1))
         self._remembered.append(remembered)
         self._later.add(name)
         return remembered

@@ -32,7 +32,7 @@ class BaseWrench(Sensor):
     # Standard deviation of white noise of force [N] and moment [Nm].
     noise: float = 0.0
     moment_noise: float = 0.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

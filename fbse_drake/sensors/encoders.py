@@ -50,7 +50,7 @@ class EncoderConfig(Sensor):
     velocity: str = "exact"
     # Standard deviation of an `exact` velocity [rad/s].
     velocity_noise: float = 0.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

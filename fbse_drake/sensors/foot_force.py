@@ -56,7 +56,7 @@ class FootForceConfig(Sensor):
     delay: float = 0.0
     # Largest force in either direction [N].
     range: float = 5000.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

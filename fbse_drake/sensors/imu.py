@@ -38,7 +38,7 @@ class ImuConfig(Sensor):
     # Random walk of the errors [m/s^2/sqrt(s)], [rad/s/sqrt(s)].
     acceleration_bias_walk: float = 0.0
     angular_velocity_bias_walk: float = 0.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ class JointTorqueConfig(Sensor):
 
     # Standard deviation of white noise [Nm].
     noise: float = 0.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

@@ -34,7 +34,7 @@ class MotorEncoderConfig(Sensor):
     resolution: float = 0.0
     # Standard deviation of the angle before it is rounded [rad].
     noise: float = 0.0
-    # Sampling period [s]; by default `Scenario.usual_period`.
+    # Sampling period [s], held in between; by default `Scenario.usual_period`.
     period: float | None = None
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ from fbse_drake.library import require_new
 from fbse_drake.log import Log
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
+from fbse_drake.sensors.sample_and_hold import SampleAndHold
 from fbse_drake.signals import Signal, channels_of, port_values, register
 from fbse_drake.wiring import connect_by_name, outputs_by_name
 
@@ -43,6 +44,7 @@ class Sensor(ABC):
     """Base of the sensors: a frozen dataclass whose fields say how the sensor errs.
 
     One that samples has a field `period` [s]; if it is None, a scenario gives it its usual one.
+    What it measures (ports `measured_...`) is then read so often, and held in between.
     """
 
     # What it gives: rows of the table of signals.
@@ -97,6 +99,14 @@ class Sensor(ABC):
             if set(given) != set(self.ports()):
                 expected, found = ", ".join(self.ports()), ", ".join(given) or "none"
                 raise InputError(f"expected the output ports {expected}, found {found}")
+        period = getattr(self, "period", None) or run.time_step
+        if period < run.time_step * (1 + 1e-6):
+            return given
+        for port in [port for port in given if port.startswith("measured_")]:
+            hold = SampleAndHold(period, given[port].size())
+            builder.AddNamedSystem(f"{name}_{port}", hold)
+            builder.Connect(given[port], hold.get_input_port())
+            given[port] = hold.held
         return given
 
     def check(self, names: RobotDescription) -> None:  # noqa: B027
