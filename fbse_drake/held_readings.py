@@ -5,6 +5,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+# A bend of a line through readings that is so many standard deviations of its noise is no noise.
+_SIGNIFICANT = 3.0
 # Fewer changes of a channel do not tell how often it is read.
 _FEWEST_CHANGES = 20
 # This share of the times from one change to the next must be alike within a row: a sensor's clock
@@ -51,3 +53,32 @@ def between_readings(values: np.ndarray) -> np.ndarray:
         return values
     line = make_interp_spline(read, values[read], k=1)
     return np.asarray(line(np.arange(len(values)).clip(read[0], read[-1])))
+
+
+def unseen_variance(
+    values: np.ndarray, noise: np.ndarray | float, seen: float, read: np.ndarray
+) -> np.ndarray:
+    """What jumps between a channel's readings, and nobody knows when: variance of white noise in
+    every row, (N, k), that leaves as much in an average; 0 where readings go on as before.
+
+    A jump J within the time T from one reading to the next, of which a reading is the mean over t,
+    makes the integral of a straight line between them wrong by J sqrt((T^2 - t^2) / 12). It shows
+    as bends of the line through the readings, to one side and back.
+
+    Args:
+        values: of the channel, (N, k).
+        noise: standard deviation of a reading, scalar, (k,) or (readings, k).
+        seen: t, in rows of the log.
+        read: the rows that are readings, see `rows_of_readings`.
+    """
+    intervals, result = np.diff(read), np.zeros(values.shape)
+    if len(read) < 3 or intervals.max() <= seen:
+        return result
+    bends = np.abs(np.diff(values[read], 2, axis=0))
+    # Of both ends of an interval the smaller one; nobody knows those before and after all readings.
+    bends = np.concatenate([bends[:1], bends, bends[-1:]])
+    jumps = np.minimum(bends[:-1], bends[1:])
+    beyond = np.maximum(jumps**2 - 6.0 * (_SIGNIFICANT * np.asarray(noise)) ** 2, 0.0)
+    unseen = np.maximum(intervals - seen**2 / intervals, 0.0) / 12.0
+    result[read[0] : read[-1]] = np.repeat(beyond * unseen[:, None], intervals, axis=0)
+    return result

@@ -10,7 +10,12 @@ from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.estimation import estimate
-from fbse_drake.held_readings import between_readings, rows_of_readings, rows_per_reading
+from fbse_drake.held_readings import (
+    between_readings,
+    rows_of_readings,
+    rows_per_reading,
+    unseen_variance,
+)
 from fbse_drake.log import Log
 from fbse_drake.report.metrics import friction_nrmse
 from fbse_drake.scenario import Scenario
@@ -74,6 +79,55 @@ def test_a_coarse_encoder_and_a_channel_without_change_are_left_as_they_are():
     for values in (coarse, np.zeros(2000), np.random.default_rng(0).normal(size=2000)):
         assert rows_per_reading(values) == 1
         assert between_readings(values) is values
+
+
+def test_a_jump_between_readings_is_as_bad_as_the_noise_that_is_said():
+    """Jumps of 7 at any time between two readings, against the integral of the line through
+    these; all else is smooth."""
+    rows, count = 10, 3000
+    step = np.zeros(4 * rows * count + rows)
+    jumps = rows * (4 * np.arange(count) + 2 + np.random.default_rng(2).uniform(size=count))
+    step[np.ceil(jumps).astype(int)] = 7.0 * (-1.0) ** np.arange(count)
+    truth = np.sin(np.arange(len(step)) / 300) + np.cumsum(step)
+    held_on = np.repeat(truth[::rows], rows)
+
+    def around_each_jump(values: np.ndarray) -> np.ndarray:
+        return values[: 4 * rows * count].reshape(count, 4 * rows)
+
+    error = around_each_jump(between_readings(held_on) - truth).sum(axis=1)
+    read = rows_of_readings(held_on)
+    said = around_each_jump(unseen_variance(held_on[:, None], 0.0, 1.0, read)[:, 0])
+    assert np.mean(error**2) == pytest.approx(said.sum(axis=1).mean(), rel=0.05)
+    amid = np.arange(4 * rows) // rows == 2
+    # (How the line bends after the last reading is not known.)
+    assert np.all(said[:, amid] > 10)
+    assert np.all(said[:-1, ~amid] < 1e-3)
+
+
+def test_noise_and_smooth_motion_are_no_jumps():
+    noise = 0.3 * np.random.default_rng(1).normal(size=(3000, 2))
+    values = np.repeat(np.sin(np.arange(3000) / 20)[:, None] + noise, 5, axis=0)
+    # Of what the noise itself leaves in an average: five rows of a reading's variance.
+    of_held = unseen_variance(values, 0.3, 1.0, np.arange(0, len(values), 5))
+    assert np.all(of_held.mean(axis=0) < 0.01 * 5 * 0.3**2)
+    jump = 1e3 * (np.arange(3000) > 1000)[:, None]
+    assert not unseen_variance(jump, 0.3, 1.0, np.arange(3000)).any()
+    assert unseen_variance(jump, 0.3, 0.2, np.arange(3000)).any()
+
+
+@pytest.mark.parametrize("sensor", ["foot_force", "imu"])
+def test_impacts_between_readings_are_no_effect(run: Callable[..., Log], sensor: str):
+    """Forces and moments of a trot's base lacked something unknown, up to seven times the noise."""
+    trot = (
+        "quadruped_trot",
+        "duration=3",
+        "estimator=!NoEstimator {}",
+        f"sensors.{sensor}.period=0.005",
+    )
+    believed = scenario(*trot)
+    believed = replace(believed, model=believed.robot)
+    found = diagnose(Predictor(believed, run(*trot)), [library()[name] for name in TRIED])
+    assert (found.verdict, found.chosen) == ("nothing_missing", [])
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,12 @@ from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.held_readings import between_readings, rows_per_reading
+from fbse_drake.held_readings import (
+    between_readings,
+    rows_of_readings,
+    rows_per_reading,
+    unseen_variance,
+)
 from fbse_drake.log import Log
 from fbse_drake.robot.dynamics import PlantDynamics
 from fbse_drake.robot.plant import Robot
@@ -353,6 +358,24 @@ def averaged(instants: Instants, length: int) -> Instants:
     )
 
 
+@dataclass(frozen=True)
+class Unseen:
+    """What happened between readings and commands that a log has: variance of noise in M instants
+    that is as bad, see `fbse_drake.held_readings.unseen_variance`."""
+
+    # Of the joints, (M, n) [Nm^2].
+    torque: np.ndarray
+    # On the base in its axes, (M, 3) [m^2/s^4].
+    specific_force: np.ndarray
+    # On each sole in its frame, (M, 6) each [Nm^2, N^2].
+    wrenches: list[np.ndarray]
+
+    def part(self, instants: slice) -> "Unseen":
+        """In some of the instants."""
+        wrenches = [wrench[instants] for wrench in self.wrenches]
+        return Unseen(self.torque[instants], self.specific_force[instants], wrenches)
+
+
 class _LastResults:
     """The last results of a function of arrays. The function itself is not held, so that it may be
     a method of what holds this."""
@@ -530,8 +553,13 @@ class EquationOfMotion:
             accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
         return states, accelerations
 
-    def noise(self, at: Instants, sensors: SensorsConfig) -> tuple[np.ndarray, np.ndarray]:
+    def noise(
+        self, at: Instants, sensors: SensorsConfig, unseen: Unseen
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Variance that sensor noise puts into each row of one step, to first order.
+
+        Args:
+            unseen: what is as good as noise besides.
 
         Returns:
             Of what is white, and of the integral over time of what is differenced white noise, each
@@ -543,13 +571,15 @@ class EquationOfMotion:
         white[:, rows - motors :] = sensors.deflection_noise**2
         for start in range(0, M, _AT_A_TIME):
             part = slice(start, start + _AT_A_TIME)
-            self._fill_noise(at.joint_position[part], sensors, white[part], differenced[part])
+            outputs = white[part], differenced[part]
+            self._fill_noise(at.joint_position[part], sensors, unseen.part(part), *outputs)
         return white, differenced
 
     def _fill_noise(
         self,
         joint_position: np.ndarray,
         sensors: SensorsConfig,
+        unseen: Unseen,
         white: np.ndarray,
         differenced: np.ndarray,
     ) -> None:
@@ -558,6 +588,7 @@ class EquationOfMotion:
         positions = np.tile(self._upright, (len(joint_position), 1))
         positions[:, robot.position_index] = joint_position
         gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
+        white[:, :n] = unseen.torque
         floating, velocity_noise = robot.has_floating_base, joint_velocity_noise(sensors)
         scale = np.concatenate(
             [np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)]
@@ -565,20 +596,26 @@ class EquationOfMotion:
         joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
         H = self.dynamics.mass_matrices(positions)[:, self._order[joints_first]][:, :, self._order]
         if floating:
-            white[:, :v] = accelerometer**2 * (H[:, :, 3:6] ** 2).sum(axis=2)
+            white[:, :v] += accelerometer**2 * (H[:, :, 3:6] ** 2).sum(axis=2)
+            white[:, :v] += np.einsum("mij,mj->mi", H[:, :, 3:6] ** 2, unseen.specific_force)
             H[:, :, :3] += H[:, :, 3:6] @ _skew(self.p_BI)
         differenced[:, :v] = ((H * scale) ** 2).sum(axis=2)
         if not floating:
             return
         place, relative = v, []
-        for J, deviation in zip(
+        for J, deviation, unseen_wrench in zip(
             self._calc_jacobians(positions),
             wrench_deviations(sensors.foot_force, robot),
+            unseen.wrenches,
             strict=True,
         ):
             white[:, :v] += np.einsum("mij,i->mj", J**2, deviation**2)[:, joints_first]
+            white[:, :v] += np.einsum("mij,mi->mj", J**2, unseen_wrench)[:, joints_first]
             white[:, place : place + 3] = ((J[:, :3] * scale) ** 2).sum(axis=2)
             white[:, place + 3 : place + 6] = accelerometer**2
+            white[:, place + 3 : place + 6] += np.einsum(
+                "mij,mj->mi", J[:, 3:, 3:6] ** 2, unseen.specific_force
+            )
             differenced[:, place + 3 : place + 6] = ((J[:, 3:] * scale) ** 2).sum(axis=2)
             relative.append(np.einsum("mij,mik->mjk", J[:, 3:, 3:6], J[:, 3:]))
             place += 6
@@ -829,10 +866,42 @@ class RecordedMotion:
         )
 
     @cached_property
+    def _unseen(self) -> Unseen:
+        """Of the blocks."""
+        log, sensors, timing = self.log, self.sensors, self.timing
+        # A row of the log for each sample on the grid.
+        grid = self.start + np.arange(len(self.measured)) * self.period
+        row = np.searchsorted(log.time, grid - 0.5 * self.period).clip(max=len(log.time) - 1)
+        # Samples that are the mean over nothing tell of all around them.
+        seen, commanded = (
+            time / self.period if time > 0 else 1.0 for time in (timing.reading, timing.command)
+        )
+
+        def of_blocks(values: np.ndarray) -> np.ndarray:
+            return block_means(values[row[:-1]], self.length)
+
+        def of_sensor(values: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
+            return of_blocks(unseen_variance(values, noise, seen, rows_of_readings(values)))
+
+        torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
+        noise = np.sqrt(self.torque_variance(torque))[:-1]
+        torques = unseen_variance(torque, noise, commanded, np.arange(len(torque)))
+        if not self.robot.has_floating_base:
+            return Unseen(of_blocks(torques), np.zeros((len(self.time), 3)), [])
+        specific_force = log["imu/linear_acceleration"] @ self.equation.R_BI.T
+        wrenches = self.equation.wrenches(measured_pad_forces(self.robot, log))
+        deviations = wrench_deviations(sensors.foot_force, self.robot)
+        return Unseen(
+            of_blocks(torques),
+            of_sensor(specific_force, sensors.imu.acceleration_noise),
+            [of_sensor(*of_foot) for of_foot in zip(wrenches, deviations, strict=True)],
+        )
+
+    @cached_property
     def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
         """Believed variance of a step's white noise and of the integral over time of what is
         differenced white noise, (B, R) each."""
-        white, differenced = self.equation.noise(self.blocks, self.sensors_by_row)
+        white, differenced = self.equation.noise(self.blocks, self.sensors_by_row, self._unseen)
         torque = self.torque_variance(self.blocks.torque_command)
         white[:, : torque.shape[1]] += torque
         return white, differenced
