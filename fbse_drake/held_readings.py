@@ -4,8 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
+from scipy.stats import norm
 
-# A bend of a line through readings that is so many standard deviations of its noise is no noise.
+# Bends of a line through readings that are so many standard deviations of their noise are none.
 _SIGNIFICANT = 3.0
 # Fewer changes of a channel do not tell how often it is read.
 _FEWEST_CHANGES = 20
@@ -63,11 +64,12 @@ def unseen_variance(
 
     A jump J within the time T from one reading to the next, of which a reading is the mean over t,
     makes the integral of a straight line between them wrong by J sqrt((T^2 - t^2) / 12). It shows
-    as bends of the line through the readings, to one side and back.
+    as bends of the line through the readings, to one side and back, that are larger than noise and
+    most others.
 
     Args:
         values: of the channel, (N, k).
-        noise: standard deviation of a reading, scalar, (k,) or (readings, k).
+        noise: standard deviation of a reading, scalar or (k,).
         seen: t, in rows of the log.
         read: the rows that are readings, see `rows_of_readings`.
     """
@@ -76,9 +78,10 @@ def unseen_variance(
         return result
     bends = np.abs(np.diff(values[read], 2, axis=0))
     # Of both ends of an interval the smaller one; nobody knows those before and after all readings.
+    usual = np.maximum(np.sqrt(6.0) * noise, np.median(bends, axis=0) / norm.ppf(0.75))
     bends = np.concatenate([bends[:1], bends, bends[-1:]])
     jumps = np.minimum(bends[:-1], bends[1:])
-    beyond = np.maximum(jumps**2 - 6.0 * (_SIGNIFICANT * np.asarray(noise)) ** 2, 0.0)
+    beyond = np.maximum(jumps**2 - (_SIGNIFICANT * usual) ** 2, 0.0)
     unseen = np.maximum(intervals - seen**2 / intervals, 0.0) / 12.0
     result[read[0] : read[-1]] = np.repeat(beyond * unseen[:, None], intervals, axis=0)
     return result

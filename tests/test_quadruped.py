@@ -335,3 +335,35 @@ def test_four_feet_that_read_too_much_are_not_taken_for_weak_motors_and_payloads
     for finding in found.chosen:
         low, high = finding.parameters["gain"].interval
         assert low < 0.05 < high < low + 0.02
+
+
+def diagnosed_hips(run, changes: tuple[str, ...], signs: tuple[int, ...]):
+    """All hips are read crooked by 6.6 mrad: what a diagnosis finds, and what there is."""
+    legs = make_robot("quadruped")[0].description.sides
+    offsets = {
+        f"{leg}_hip_abduction": -0.0066 * sign for leg, sign in zip(legs, signs, strict=True)
+    }
+    hips = f"robot.effects.hips=!EncoderOffset {{offset: {offsets}}}".replace("'", "")
+    log = run("quadruped_trot", *changes, "estimator=!NoEstimator {}", hips)
+    given = scenario("quadruped_trot", *changes)
+    names = ("EncoderOffset", "ImuMisalignment", "AccelerometerBias", "GyroscopeBias", "BodyMass")
+    found = diagnose(
+        Predictor(replace(given, model=given.robot), log), [library()[name] for name in names]
+    )
+    assert found.verdict == "effect_found"
+    return found.chosen, offsets
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, 1, -1)])
+def test_four_hips_that_are_read_crooked_are_not_taken_for_a_crooked_imu(run, signs):
+    """Alone none of the front hips explains anything: the sum over all is as if the base tilted."""
+    chosen, offsets = diagnosed_hips(run, ("duration=3", "seed=11"), signs)
+    values = {f.targets[0]: f.parameters["offset"].value for f in chosen}
+    assert {f.effect for f in chosen} == {"EncoderOffset"}
+    assert values == pytest.approx(offsets, abs=6e-4)
+
+
+def test_of_a_log_that_is_too_short_to_tell_hips_from_imu_both_are_named(run):
+    (found,), _ = diagnosed_hips(run, (*SHORT, "seed=12"), (1, 1, 1, 1))
+    assert found.effect == "ImuMisalignment"
+    assert "EncoderOffset" in found.confusable_with

@@ -4,6 +4,7 @@ leave."""
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -70,6 +71,33 @@ class Grid:
     sets: Mapping[int, GridSets]
 
 
+class Alike:
+    """Candidates of one effect in several places that may be wrong together."""
+
+    def __init__(self, members: list[Candidate]):
+        self.members = members
+
+    @cached_property
+    def signature(self) -> Signature:
+        """Their columns side by side."""
+        signatures = [member.signature for member in self.members]
+        rows = np.unique(np.concatenate([s.rows for s in signatures]))
+        values = []
+        for s in signatures:
+            values.append(np.zeros((len(s.values), len(rows), s.values.shape[2])))
+            values[-1][:, np.searchsorted(rows, s.rows)] = s.values
+        return Signature(rows, np.concatenate(values, axis=2))
+
+    @cached_property
+    def shared(self) -> list[np.ndarray]:
+        """What makes one value of the values of all, side by side: (members p, p) each. Joints may
+        be wrong to either side, for their axes are mirrored or not."""
+        n, p = len(self.members), self.members[0].signature.values.shape[2]
+        either = (1.0, -1.0) if self.members[0].effect.acts_on == "joint" else (1.0,)
+        signs = product((1.0,), *[either] * (n - 1))
+        return [np.kron(np.array(of_each)[:, None], np.eye(p)) for of_each in signs]
+
+
 class Fits:
     """Explanations of one residual by one dictionary, weighted by the residual's noise."""
 
@@ -123,18 +151,20 @@ class Fits:
         ]
 
     @cached_property
-    def feet_alike(self) -> list[tuple[list[Candidate], Signature]]:
-        """For each effect in feet: its candidates in all of them, and the signature of one value
-        for all feet; of robots with more than one."""
-        sides = self.dictionary.predictor.robot.description.sides
-        found: dict[type[Effect], list[Candidate]] = {}
+    def alike(self) -> list[Alike]:
+        """Candidates of one effect in all feet, or in the same joint of all legs; of robots with
+        more than one."""
+        description = self.dictionary.predictor.robot.description
+        joints = dict.fromkeys(map(description.counterparts, self.dictionary.joints))
+        groups = {"foot": [tuple(description.sides)], "joint": list(joints)}
+        found: dict[type[Effect], dict[str, Candidate]] = {}
         for candidate in self.fixed_candidates:
-            if candidate.effect.acts_on == "foot":
-                found.setdefault(candidate.effect, []).append(candidate)
+            found.setdefault(candidate.effect, {})[candidate.targets[0]] = candidate
         return [
-            (feet, _sum([c.signature for c in feet]))
-            for feet in found.values()
-            if 1 < len(feet) == len(sides)
+            Alike([of_target[target] for target in group])
+            for effect, of_target in found.items()
+            for group in groups.get(effect.acts_on, [])
+            if len(group) > 1 and of_target.keys() >= set(group)
         ]
 
     def _fixed_candidate(self, effect: type[Effect], fixed: FixedColumns) -> Candidate:
@@ -419,15 +449,3 @@ class Fits:
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""
         return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)
-
-
-def _sum(signatures: Sequence[Signature]) -> Signature:
-    """What several signatures with equally many parameters add with the same values in all."""
-    rows = np.unique(np.concatenate([s.rows for s in signatures]))
-    blocks, parameters = signatures[0].values.shape[0], signatures[0].values.shape[2]
-    values, offset = np.zeros((blocks, len(rows), parameters)), np.zeros((blocks, len(rows)))
-    for s in signatures:
-        places = np.searchsorted(rows, s.rows)
-        values[:, places] += s.values
-        offset[:, places] += s.offset
-    return Signature(rows, values, offset if offset.any() else 0.0)

@@ -1,11 +1,11 @@
 """Proposals: which candidates, alone, would take off enough of what an explanation leaves over."""
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
-from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.fits import Alike, Fits
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.memory import Memory
@@ -118,23 +118,33 @@ class Proposals:
                     result.append(self._best_on(effect, group, best, beside))
         return result
 
-    def all_feet(self, base: Explanation, promising: Sequence[Candidate]) -> list[list[Candidate]]:
-        """Candidates of one effect in all feet, with values of their own.
+    def together(self, base: Explanation, promising: Sequence[Candidate]) -> list[list[Candidate]]:
+        """Candidates of one effect in all feet, or in the same joint of all legs, with values of
+        their own.
 
-        Worth a fit where each is promising alone, or where one value for all feet explains more
-        than the best of them: what all feet read is the robot's weight, and what one of them alone
-        reads too much may be made up for by what the others leave.
+        Worth a fit where each is promising alone, or where one value for all explains more than the
+        best of them: what all feet read is the robot's weight, and what one of them alone reads too
+        much may be made up for by what the others leave.
         """
         beside, found = self.fits.remainder(base), []
         taken = {c.key for c in base.candidates} | self._barred
-        for feet, alike in self.fits.feet_alike:
-            alone = {c.targets: c for c in promising if c.effect is feet[0].effect}
-            if not alone or any(c.key in taken for c in feet):
+        for alike in self.fits.alike:
+            members = alike.members
+            alone = {c.targets: c for c in promising if c.effect is members[0].effect}
+            alone = {c.targets: alone[c.targets] for c in members if c.targets in alone}
+            if not alone or any(c.key in taken for c in members):
                 continue
-            best = max(_gain(beside, c.signature) for c in alone.values())
-            if len(alone) == len(feet) or _gain(beside, alike) > best:
-                found.append([alone.get(c.targets) or self._settled(c, base) for c in feet])
+            if len(alone) == len(members) or self._one_value_explains_more(alike, alone, beside):
+                found.append([alone.get(c.targets) or self._settled(c, base) for c in members])
         return found
+
+    @staticmethod
+    def _one_value_explains_more(
+        alike: Alike, alone: Mapping[tuple[str, ...], Candidate], beside: Remainder
+    ) -> bool:
+        best = max(fixed_gain(*_inner_products(beside, c.signature)) for c in alone.values())
+        gram, right = _inner_products(beside, alike.signature)
+        return any(fixed_gain(one.T @ gram @ one, one.T @ right) > best for one in alike.shared)
 
     def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
         """A candidate made linear about the values that fit best beside an explanation, if it is
@@ -279,9 +289,9 @@ def _moments(beside: Remainder, signature: Signature) -> list[tuple[np.ndarray, 
     return [beside.moments(signature, k) for k in range(len(signature.rows))]
 
 
-def _gain(beside: Remainder, signature: Signature) -> float:
-    """Drop of the sum of squares by columns beside an explanation, roughly."""
-    return fixed_gain(*_weighted(_moments(beside, signature), beside.scale[signature.rows]))
+def _inner_products(beside: Remainder, signature: Signature) -> tuple[np.ndarray, np.ndarray]:
+    """The same, of all rows together."""
+    return _weighted(_moments(beside, signature), beside.scale[signature.rows])
 
 
 def _weighted(

@@ -31,8 +31,8 @@ _POINTS, _NARROWINGS = 5, 2
 
 
 def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
-    """For each member: explanations with another effect in its place, or the same on another body,
-    which comes last; best first.
+    """For each member: explanations with another effect in its place, be it in all legs, or the
+    same on another body, which comes last; best first.
 
     One for each effect and targets that comes near the member; the best of them fitted by
     themselves.
@@ -50,11 +50,17 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
         additions = [
             e
             for e in best_additions(proposals, rest, member.signature.rows, final.deviance + near)
-            if len(e.candidates) == len(final.candidates) and rival_name(e.candidates[-1], member)
+            if _is_of_one_effect(e.candidates[len(rest.candidates) :])
+            and rival_name(e.candidates[-1], member)
         ]
         found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]
         result[k] = sorted(found, key=lambda e: e.deviance)
     return result
+
+
+def _is_of_one_effect(added: Sequence[Candidate]) -> bool:
+    """One candidate, or one for each leg."""
+    return len({candidate.effect for candidate in added}) == 1
 
 
 def rival_name(rival: Candidate, member: Candidate) -> str:

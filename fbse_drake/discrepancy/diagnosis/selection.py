@@ -87,8 +87,7 @@ def best_additions(
     promising, found = proposals.promising(base, rows, base.deviance - most), []
     tried = [
         *([candidate] for candidate in promising),
-        *_pairs(fits, promising),
-        *proposals.all_feet(base, promising),
+        *proposals.together(base, promising),
     ]
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
@@ -127,23 +126,6 @@ def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
     tried = proposals.promising(base, rows, share=0.0)
     found = sorted((fits.explain([candidate]) for candidate in tried), key=left)
     return [e for e in found if left(e) < left(base) - COMPLEXITY * len(e.solved.parameters)]
-
-
-def _pairs(fits: Fits, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Candidates in joints that are no joint torque effects, each with its like on the other legs;
-    with values of their own."""
-    description = fits.dictionary.predictor.robot.description
-    alike = dict.fromkeys(map(description.counterparts, fits.dictionary.joints))
-    found = {
-        (c.effect, c.targets): c for c in candidates if not issubclass(c.effect, JointTorqueEffect)
-    }
-    result = []
-    for effect in dict.fromkeys(c.effect for c in candidates):
-        for targets in alike:
-            members = [found[effect, (t,)] for t in targets if (effect, (t,)) in found]
-            if 1 < len(members) == len(targets):
-                result.append(members)
-    return result
 
 
 def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:

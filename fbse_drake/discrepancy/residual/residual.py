@@ -884,7 +884,7 @@ class RecordedMotion:
             return of_blocks(unseen_variance(values, noise, seen, rows_of_readings(values)))
 
         torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
-        noise = np.sqrt(self.torque_variance(torque))[:-1]
+        noise = np.sqrt(self.torque_variance(torque).mean(axis=0))
         torques = unseen_variance(torque, noise, commanded, np.arange(len(torque)))
         if not self.robot.has_floating_base:
             return Unseen(of_blocks(torques), np.zeros((len(self.time), 3)), [])
