@@ -103,18 +103,25 @@ def friction_estimates(
     return frictions
 
 
-def _inputs(scenario: Scenario, robot: Robot, log: Log, ticks: np.ndarray) -> dict[str, np.ndarray]:
+def _inputs(
+    scenario: Scenario, robot: Robot, log: Log, ticks: np.ndarray, at_ticks: Log
+) -> dict[str, np.ndarray]:
     """What a station's ports told at some rows of a log, (ticks, size) each, if the log says it; a
-    torque command is the mean over the tick that begins there."""
+    torque command is the mean over the tick that begins there.
+
+    Args:
+        ticks, at_ticks: these rows, and the log of them alone.
+    """
     if log.joints != robot.joint_names:
         raise InputError(f"the log's joints {log.joints} are not the model's {robot.joint_names}")
-    values = {port: port_values(port, log) for port in ("torque_command", "torque_loss")}
-    inputs = {port: value[ticks] for port, value in values.items() if value is not None}
-    if (torque := values["torque_command"]) is not None:
+    inputs = {}
+    if (torque := port_values("torque_command", log)) is not None:
         torque = _torque_over_rows(scenario, log, torque)
         inputs["torque_command"] = _mean_over_ticks(log.time, torque, ticks)
+    if (loss := port_values("torque_loss", at_ticks)) is not None:
+        inputs["torque_loss"] = loss
     for sensor in scenario.sensors.by_name.values():
-        inputs |= sensor.readings(robot, log.part(ticks))
+        inputs |= sensor.readings(robot, at_ticks)
     return inputs
 
 
@@ -185,9 +192,9 @@ class Replay:
         slowest, ticks = _ticks(log)
         # The tick that each row of the log tells of.
         self._tick_of_row = np.searchsorted(ticks[1:], np.arange(len(log.time)), side="right")
-        inputs = _inputs(scenario, robot, log, ticks)
-        if slowest is not None:
-            log = log.part(ticks)
+        at_ticks = log if slowest is None else log.part(ticks)
+        inputs = _inputs(scenario, robot, log, ticks, at_ticks)
+        log = at_ticks
         sensors, knows_torque = _believed_sensors(scenario, log), "torque_command" in inputs
         believed = partial(scenario.believed.effects_of, names=robot.description, key="model")
         in_sensors = believed(SensorEffect)

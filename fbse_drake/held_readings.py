@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.stats import norm
 
-# Bends of a line through readings that are so many standard deviations of their noise are none.
+# The line through readings jumps where it bends by more standard deviations of its noise.
 _SIGNIFICANT = 3.0
 # Fewer changes of a channel do not tell how often it is read.
 _FEWEST_CHANGES = 20

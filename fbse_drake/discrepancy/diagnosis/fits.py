@@ -71,11 +71,11 @@ class Grid:
     sets: Mapping[int, GridSets]
 
 
+@dataclass(frozen=True, eq=False)
 class Alike:
     """Candidates of one effect in several places that may be wrong together."""
 
-    def __init__(self, members: list[Candidate]):
-        self.members = members
+    members: list[Candidate]
 
     @cached_property
     def signature(self) -> Signature:
