@@ -114,19 +114,20 @@ def test_noise_and_smooth_motion_are_no_jumps():
     assert unseen_variance(jump, 0.3, 0.2, np.arange(3000)).any()
 
 
-@pytest.mark.parametrize("sensor", ["foot_force", "imu"])
-def test_impacts_between_readings_are_no_effect(run: Callable[..., Log], sensor: str):
+@pytest.mark.parametrize("read", ["sensors.foot_force", "sensors.imu", "log"])
+def test_impacts_between_readings_are_no_effect(run: Callable[..., Log], read: str):
     """Forces and moments of a trot's base lacked something unknown, up to seven times the noise."""
     trot = (
         "quadruped_trot",
         "duration=3",
         "estimator=!NoEstimator {}",
-        f"sensors.{sensor}.period=0.005",
+        f"{read}.period=0.005",
     )
     believed = scenario(*trot)
     believed = replace(believed, model=believed.robot)
     found = diagnose(Predictor(believed, run(*trot)), [library()[name] for name in TRIED])
     assert (found.verdict, found.chosen) == ("nothing_missing", [])
+    assert found.held_out_after < 1.2
 
 
 @pytest.mark.parametrize(
