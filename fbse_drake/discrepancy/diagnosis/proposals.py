@@ -130,9 +130,9 @@ class Proposals:
         taken = {c.key for c in base.candidates} | self._barred
         for alike in self.fits.alike:
             members = alike.members
-            alone = {c.targets: c for c in promising if c.effect is members[0].effect}
-            alone = {c.targets: alone[c.targets] for c in members if c.targets in alone}
-            if not alone or any(c.key in taken for c in members):
+            keys = {c.key for c in members}
+            alone = {c.targets: c for c in promising if c.key in keys}
+            if not alone or keys & taken:
                 continue
             if len(alone) == len(members) or self._one_value_explains_more(alike, alone, beside):
                 found.append([alone.get(c.targets) or self._settled(c, base) for c in members])

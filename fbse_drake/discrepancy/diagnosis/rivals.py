@@ -50,17 +50,11 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
         additions = [
             e
             for e in best_additions(proposals, rest, member.signature.rows, final.deviance + near)
-            if _is_of_one_effect(e.candidates[len(rest.candidates) :])
-            and rival_name(e.candidates[-1], member)
+            if rival_name(e.candidates[-1], member)
         ]
         found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]
         result[k] = sorted(found, key=lambda e: e.deviance)
     return result
-
-
-def _is_of_one_effect(added: Sequence[Candidate]) -> bool:
-    """One candidate, or one for each leg."""
-    return len({candidate.effect for candidate in added}) == 1
 
 
 def rival_name(rival: Candidate, member: Candidate) -> str:
