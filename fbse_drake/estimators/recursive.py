@@ -108,18 +108,31 @@ class RecordInput:
 
 @dataclass(frozen=True)
 class RememberedInput:
-    """An input port whose mean counts, from the tick before to the present one; zero before the
-    first. The state is the mean, then how many values it is of."""
+    """An input port whose value of the tick before counts: before the first, it is zero."""
 
     port: InputPort
     index: DiscreteStateIndex
 
     def Eval(self, context: Context) -> np.ndarray:
+        """The value a tick ago."""
+        return context.get_discrete_state().value(self.index)
+
+    def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:  # noqa: ARG002
+        """Keeps the present value for the next tick."""
+        state.set_value(self.index, self.port.Eval(context))
+
+
+@dataclass(frozen=True)
+class AveragedInput(RememberedInput):
+    """The same of an input that changes within a tick: its mean since the tick before counts. The
+    state is the mean, then how many values it is of."""
+
+    def Eval(self, context: Context) -> np.ndarray:
         """The mean since the tick before."""
-        return context.get_discrete_state().value(self.index)[:-1]
+        return super().Eval(context)[:-1]
 
     def remember(self, context: Context, state: DiscreteValues, posterior: np.ndarray) -> None:
-        """Keeps the present value for the next tick."""
+        """Adds the present value to the mean, which begins anew in a tick."""
         values, present = state.get_mutable_value(self.index), self.port.Eval(context)
         if _is_tick(context, posterior):
             values[:-1], values[-1] = present, 1.0
@@ -226,9 +239,9 @@ class RecursiveEstimator(LeafSystem):
         self.record_inputs: dict[str, np.dtype] = {}
         self._remembered: list[RememberedInput | History | Advanced] = []
         self._later: set[str] = set()
-        self.DeclarePeriodicUnrestrictedUpdateEvent(
-            clock.control or clock.period, 0.0, weakly(self._remember)
-        )
+        control = clock.control or clock.period
+        self._changes_within_ticks = control < clock.shortest
+        self.DeclarePeriodicUnrestrictedUpdateEvent(control, 0.0, weakly(self._remember))
         self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
 
     @staticmethod
@@ -288,7 +301,11 @@ class RecursiveEstimator(LeafSystem):
     def _declare_remembered_input(self, name: str, size: int) -> RememberedInput:
         """Declares an input port that the posterior of the next tick depends on, not this one's."""
         port = self.DeclareVectorInputPort(name, size)
-        remembered = RememberedInput(port, self.DeclareDiscreteState(size + 1))
+        remembered = (
+            AveragedInput(port, self.DeclareDiscreteState(size + 1))
+            if self._changes_within_ticks
+            else RememberedInput(port, self.DeclareDiscreteState(size))
+        )
         self._remembered.append(remembered)
         self._later.add(name)
         return remembered
