@@ -42,6 +42,9 @@ from fbse_drake.walking.plan import TaskPlan
 from fbse_drake.walking.reference import Reference, ReferenceConfig, make_plan, make_reference
 from fbse_drake.walking.walk import Walk
 
+# A rotor's inertia that is found to be nothing may come out below zero by this [kg m^2].
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True)
 class RobotConfig:
@@ -422,9 +425,15 @@ def build_robot(
     rotor_inertia = added + bare.description.per_joint(
         config.rotor_inertia, key="rotor_inertia", default=0.0
     )
+    for joint, inertia in zip(bare.joint_names, rotor_inertia, strict=True):
+        if inertia < -_ROUNDING:
+            raise InputError(
+                f"effects: the rotor inertia of {joint}, with what effects add, is {inertia:g} "
+                "kg m^2 (allowed: >= 0)"
+            )
     robot, _ = make_robot(
         config.description,
-        rotor_inertia=dict(zip(bare.joint_names, rotor_inertia, strict=True)),
+        rotor_inertia=dict(zip(bare.joint_names, np.maximum(rotor_inertia, 0.0), strict=True)),
         point_masses=point_masses,
         joint_shifts=joint_shifts(config.effects, bare),
         gantry_height=config.gantry_height,

@@ -95,7 +95,7 @@ def inertia_changes(
 @dataclass(frozen=True)
 class ReflectedInertia(InertiaEffect):
     """Inertia of rotor and gears as the joint feels it (that of the rotor times the gear ratio
-    squared), beside a configured `rotor_inertia`."""
+    squared), beside a configured `rotor_inertia`; negative where that is too large."""
 
     description: ClassVar[str] = "Inertia of motor and gears, as felt at the joint."
     signature: ClassVar[str] = (
@@ -105,10 +105,17 @@ class ReflectedInertia(InertiaEffect):
     experiment: ClassVar[str] = "Swing each joint fast, with the robot hanging and its feet free."
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "inertia": Parameter("kg m^2", linear=True, plausible=(0.02, 0.6))
+        "inertia": Parameter(
+            "kg m^2", linear=True, plausible=(0.02, 0.6), bounds=(-np.inf, np.inf)
+        )
     }
 
     inertia: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:
+        """No rotor has less inertia than none."""
+        return np.array([-robot.rotor_inertia(target)])
 
     @staticmethod
     def rotor_inertia(values: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ _DOUBT = 3.0
 # correlated if there is more or less of it white than believed, and less or more differenced. And
 # how often noise seems to.
 _LAGS, _FALSE_ALARM = np.arange(2, 7), 1e-3
-# An impact tells of itself alone: what is left counts up to so many of its usual deviations, which
+# A foot's impact tells of itself alone: what is left counts up to so many of its usual deviations, which
 # are had from the median of their sizes.
 _LARGEST, _NORMAL_MEDIAN = 3.0, 0.6745
 # Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
@@ -51,7 +51,8 @@ def leftover_structure(
     """Rows in which more than noise is left: it lives in variables that were measured, or it is
     more than the sensors' noise and tells of what comes later.
 
-    What does neither is noise all the same, of impacts or of what happens between rare samples.
+    What does neither is noise all the same, of feet's impacts or of what happens between rare
+    samples.
 
     Args:
         white: the residual by which it is measured.
@@ -59,7 +60,8 @@ def leftover_structure(
     """
     result = []
     size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    left = _without_impacts(left, white.residual.known)
+    if motion.robot.has_floating_base:
+        left = _without_impacts(left, white.residual.known)
     for k, row in enumerate(white.residual.rows):
         if white.count[k] < 50:
             continue
