@@ -133,6 +133,28 @@ def test_structure_tells_of_what_comes_later(
     assert found(drifting) < found(1.5 * drifting) == len(rows)
 
 
+def test_a_robot_that_stands_on_no_feet_has_no_impacts(walk: tuple[Scenario, Log]) -> None:
+    """Hits that are few, and last for some averages, tell of a gap in a gear where no foot lands;
+    a single one, as of somebody who touches the arm, is noise in both."""
+    arm = load_scenario("bsc_arm", overrides=["duration=3"])
+    lasting = np.isin(np.arange(300) % 150, [70, 71, 72, 73])
+    for scenario, log, tells in ((*walk, 0), (believed(arm), simulate(arm).log, 6)):
+        predictor = Predictor(scenario, log)
+        motion, white = predictor.motion, WhitenedResidual(predictor.residual)
+        known = white.residual.known
+        noise = np.random.default_rng(3).standard_normal(known.shape)
+        single = np.arange(len(noise)) == 150
+        joints = len(motion.robot.joint_names)
+
+        def found(hits: np.ndarray) -> int:
+            left = noise + 20.0 * hits[: len(noise), None]  # noqa: B023 - called in this turn.
+            structures = leftover_structure(motion, white, np.where(known, left, 0.0))  # noqa: B023
+            return sum(structure.index < joints for structure in structures)  # noqa: B023
+
+        assert found(lasting) == tells
+        assert found(single) == 0
+
+
 def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:
     scenario, _ = walk
     scenario = replace(scenario, sensors=type(scenario.sensors)(), duration=1.5)

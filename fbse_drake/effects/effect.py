@@ -184,8 +184,14 @@ class Effect(ABC):
             )
         return cls(**arguments)
 
-    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedEffect":
+    def resolve(
+        self, names: RobotDescription, *, key: str = "", is_change: bool = False
+    ) -> "ResolvedEffect":
         """This effect with its values as arrays.
+
+        Args:
+            is_change: is it a change of a model, which may take away what that has, and whose
+                linear parameters may so be below their bounds?
 
         Raises:
             InputError: unknown target, a value out of bounds, or a nonlinear parameter without a
@@ -199,6 +205,8 @@ class Effect(ABC):
                 name, targets, names, where, 0.0 if parameter.linear else parameter.neutral
             )
             low, high = parameter.bounds
+            if is_change and parameter.linear:
+                low = -np.inf
             if not np.all((low <= values) & (values <= high)):
                 raise InputError(
                     f"{where}: expected values in [{low:g}, {high:g}] {parameter.unit}, found "
@@ -256,6 +264,11 @@ class ResolvedEffect:
     # In the order of the effect's `parameters`; each of shape (parameters, targets).
     linear: np.ndarray
     nonlinear: np.ndarray
+
+    def linear_values(self, name: str) -> np.ndarray:
+        """Of one linear parameter, (targets,)."""
+        names = [n for n, parameter in self.effect.parameters.items() if parameter.linear]
+        return self.linear[names.index(name)]
 
 
 _LIBRARY: dict[str, type[Effect]] = {}

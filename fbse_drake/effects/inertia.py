@@ -105,9 +105,7 @@ class ReflectedInertia(InertiaEffect):
     experiment: ClassVar[str] = "Swing each joint fast, with the robot hanging and its feet free."
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "inertia": Parameter(
-            "kg m^2", linear=True, plausible=(0.02, 0.6), bounds=(-np.inf, np.inf)
-        )
+        "inertia": Parameter("kg m^2", linear=True, plausible=(0.02, 0.6), bounds=(-np.inf, np.inf))
     }
 
     inertia: dict[str, float] = field(default_factory=dict)

@@ -123,6 +123,18 @@ class JointTorqueEffect(Effect):
             that broadcast to (..., n).
         """
 
+    @classmethod
+    def shares(cls, name: str, other: type[Effect]) -> bool:
+        """Has another effect a parameter of this name that stands for the same? So has the same
+        effect, and among laws of the velocity alone, each with one of this name. What remembers may
+        remember something else."""
+        return (
+            not cls.has_memory
+            and name in other.parameters
+            and issubclass(other, JointTorqueEffect)
+            and (other is cls or (cls.of_velocity_alone and other.of_velocity_alone))
+        )
+
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
         """How it rises with the velocity; by default it does not.
@@ -183,9 +195,11 @@ class JointTorqueEffect(Effect):
         """
         return None
 
-    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedJointTorque":
+    def resolve(
+        self, names: RobotDescription, *, key: str = "", is_change: bool = False
+    ) -> "ResolvedJointTorque":
         """See `Effect.resolve`."""
-        resolved = super().resolve(names, key=key)
+        resolved = super().resolve(names, key=key, is_change=is_change)
         linear = resolved.linear if len(resolved.linear) else np.ones((1, len(resolved.targets)))
         return ResolvedJointTorque(type(self), resolved.targets, linear, resolved.nonlinear)
 

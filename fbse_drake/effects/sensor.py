@@ -160,9 +160,11 @@ class SensorEffect(Effect):
             signals, cls.memory_over_time(signals, values, robot, period), values, robot
         )
 
-    def resolve(self, names: RobotDescription, *, key: str = "") -> "ResolvedSensorEffect":
+    def resolve(
+        self, names: RobotDescription, *, key: str = "", is_change: bool = False
+    ) -> "ResolvedSensorEffect":
         """See `Effect.resolve`."""
-        resolved = super().resolve(names, key=key)
+        resolved = super().resolve(names, key=key, is_change=is_change)
         return ResolvedSensorEffect(
             type(self), resolved.targets, resolved.linear, resolved.nonlinear
         )

@@ -11,7 +11,9 @@ from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding
 from fbse_drake.discrepancy.diagnosis.written import written_diagnosis
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
+from fbse_drake.effects.surplus import without_surplus
 from fbse_drake.errors import InputError
+from fbse_drake.robot.description import load_description
 from fbse_drake.scenario import Scenario
 
 
@@ -52,7 +54,8 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
 
 
 def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
-    """The scenario with further effects in its model.
+    """The scenario with further effects in its model. What its own joint effects have too much of
+    is taken from them.
 
     Raises:
         InputError: an effect that the library does not have.
@@ -67,6 +70,7 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
             values.setdefault(name, {}).update(dict.fromkeys(finding.targets, value))
     model = scenario.believed
     effects = dict(model.effects)
+    names, _ = load_description(model.description)
     for name, values in by_effect.items():
         effect = _make(name, values)
         if isinstance(effect, InertialParameters):
@@ -77,7 +81,9 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
             }
             effect = sum(earlier.values(), effect)
             effects = {key: other for key, other in effects.items() if key not in earlier}
-        effects[_free_key(name, effects)] = effect
+        effects, beside = without_surplus(effects, effect, names)
+        if beside is not None:
+            effects[_free_key(name, effects)] = beside
     return replace(scenario, model=replace(model, effects=effects))
 
 

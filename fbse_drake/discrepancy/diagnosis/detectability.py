@@ -116,8 +116,9 @@ def separation(
             if signal[:, rows].any():
                 sets = [grid.sets[row] for row in rows]
                 rights = [s.times(signal[:, [s.row]]).reshape(s.gram.shape[:2]) for s in sets]
+                parameters = fits.dictionary.parameters(rival, joint)
                 gain = grid_gain(
-                    rival, np.sum([s.gram for s in sets], axis=0), np.sum(rights, axis=0)
+                    parameters, np.sum([s.gram for s in sets], axis=0), np.sum(rights, axis=0)
                 )
                 total -= float(gain.max())
         return total

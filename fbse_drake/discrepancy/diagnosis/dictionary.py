@@ -93,9 +93,22 @@ class Dictionary:
         changed._look_at(inertia)
         return changed
 
-    def parameters(self, effect: type[Effect], target: str) -> Mapping[str, Parameter]:
-        """An effect's parameters in the units of a target."""
-        return effect.parameters_at(self.unit.get(target, "Nm"))
+    def parameters(self, effect: type[Effect], *targets: str) -> Mapping[str, Parameter]:
+        """An effect's parameters in the units of targets that share values. Of what the model has
+        already they may take away."""
+        parameters = effect.parameters_at(self.unit.get(targets[0], "Nm"))
+        if not issubclass(effect, JointTorqueEffect):
+            return parameters
+        believed = {
+            name: min(self.predictor.believed_amount(effect, name, joint) for joint in targets)
+            for name, parameter in parameters.items()
+            if parameter.linear and parameter.bounds[0] == 0.0
+        }
+        return parameters | {
+            name: replace(parameters[name], bounds=(-amount, parameters[name].bounds[1]))
+            for name, amount in believed.items()
+            if amount > 0.0
+        }
 
     def largest_plausible(self, effect: type[Effect], target: str) -> float:
         """See `Effect.largest_plausible`; in the unit of a target."""

@@ -130,7 +130,8 @@ class Fits:
         """Fits that weigh the residual anew, and an explanation in them: friction laws that it
         takes off make the residual noisier."""
         predictor = self.dictionary.predictor
-        resolved = [effect.resolve(predictor.robot.description) for effect in explanation.effects]
+        names = predictor.robot.description
+        resolved = [effect.resolve(names, is_change=True) for effect in explanation.effects]
         residual = predictor.doubted(predictor.residual, resolved)
         if np.array_equal(residual.variance, self.white.residual.variance):
             return self, explanation
@@ -326,7 +327,7 @@ class Fits:
             beside: what the explanation leaves that it is to be added to.
         """
         places = self.dictionary.rows_of(effect, group)
-        parameters = self.dictionary.parameters(effect, group[0])
+        parameters = self.dictionary.parameters(effect, *group)
         names = [name for name, parameter in parameters.items() if not parameter.linear]
         smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
         steps = _SLOPE_STEP * nonlinear

@@ -125,6 +125,15 @@ class Predictor:
         scenario = replace(self.scenario, identify=identify)
         return Predictor(scenario, self.log, self._given_noise, self.left_out, self.reading)
 
+    def believed_amount(self, effect: type[JointTorqueEffect], name: str, joint: str) -> float:
+        """How much of a linear parameter of an effect the model's effects have in a joint, see
+        `JointTorqueEffect.shares`."""
+        return sum(
+            known.linear_values(name)[known.targets.index(joint)]
+            for known in self._known
+            if effect.shares(name, known.effect)
+        )
+
     @property
     def rows(self) -> int:
         """Number of the residual's rows."""

@@ -10,7 +10,7 @@ from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.actuation import TorqueBias
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -98,9 +98,10 @@ class Proposals:
                 ):
                     continue
                 moments = self._grid_moments(effect, places, beside)
-                gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
+                parameters = dictionary.parameters(effect, *group)
+                gain = grid_gain(parameters, *_weighted(moments, beside.scale[places]))
                 best = int(gain.argmax())
-                alone = (float(grid_gain(effect, *of_row).max()) for of_row in moments)
+                alone = [float(grid_gain(parameters, *of_row).max()) for of_row in moments]
                 if self._may_reach(wanted, base, places, alone):
                     coarse[group].append((float(gain[best]), effect, best))
         for group, found in coarse.items():
@@ -187,7 +188,8 @@ class Proposals:
         remainder = self.fits.remainder(base)
         places = self.fits.dictionary.rows_of(effect, targets)
         moments = self._grid_moments(effect, places, remainder)
-        gain = grid_gain(effect, *_weighted(moments, remainder.scale[places]))
+        parameters = self.fits.dictionary.parameters(effect, *targets)
+        gain = grid_gain(parameters, *_weighted(moments, remainder.scale[places]))
         best = self._best_on(effect, targets, int(gain.argmax()), remainder)
         return self.fits.explain([*base.candidates, best])
 
@@ -262,7 +264,8 @@ class Proposals:
         dictionary = self.fits.dictionary
         points = self.fits.grid(effect).points[..., places[0]]
         chosen = points[:, best].copy()
-        parameters = dictionary.parameters(effect, dictionary.joints[places[0]])
+        joints = dictionary.predictor.joints_of(np.asarray(places))
+        parameters = dictionary.parameters(effect, *(dictionary.joints[k] for k in joints))
         ranges = [p.plausible for p in parameters.values() if not p.linear]
         steps = []
         for axis in points:
@@ -278,7 +281,7 @@ class Proposals:
                 )
                 found = [self.fits.sets(effect, place, trial) for place in places]
                 moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in found]
-                gain = grid_gain(effect, *_weighted(moments, beside.scale[places]))
+                gain = grid_gain(parameters, *_weighted(moments, beside.scale[places]))
                 chosen[k] = trial[k, int(gain.argmax())]
                 steps[k] *= 2.0 / (_POINTS - 1)
         return chosen
@@ -331,16 +334,18 @@ def fixed_gain(gram: np.ndarray, right: np.ndarray) -> float:
     return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
 
 
-def grid_gain(effect: type[Effect], gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+def grid_gain(
+    parameters: Mapping[str, Parameter], gram: np.ndarray, right: np.ndarray
+) -> np.ndarray:
     """Drop of the sum of squares for each set of nonlinear values, shape (G,)."""
-    if not any(parameter.linear for parameter in effect.parameters.values()):
+    linear = [parameter for parameter in parameters.values() if parameter.linear]
+    if not linear:
         return 2 * right[:, 0] - gram[:, 0, 0]
     if right.shape[1] == 1:
-        parameter = next(p for p in effect.parameters.values() if p.linear)
         theta = np.divide(
             right[:, 0], gram[:, 0, 0], out=np.zeros(len(right)), where=gram[:, 0, 0] > 1e-12
         )
-        theta = np.clip(theta, *parameter.bounds)
+        theta = np.clip(theta, *linear[0].bounds)
         return 2 * theta * right[:, 0] - theta**2 * gram[:, 0, 0]
     ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(
         gram.shape[1]

@@ -20,6 +20,7 @@ from fbse_drake.effects.geometry import GeometryEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.effects.surplus import without_surplus
 from fbse_drake.errors import InputError
 
 # How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
@@ -206,8 +207,12 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
         return explanation, fits.white, fits.leftover(explanation)
     predictor = fits.dictionary.predictor
     scenario = predictor.scenario
-    found = {f"_found_{k}": effect for k, effect in enumerate(explanation.effects)}
-    believed = replace(scenario.believed, effects=scenario.believed.effects | found)
+    effects = dict(scenario.believed.effects)
+    for k, effect in enumerate(explanation.effects):
+        effects, beside = without_surplus(effects, effect, predictor.robot.description)
+        if beside is not None:
+            effects[f"_found_{k}"] = beside
+    believed = replace(scenario.believed, effects=effects)
     white = WhitenedResidual(predictor.of(replace(scenario, model=believed)).residual)
     # As many squares as before; what is held out exceeds them by as much as it did.
     share = fits.white.count / np.maximum(white.count, 1)

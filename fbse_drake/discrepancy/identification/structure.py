@@ -23,8 +23,8 @@ _DOUBT = 3.0
 # correlated if there is more or less of it white than believed, and less or more differenced. And
 # how often noise seems to.
 _LAGS, _FALSE_ALARM = np.arange(2, 7), 1e-3
-# A foot's impact tells of itself alone: what is left counts up to so many of its usual deviations, which
-# are had from the median of their sizes.
+# A foot's impact tells of itself alone: what is left counts up to so many of its usual deviations,
+# which are had from the median of their sizes.
 _LARGEST, _NORMAL_MEDIAN = 3.0, 0.6745
 # Kinematic rows show the slightest give of the ground: they must exceed the noise by this.
 _KINEMATIC_EXCESS = 3.0
