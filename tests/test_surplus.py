@@ -77,6 +77,12 @@ def test_nobody_gives_what_he_has_not(own: Effect) -> None:
         beside.resolve(NAMES)
 
 
+def test_of_a_joint_that_the_robot_has_not_nothing_is_taken() -> None:
+    change = CoulombFriction(coulomb={"elbow": -1.0})
+    lowered, beside = without_surplus({"own": BELIEVED}, change, NAMES)
+    assert (lowered, beside) == ({"own": BELIEVED}, change)
+
+
 @cache
 def arm() -> tuple[Scenario, Log]:
     scenario = load_scenario("bsc_arm", overrides=["duration=4", "seed=3"])
@@ -130,6 +136,27 @@ def test_friction_that_a_model_has_too_much_of_is_found_and_taken_from_it() -> N
     )
     assert resolved == pytest.approx(truth, rel=0.01)
     assert diagnose(Predictor(mended, log)).verdict == "nothing_missing"
+
+
+def test_friction_that_a_robot_has_not_is_found_to_be_none() -> None:
+    """Where the fit ends at its bound."""
+    scenario, _ = arm()
+    free = replace(scenario, robot=replace(scenario.robot, effects={}))
+    true = scenario.robot.effects["joint_friction"]
+    assert isinstance(true, CoulombViscousFriction)
+    model = replace(scenario, robot=free.robot, model=replace(free.robot, effects={"own": true}))
+    diagnosis = diagnose(Predictor(model, simulate(free).log))
+    assert diagnosis.verdict == "effect_found"
+    mended = add(model, diagnosis.chosen).believed.effects
+    motion = JointMotion(np.linspace(-0.5, 0.5, 21)[:, None] * np.ones(6))
+    before, after = (
+        sum(
+            np.abs(effect.resolve(NAMES).torque_and_slope(motion)[0]).max()
+            for effect in effects.values()
+        )
+        for effects in (model.believed.effects, mended)
+    )
+    assert after < 1e-3 * before
 
 
 def test_rotors_that_a_model_has_too_much_of_are_found() -> None:

@@ -31,7 +31,8 @@ def without_surplus(
     taken = False
     for name, by_joint in left.items():
         low = change.parameters[name].bounds[0]
-        for joint in [joint for joint, value in by_joint.items() if value < low]:
+        # Who reads the scenario refuses joints that the robot has not.
+        for joint in [j for j in names.joint_names if by_joint.get(j, low) < low]:
             for key, effect in result.items():
                 if not change.shares(name, type(effect)) or by_joint[joint] >= low:
                     continue

@@ -498,25 +498,26 @@ class Regression:
                 gram = gram[np.ix_(fitted, fitted)]
             return gram / np.outer(norm, norm), right / norm
 
+        def solved(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+            # What is rounded below a bound would be impossible.
+            return np.maximum(bounded_least_squares(gram, right, lowest * norm) / norm, lowest)
+
         # From the sensors' noise on: weighted by what is there before anything is fitted,
         # beliefs would hold back what the data say clearly.
         scale = np.ones(len(rows))
         for _ in range(_REWEIGHTINGS):
             gram, right = weighted(None)
-            theta = bounded_least_squares(gram + held, right, lowest * norm)
-            amounts[fitted] = theta / norm
+            amounts[fitted] = solved(gram + held, right)
             scale = np.maximum(self._squares(signatures, together, amounts) / count, 1.0)
         gram, right = weighted(None)
         gram += held
-        theta = bounded_least_squares(gram, right, lowest * norm)
-        amounts[fitted] = theta / norm
+        amounts[fitted] = solved(gram, right)
         parameters = amounts[fitted]
         sse = self._squares(signatures, together, amounts)
         held_out_sse = np.zeros(len(rows))
         for fold in range(FOLDS):
             of_fold = weighted(fold)
-            theta = bounded_least_squares(gram - of_fold[0], right - of_fold[1], lowest * norm)
-            amounts[fitted] = theta / norm
+            amounts[fitted] = solved(gram - of_fold[0], right - of_fold[1])
             held_out_sse += self._squares(signatures, together, amounts, fold)
         return PartialFit(
             white,
