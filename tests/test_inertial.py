@@ -282,6 +282,22 @@ def test_consistent_parameters_against_a_closed_form() -> None:
     assert z == pytest.approx(np.array([*np.zeros(9), 0.5]), abs=1e-3)
 
 
+@pytest.mark.parametrize("lowest", [0.0, -3.0, -1e3, -1e6])
+def test_bounds_of_consistent_parameters_hold_and_do_nothing_where_they_are_far(
+    lowest: float,
+) -> None:
+    random = np.random.default_rng(0)
+    X = random.standard_normal((2000, 12)) * np.array([30.0, 30.0, *np.full(10, 3.0)])
+    own, prior = 0.1 * np.eye(4)[None], np.full(12, 1e-4)
+    y = X @ np.array([2.0, -2.5, *np.zeros(10)]) + random.standard_normal(2000)
+    found, _ = consistent_parameters(X, y, prior, np.full(2, lowest), own)
+    if lowest < -2.5:
+        assert found == pytest.approx([2.0, -2.5], abs=5e-3)
+    else:
+        # Above its bound by no more than the solver's tolerance.
+        assert found[1] == pytest.approx(lowest, abs=1e-4)
+
+
 def test_base_columns_say_what_the_others_are() -> None:
     W = np.random.default_rng(0).standard_normal((50, 3)) * 100
     W = np.column_stack([W[:, 0], W[:, 1], 2 * W[:, 0] - W[:, 1], 1e-6 * W[:, 2], W[:, 2]])

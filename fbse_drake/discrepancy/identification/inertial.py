@@ -468,18 +468,33 @@ def consistent_parameters(
     Q, R = np.linalg.qr(np.concatenate([X / norm, np.diag(np.sqrt(prior) / norm)]))
     target = Q.T @ np.concatenate([y, np.zeros(len(prior))])
     size = max(1.0, float(np.linalg.norm(target)))
-    program = MathematicalProgram()
-    variables = program.NewContinuousVariables(X.shape[1])
-    program.Add2NormSquaredCost(R / np.sqrt(size), target / np.sqrt(size), variables)
-    if K:
-        program.AddBoundingBoxConstraint(lowest * norm[:K], np.full(K, np.inf), variables[:K])
-    for z, J in zip(np.split(variables[K:], len(own)), own, strict=True):
-        program.AddLinearMatrixInequalityConstraint([J - _LEAST_SHARE * np.eye(4), *_BASIS], z)
-    result = ClarabelSolver().Solve(program)
-    if not result.is_success():
-        raise InputError(
-            "inertial parameters: no physically consistent values found "
-            f"({result.get_solution_result().name})"
-        )
-    solution = result.GetSolution(variables) / norm
+
+    def solved(is_bounded: np.ndarray) -> np.ndarray:
+        # What is bounded is told from its bound: it will be near to it, and zero may be far.
+        least = np.where(is_bounded, lowest, 0.0)
+        shift = np.concatenate([least, np.zeros(X.shape[1] - K)]) * norm
+        program = MathematicalProgram()
+        variables = program.NewContinuousVariables(X.shape[1])
+        rest = (target - R @ shift) / np.sqrt(size)
+        program.Add2NormSquaredCost(R / np.sqrt(size), rest, variables)
+        if K:
+            lower = np.where(is_bounded, 0.0, -np.inf)
+            program.AddBoundingBoxConstraint(lower, np.full(K, np.inf), variables[:K])
+        for z, J in zip(np.split(variables[K:], len(own)), own, strict=True):
+            program.AddLinearMatrixInequalityConstraint([J - _LEAST_SHARE * np.eye(4), *_BASIS], z)
+        result = ClarabelSolver().Solve(program)
+        if not result.is_success():
+            raise InputError(
+                "inertial parameters: no physically consistent values found "
+                f"({result.get_solution_result().name})"
+            )
+        return (result.GetSolution(variables) + shift) / norm
+
+    # Bounds that are far from zero are heard where they are needed: the solver fails at many that
+    # bound nothing.
+    is_bounded = lowest == 0.0
+    solution = solved(is_bounded)
+    while (beyond := ~is_bounded & (solution[:K] < lowest)).any():
+        is_bounded |= beyond
+        solution = solved(is_bounded)
     return solution[:K], solution[K:]
