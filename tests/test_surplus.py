@@ -22,6 +22,7 @@ from fbse_drake.effects.surplus import without_surplus
 from fbse_drake.effects.transmission import PreslidingHysteresis
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.report.sentences import diagnosis_outcome
 from fbse_drake.robot.description import load_description
 from fbse_drake.scenario import Scenario, load_scenario
 from fbse_drake.simulation import simulate
@@ -129,6 +130,8 @@ def test_friction_that_a_model_has_too_much_of_is_found_and_taken_from_it() -> N
         (("ViscousFriction", ("axis_5",)), "viscous", 2.0),
     ):
         assert found[effect, joint][name].value == pytest.approx(-surplus, rel=0.01)
+    assert diagnosis_outcome(diagnosis).startswith("The model lacks ")
+    assert "It has too much of what is negative." in diagnosis_outcome(diagnosis)
     mended = add(model, diagnosis.chosen)
     assert set(mended.believed.effects) == {"joint_friction"}
     resolved, truth = (

@@ -11,6 +11,7 @@ from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance
 from fbse_drake.discrepancy.diagnosis.study import Study
 from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene
+from fbse_drake.effects.effect import library
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy_figures import (
     by_effect,
@@ -200,6 +201,19 @@ def _partly(diagnosis: Diagnosis) -> str:
     )
 
 
+def _surplus(findings: Sequence[Finding]) -> str:
+    """Says that the model has too much of what is usually positive and was found to be negative."""
+    known = library()
+    negative = any(
+        estimate.value < 0.0 <= known[finding.effect].parameters[name].plausible[0]
+        for finding in findings
+        if finding.effect in known
+        for name, estimate in finding.parameters.items()
+        if name in known[finding.effect].parameters
+    )
+    return " It has too much of what is negative." if negative else ""
+
+
 def _verdict(diagnosis: Diagnosis) -> str:
     found = listed_effects(diagnosis.chosen)
     if diagnosis.verdict == "effect_found":
@@ -209,7 +223,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
         doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
         if is_refuted(diagnosis.set_aside):
             return f"{_suggested(found)}{doubt}."
-        return f"The model lacks {found}{doubt}."
+        return f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}"
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
