@@ -106,6 +106,13 @@ def test_more_noise_of_the_feet_than_is_believed_is_measured_and_no_structure(
     assert not leftover_structure(motion, white, white.y)
 
 
+def rows_told(predictor: Predictor, left: np.ndarray) -> list[int]:
+    """Rows in which structure is found, if this is left, (B, R)."""
+    white = WhitenedResidual(predictor.residual)
+    left = np.where(white.residual.known, left, 0.0)
+    return [structure.index for structure in leftover_structure(predictor.motion, white, left)]
+
+
 def test_structure_tells_of_what_comes_later(
     walk: tuple[Scenario, Log],
 ) -> None:
@@ -113,17 +120,14 @@ def test_structure_tells_of_what_comes_later(
     noise of impacts, or of what happens between rare samples. Nor where more noise is white, or
     more of it differenced, than was believed, for then only neighbours are correlated."""
     predictor = Predictor(*walk)
-    motion, white = predictor.motion, WhitenedResidual(predictor.residual)
-    rows = [k for k, row in enumerate(white.residual.rows) if row.kind != "kinematic"]
-    known = white.residual.known
-    noise = np.random.default_rng(2).standard_normal(known.shape)
+    rows = [k for k, row in enumerate(predictor.residual.rows) if row.kind != "kinematic"]
+    noise = np.random.default_rng(2).standard_normal(predictor.residual.known.shape)
     impact = noise.copy()
     impact[len(impact) // 2] += 30.0
     drifting = lfilter([np.sqrt(1 - 0.8**2)], [1.0, -0.8], noise, axis=0)
 
     def found(left: np.ndarray) -> int:
-        structures = leftover_structure(motion, white, np.where(known, left, 0.0))
-        return sum(structure.index in rows for structure in structures)
+        return sum(row in rows for row in rows_told(predictor, left))
 
     assert EXCESS < 1.5 < np.sqrt((impact**2).mean(axis=0)).min()
     assert found(noise) == found(1.5 * noise) == found(impact) == 0
@@ -137,22 +141,13 @@ def test_a_robot_that_stands_on_no_feet_has_no_impacts(walk: tuple[Scenario, Log
     """Hits that are few, and last for some averages, tell of a gap in a gear where no foot lands;
     a single one, as of somebody who touches the arm, is noise in both."""
     arm = load_scenario("bsc_arm", overrides=["duration=3"])
-    lasting = np.isin(np.arange(300) % 150, [70, 71, 72, 73])
     for scenario, log, tells in ((*walk, 0), (believed(arm), simulate(arm).log, 6)):
         predictor = Predictor(scenario, log)
-        motion, white = predictor.motion, WhitenedResidual(predictor.residual)
-        known = white.residual.known
-        noise = np.random.default_rng(3).standard_normal(known.shape)
-        single = np.arange(len(noise)) == 150
-        joints = len(motion.robot.joint_names)
-
-        def found(hits: np.ndarray) -> int:
-            left = noise + 20.0 * hits[: len(noise), None]  # noqa: B023 - called in this turn.
-            structures = leftover_structure(motion, white, np.where(known, left, 0.0))  # noqa: B023
-            return sum(structure.index < joints for structure in structures)  # noqa: B023
-
-        assert found(lasting) == tells
-        assert found(single) == 0
+        noise = np.random.default_rng(3).standard_normal(predictor.residual.known.shape)
+        joints, block = range(len(predictor.robot.joint_names)), np.arange(len(noise))[:, None]
+        lasting, single = np.isin(block % 150, [70, 71, 72, 73]), block == 150
+        assert sum(row in joints for row in rows_told(predictor, noise + 20.0 * lasting)) == tells
+        assert not any(row in joints for row in rows_told(predictor, noise + 20.0 * single))
 
 
 def test_residual_of_a_model_without_friction_is_the_friction(walk: tuple[Scenario, Log]) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from fbse_drake.discrepancy.diagnosis.add import add
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import (
     CoulombFriction,
     CoulombViscousFriction,
@@ -78,6 +79,16 @@ def test_nobody_gives_what_he_has_not(own: Effect) -> None:
         beside.resolve(NAMES)
 
 
+def test_a_nonlinear_parameter_of_the_same_name_is_something_else() -> None:
+    class Bent(ViscousFriction):
+        parameters: ClassVar[dict[str, Parameter]] = {
+            "coulomb": Parameter("Nm", linear=False, plausible=(0.1, 1.0), neutral=1.0)
+        }
+
+    assert CoulombFriction.shares("coulomb", CoulombViscousFriction)
+    assert not CoulombFriction.shares("coulomb", Bent)
+
+
 def test_of_a_joint_that_the_robot_has_not_nothing_is_taken() -> None:
     change = CoulombFriction(coulomb={"elbow": -1.0})
     lowered, beside = without_surplus({"own": BELIEVED}, change, NAMES)
@@ -131,7 +142,7 @@ def test_friction_that_a_model_has_too_much_of_is_found_and_taken_from_it() -> N
     ):
         assert found[effect, joint][name].value == pytest.approx(-surplus, rel=0.01)
     assert diagnosis_outcome(diagnosis).startswith("The model lacks ")
-    assert "It has too much of what is negative." in diagnosis_outcome(diagnosis)
+    assert "Where a value is negative, the model has too much." in diagnosis_outcome(diagnosis)
     mended = add(model, diagnosis.chosen)
     assert set(mended.believed.effects) == {"joint_friction"}
     resolved, truth = (

@@ -125,14 +125,15 @@ class JointTorqueEffect(Effect):
 
     @classmethod
     def shares(cls, name: str, other: type[Effect]) -> bool:
-        """Has another effect a parameter of this name that stands for the same? So has the same
-        effect, and among laws of the velocity alone, each with one of this name. What remembers may
-        remember something else."""
+        """Has another effect a linear parameter of this name that stands for the same? So has the
+        same effect, and among laws of the velocity alone, each with one of this name. What
+        remembers may remember something else."""
         return (
             not cls.has_memory
-            and name in other.parameters
             and issubclass(other, JointTorqueEffect)
             and (other is cls or (cls.of_velocity_alone and other.of_velocity_alone))
+            and name in other.parameters
+            and other.parameters[name].linear
         )
 
     @staticmethod

@@ -202,16 +202,14 @@ def _partly(diagnosis: Diagnosis) -> str:
 
 
 def _surplus(findings: Sequence[Finding]) -> str:
-    """Says that the model has too much of what is usually positive and was found to be negative."""
-    known = library()
-    negative = any(
-        estimate.value < 0.0 <= known[finding.effect].parameters[name].plausible[0]
-        for finding in findings
-        if finding.effect in known
-        for name, estimate in finding.parameters.items()
-        if name in known[finding.effect].parameters
+    """Says that the model has too much of what cannot be negative by itself but was found so."""
+    is_surplus = any(
+        name in f.parameters and f.parameters[name].value < 0.0 <= parameter.plausible[0]
+        for f in findings
+        if f.effect in library()
+        for name, parameter in library()[f.effect].parameters.items()
     )
-    return " It has too much of what is negative." if negative else ""
+    return " Where a value is negative, the model has too much." if is_surplus else ""
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
