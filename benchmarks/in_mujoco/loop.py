@@ -10,6 +10,7 @@ from benchmarks.in_mujoco.physics import Physics, Readings
 from benchmarks.in_mujoco.robot import Machine, make_machine, pad_bodies
 from fbse_drake import Log
 from fbse_drake.control.position_loop import position_loop
+from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.robot.plant import Ground
 from fbse_drake.scenario import Scenario, build_robot, dump_scenario
 from fbse_drake.sensors.errors import ticks_until, white_noise
@@ -171,12 +172,12 @@ def _imu(machine: Machine, states: _States, period: float) -> tuple[np.ndarray, 
     Returns:
         Shape (N, 3) each [m/s^2], [rad/s]; of the first row the force is that of the second.
     """
-    frame = machine.robot.imu.GetFixedPoseInBodyFrame()
-    R_BI = Rotation.from_matrix(frame.rotation().matrix())
+    mount = ImuMount(machine.robot)
+    R_BI = Rotation.from_matrix(mount.R_BI)
     R_WB = Rotation.from_quat(states.qpos[:, 3:7], scalar_first=True)
     # MuJoCo has the rate of a free body in its own axes.
     w_B = states.qvel[:, 3:6]
-    velocity = states.qvel[:, :3] + R_WB.apply(np.cross(w_B, frame.translation()))
+    velocity = states.qvel[:, :3] + R_WB.apply(np.cross(w_B, mount.p_BI))
     force_W = np.diff(velocity, axis=0) / period - machine.model.opt.gravity
     # The attitude amid the period.
     middle = R_WB[:-1] * Rotation.from_rotvec(0.5 * period * w_B[:-1])
