@@ -84,6 +84,7 @@ from .effects.contact import GroundCompliance as GroundCompliance
 from .effects.contact import GroundSlope as GroundSlope
 from .effects.counterbalance import Counterbalance as Counterbalance
 from .effects.geometry import GeometryEffect as GeometryEffect
+from .effects.geometry import ImuPosition as ImuPosition
 from .effects.geometry import LinkLength as LinkLength
 from .effects.inertia import InertiaEffect as InertiaEffect
 from .effects.inertia import BodyCentreOfMass as BodyCentreOfMass

@@ -22,7 +22,7 @@ from fbse_drake import resources, schema
 from fbse_drake.control.compensation import Compensation, NoCompensation
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.effects.effect import Effect, library
-from fbse_drake.effects.geometry import joint_shifts
+from fbse_drake.effects.geometry import shifts
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules, require_trusted
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
@@ -435,7 +435,7 @@ def build_robot(
         config.description,
         rotor_inertia=dict(zip(bare.joint_names, np.maximum(rotor_inertia, 0.0), strict=True)),
         point_masses=point_masses,
-        joint_shifts=joint_shifts(config.effects, bare),
+        shifts=shifts(config.effects, bare),
         gantry_height=config.gantry_height,
         builder=builder,
         config=plant,

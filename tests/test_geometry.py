@@ -1,5 +1,5 @@
-"""Links that are longer than the model says. Truth: models whose joints are placed elsewhere in the
-file."""
+"""Links that are longer, and an IMU that sits elsewhere, than the model says. Truth: models whose
+joints and IMU are placed elsewhere in the file."""
 
 import dataclasses
 from pathlib import Path
@@ -12,9 +12,14 @@ from fbse_drake import InputError, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
-from fbse_drake.effects.geometry import LinkLength
+from fbse_drake.effects.geometry import ImuPosition, LinkLength
+from fbse_drake.effects.inertia import BodyMass
+from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.interop.models import links_of
 from fbse_drake.robot.plant import Robot, make_robot
-from fbse_drake.scenario import RobotConfig, build_robot
+from fbse_drake.scenario import RobotConfig, Scenario, build_robot
+from fbse_drake.sensors.encoders import EncoderConfig
+from fbse_drake.sensors.imu import ImuConfig
 
 KNEE_TO_ANKLE = '<child link="left_ankle_link"/>\n    <origin xyz="0 0 -0.27"/>'
 
@@ -129,3 +134,102 @@ def test_a_robot_with_unequal_legs_starts_on_the_ground(length: float) -> None:
     force = sum(log[f"foot/{side}/pad_force"][5:, :, 2].sum(axis=1) for side in log.sides)
     assert 0.5 * weight < force.mean() < 1.5 * weight
     assert force.max() < 3 * weight
+
+
+IMU_MOVED = (0.03, -0.02, 0.04)
+
+
+def moved_imu(folder: Path) -> str:
+    """Description of a biped whose IMU is at another place on the trunk, which its axes are
+    parallel to."""
+    place = " ".join(f"{a + b:g}" for a, b in zip((0.01, -0.01, 0.02), IMU_MOVED, strict=True))
+    return robot_copy(folder, lambda urdf: urdf.replace('xyz="0.01 -0.01 0.02"', f'xyz="{place}"'))
+
+
+def exact_trot() -> Scenario:
+    scenario = load_scenario("quadruped_trot", overrides=["duration=1.5", "estimator=null"])
+    sensors = dataclasses.replace(scenario.sensors, imu=ImuConfig(), encoders=EncoderConfig())
+    return dataclasses.replace(scenario, sensors=sensors)
+
+
+def test_a_moved_imu_is_where_another_file_has_it(tmp_path: Path) -> None:
+    changed = build_robot(RobotConfig(effects={"imu": ImuPosition(*IMU_MOVED)}))
+    expected, _ = make_robot(moved_imu(tmp_path / "copy"))
+    found, truth = ImuMount(changed), ImuMount(expected)
+    np.testing.assert_allclose(found.p_BI, truth.p_BI, atol=1e-15)
+    np.testing.assert_allclose(found.R_BI, truth.R_BI, atol=1e-15)
+
+
+def test_a_moved_imu_reads_what_a_rigid_body_has_there() -> None:
+    """Of a trunk that turns: w_dot x p + w x (w x p) more, and the same rate."""
+    scenario = exact_trot()
+    effects = {**scenario.robot.effects, "imu": ImuPosition(*IMU_MOVED)}
+    moved = dataclasses.replace(
+        scenario, robot=dataclasses.replace(scenario.robot, effects=effects)
+    )
+    here, there = simulate(scenario).log, simulate(moved).log
+    w = here["imu/angular_velocity"]
+    np.testing.assert_array_equal(there["imu/angular_velocity"], w)
+    # A reading is the mean over the step before it.
+    w_dot, p = np.diff(w, axis=0) / here.meta["period"], np.array(IMU_MOVED)
+    expected = np.cross(w_dot, p) + np.cross(w[1:], np.cross(w[1:], p))
+    found = (there["imu/linear_acceleration"] - here["imu/linear_acceleration"])[1:]
+    assert expected.std() > 0.01
+    assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
+
+
+def test_links_do_not_say_where_an_imu_sits() -> None:
+    effects = {"imu": ImuPosition(*IMU_MOVED), "long": LinkLength({"left_thigh": 0.01})}
+    _, unsaid = links_of(RobotConfig(effects=effects))
+    assert unsaid == ["imu: IMU position"]
+
+
+def test_a_moved_imu_is_found_in_a_walk(tmp_path: Path) -> None:
+    scenario = load_scenario(
+        "frictionless_walk", overrides=["duration=3.5", "reference.single_supports=2"]
+    )
+    scenario = dataclasses.replace(scenario, model=scenario.robot)
+    robot = dataclasses.replace(scenario.robot, description=moved_imu(tmp_path / "copy"))
+    log = simulate(dataclasses.replace(scenario, robot=robot)).log
+    rivals = [
+        library()[name]
+        for name in (
+            "ImuPosition",
+            "ImuMisalignment",
+            "AccelerometerBias",
+            "AccelerometerGain",
+            "GyroscopeBias",
+            "LinkLength",
+            "EncoderOffset",
+            "BodyMass",
+            "BodyCentreOfMass",
+            "FootForceGain",
+            "TransmissionElasticity",
+        )
+    ]
+    found = diagnose(Predictor(scenario, log), rivals).chosen
+    assert [(f.effect, f.targets) for f in found] == [("ImuPosition", ("robot",))]
+    for axis, place in zip("xyz", IMU_MOVED, strict=True):
+        assert found[0].parameters[axis].value == pytest.approx(place, abs=5e-3)
+
+
+def test_of_accelerations_what_is_no_noise_is_not_smoothed() -> None:
+    """What a heavier foot adds to a log of exact sensors is the difference of both models'
+    residuals, at impacts too."""
+    scenario = exact_trot()
+    scenario = dataclasses.replace(scenario, model=scenario.robot)
+    log = simulate(scenario).log
+    predictor = Predictor(scenario, log)
+    heavier = dataclasses.replace(
+        scenario.believed,
+        effects={**scenario.believed.effects, "heavy": BodyMass({"front_left_foot": 0.1})},
+    )
+    difference = (
+        predictor.motion.residual.value
+        - Predictor(dataclasses.replace(scenario, model=heavier), log).motion.residual.value
+    )
+    signature = predictor.signature(BodyMass, "front_left_foot", np.zeros(0))
+    expected = difference[:, signature.rows]
+    np.testing.assert_allclose(
+        0.1 * signature.values[..., 0], expected, atol=1e-3 * np.abs(expected).max()
+    )

@@ -1,7 +1,7 @@
 """The benchmark in MuJoCo: its robots are the project's, and its logs mean the same."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 
@@ -18,7 +18,8 @@ from benchmarks import mujoco_hidden
 from benchmarks.cases import Result
 from fbse_drake import Log, load_scenario
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.effects.effect import library
+from fbse_drake.effects.effect import Effect, library
+from fbse_drake.effects.geometry import ImuPosition, LinkLength
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.scenario import (
@@ -45,6 +46,7 @@ if find_spec("mujoco") is not None:
         FootGain,
         GyroscopeBias,
         JointProperty,
+        LongLink,
         Misalignment,
         MotorBias,
         MotorGain,
@@ -387,6 +389,33 @@ def test_walk_closes_with_what_its_sensors_say() -> None:
     share = rms(np.where(residual.known, residual.value, np.nan) / np.sqrt(residual.variance))
     dynamics = [row.kind != "kinematic" for row in residual.rows]
     assert share[dynamics] == pytest.approx(np.ones(sum(dynamics)), abs=0.3)
+
+
+@needs_mujoco
+def test_walk_that_rocks_closes_with_the_imu_where_it_is() -> None:
+    """The shorter leg makes the feet hit early, and the trunk turn fast: an IMU that is not where
+    the model has it would leave forces that no foot feels."""
+
+    @dataclass(frozen=True)
+    class Both(LongLink):
+        imu_shift: tuple[float, float, float] = (0.03, -0.02, 0.04)
+
+    overrides = ("duration=3.0", "reference.single_supports=2", "control.kd={all: 10}")
+    scenario = load_scenario("frictionless_walk", overrides=overrides)
+    reference = planned_reference(scenario, build_robot(scenario.believed))
+    log = record(Run(scenario, 5, Both("left_shank", 0.003)), reference, "walk")
+    told = {"long": LinkLength({"left_shank": 0.003})}
+
+    def share_of_base_force(effects: dict[str, Effect]) -> np.ndarray:
+        model = replace(scenario.believed, effects=effects)
+        residual = Predictor(replace(scenario, model=model), log).residual
+        of_force = ["base/force" in row.name for row in residual.rows]
+        value = np.where(residual.known, residual.value, np.nan)
+        return rms(value / np.sqrt(residual.variance))[of_force]
+
+    moved = told | {"imu": ImuPosition(*Both("left_shank", 0.003).imu_shift)}
+    assert share_of_base_force(moved) == pytest.approx(np.ones(3), abs=0.15)
+    assert share_of_base_force(told).min() > 2.0
 
 
 # Scores.

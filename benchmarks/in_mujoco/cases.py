@@ -31,6 +31,7 @@ from benchmarks.in_mujoco.physics import (
     MotorGain,
     MotorLag,
     MotorLimit,
+    MovedImu,
     Nothing,
     Payload,
     Physics,
@@ -169,6 +170,7 @@ def effects() -> list[Case]:
         biped("accelerometer-bias", AccelerometerBias((0.2, 0.1, 0.0))),
         biped("gyroscope-bias", GyroscopeBias((0.02, -0.01, 0.0))),
         biped("misalignment", Misalignment((0.02, 0.01, 0.0))),
+        biped("moved-imu", MovedImu((0.03, -0.02, 0.04))),
         biped("foot-gain", FootGain("left", 1.05)),
     ]
 

@@ -87,7 +87,7 @@ def record(run: Run, reference: Reference, name: str) -> Log:
     physics.change(machine.model)
     states = _simulate(run, machine, reference)
     readings = Readings(
-        *_imu(machine, states, period)
+        *_imu(machine, states, period, physics.imu_shift)
         if robot.has_floating_base
         else np.zeros((2, len(states.command), 3)),
         states.pad_force,
@@ -166,8 +166,11 @@ def _set_start(machine: Machine, data: mujoco.MjData, reference: Reference, grou
         data.qpos[2] -= weight / (machine.model.nsensor * ground.stiffness)
 
 
-def _imu(machine: Machine, states: _States, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Specific force, the mean over the period that ends, and rate at its end, in the IMU frame.
+def _imu(
+    machine: Machine, states: _States, period: float, shift: tuple[float, float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Specific force, the mean over the period that ends, and rate at its end, in the IMU frame,
+    from which the IMU is shifted.
 
     Returns:
         Shape (N, 3) each [m/s^2], [rad/s]; of the first row the force is that of the second.
@@ -177,7 +180,8 @@ def _imu(machine: Machine, states: _States, period: float) -> tuple[np.ndarray, 
     R_WB = Rotation.from_quat(states.qpos[:, 3:7], scalar_first=True)
     # MuJoCo has the rate of a free body in its own axes.
     w_B = states.qvel[:, 3:6]
-    velocity = states.qvel[:, :3] + R_WB.apply(np.cross(w_B, mount.p_BI))
+    p_BI = mount.p_BI + R_BI.apply(shift)
+    velocity = states.qvel[:, :3] + R_WB.apply(np.cross(w_B, p_BI))
     force_W = np.diff(velocity, axis=0) / period - machine.model.opt.gravity
     # The attitude amid the period.
     middle = R_WB[:-1] * Rotation.from_rotvec(0.5 * period * w_B[:-1])

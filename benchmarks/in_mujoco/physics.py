@@ -51,6 +51,11 @@ class Physics:
         """Joints of what the library does not have."""
         return ()
 
+    @property
+    def imu_shift(self) -> tuple[float, float, float]:
+        """How far the IMU is from where the model has it, in its axes [m]."""
+        return (0.0, 0.0, 0.0)
+
     def edit(self, spec: mujoco.MjSpec) -> None:
         """Changes the robot before it is compiled."""
 
@@ -531,3 +536,14 @@ def _with(values: np.ndarray, column: int, value: float) -> np.ndarray:
     result = values.copy()
     result[column] = value
     return result
+
+
+@dataclass(frozen=True)
+class MovedImu(ImuError):
+    """An IMU that sits elsewhere [m]."""
+
+    effect: ClassVar[str] = "ImuPosition"
+
+    @property
+    def imu_shift(self) -> tuple[float, float, float]:
+        return self.vector

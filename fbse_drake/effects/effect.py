@@ -7,7 +7,7 @@ thing it is, is said by its base class:
     JointTorqueEffect   a torque loss in a joint: friction, springs, ripple; also of its
                         actuation: gain, bias, delay (joint_torque.py)
     InertiaEffect       reflected inertia, masses, centres of mass (inertia.py)
-    GeometryEffect      lengths of links (geometry.py)
+    GeometryEffect      lengths of links, where the IMU sits (geometry.py)
     SensorEffect        what a sensor reads beside the truth (sensor.py)
     ContactEffect       ground and soles (contact.py)
 

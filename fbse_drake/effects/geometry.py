@@ -1,4 +1,4 @@
-"""Effects on a robot's shape: what the model's joints are placed by.
+"""Effects on a robot's shape: where the model has its joints and its IMU.
 
 The same lines change the plant that is simulated, the model that is believed, and the model that
 the diagnosis tries out.
@@ -13,7 +13,7 @@ from pydrake.multibody.tree import Frame, Joint
 
 from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.errors import InputError, located
-from fbse_drake.robot.plant import Robot
+from fbse_drake.robot.plant import Robot, Shifts
 
 # Joints that are closer to each other than this have no link between them that could be longer [m].
 _SHORTEST_LINK = 0.02
@@ -22,21 +22,18 @@ _SHORTEST_LINK = 0.02
 @dataclass(frozen=True)
 class GeometryEffect(Effect):
     """Base of the effects on a robot's shape; a subclass moves joints against the bodies that carry
-    them."""
+    them, or the IMU."""
 
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
+    # Does a file of links and joints say it?
+    in_links: ClassVar[bool] = True
 
     @staticmethod
-    def suspected_bodies(robot: Robot) -> list[str]:
-        """Bodies that the diagnosis tries it on."""
-        raise NotImplementedError
-
-    @staticmethod
-    def joint_shifts(robot: Robot, body: str, values: np.ndarray) -> dict[str, np.ndarray]:
-        """How far joints are moved in the frames of the bodies that carry them, (3,) [m], by joint.
+    def shifts(robot: Robot, target: str, values: np.ndarray) -> Shifts:
+        """What is moved, and how far.
 
         Args:
-            values: of the parameters for this body, shape (parameters,).
+            values: of the parameters for this target, shape (parameters,).
 
         Raises:
             InputError: the robot has no such body, or one that this does not act on.
@@ -44,8 +41,8 @@ class GeometryEffect(Effect):
         raise NotImplementedError
 
 
-def joint_shifts(effects: Mapping[str, Effect], robot: Robot) -> dict[str, np.ndarray]:
-    """How far the geometry effects among some effects move joints, by joint.
+def shifts(effects: Mapping[str, Effect], robot: Robot) -> Shifts:
+    """What the geometry effects among some effects move, all together.
 
     Args:
         effects: by name, of any kind.
@@ -54,16 +51,19 @@ def joint_shifts(effects: Mapping[str, Effect], robot: Robot) -> dict[str, np.nd
     Raises:
         InputError: unknown body, a value out of bounds.
     """
-    result: dict[str, np.ndarray] = {}
+    joints: dict[str, np.ndarray] = {}
+    imu = np.zeros(3)
     for name, effect in effects.items():
         if not isinstance(effect, GeometryEffect):
             continue
         values = effect.resolve(robot.description, key=f"effects.{name}")
         with located(f"effects.{name}: "):
-            for body, of_body in zip(values.targets, values.linear.T, strict=True):
-                for joint, shift in effect.joint_shifts(robot, body, of_body).items():
-                    result[joint] = result.get(joint, 0.0) + shift
-    return result
+            for target, of_target in zip(values.targets, values.linear.T, strict=True):
+                moved = effect.shifts(robot, target, of_target)
+                imu += moved.imu
+                for joint, shift in moved.joints.items():
+                    joints[joint] = joints.get(joint, 0.0) + shift
+    return Shifts(joints, imu)
 
 
 @in_library
@@ -94,14 +94,41 @@ class LinkLength(GeometryEffect):
         return [name for name in robot.body_names if _next_joint(robot, name) is not None]
 
     @staticmethod
-    def joint_shifts(robot: Robot, body: str, values: np.ndarray) -> dict[str, np.ndarray]:
-        robot.body(body)
-        following = _next_joint(robot, body)
+    def shifts(robot: Robot, target: str, values: np.ndarray) -> Shifts:
+        robot.body(target)
+        following = _next_joint(robot, target)
         if following is None:
             links = ", ".join(name for name in robot.body_names if _next_joint(robot, name))
-            raise InputError(f"{body}: expected a link between two joints (there are: {links})")
+            raise InputError(f"{target}: expected a link between two joints (there are: {links})")
         joint, along = following
-        return {joint.name(): values[0] * along / np.linalg.norm(along)}
+        return Shifts({joint.name(): values[0] * along / np.linalg.norm(along)})
+
+
+@in_library
+@dataclass(frozen=True)
+class ImuPosition(GeometryEffect):
+    """The IMU is this far from where the model has it, in the axes of the IMU frame."""
+
+    description: ClassVar[str] = "The IMU sits elsewhere than the model says."
+    signature: ClassVar[str] = (
+        "Forces on the trunk that no foot feels, in proportion to how fast it begins to turn."
+    )
+    experiment: ClassVar[str] = "Sway and turn the trunk fast, to and fro, about all axes."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
+    parameters: ClassVar[dict[str, Parameter]] = {
+        axis: Parameter("m", linear=True, plausible=(-0.1, 0.1), bounds=(-np.inf, np.inf))
+        for axis in "xyz"
+    }
+    # Links stay where they are.
+    in_links: ClassVar[bool] = False
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+    @staticmethod
+    def shifts(robot: Robot, target: str, values: np.ndarray) -> Shifts:  # noqa: ARG004
+        return Shifts(imu=values)
 
 
 def _next_joint(robot: Robot, body: str) -> tuple[Joint, np.ndarray] | None:

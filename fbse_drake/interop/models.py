@@ -80,7 +80,10 @@ def links_of(config: RobotConfig) -> tuple[list[Link], list[str]]:
     unsaid = [
         f"{name}: {spaced(type(effect).__name__)}"
         for name, effect in config.effects.items()
-        if not isinstance(effect, InertiaEffect | GeometryEffect | _Resistance)
+        if not (
+            isinstance(effect, InertiaEffect | _Resistance)
+            or (isinstance(effect, GeometryEffect) and effect.in_links)
+        )
     ]
     return list(_links(robot, resistance)), unsaid
 

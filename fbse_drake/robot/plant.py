@@ -46,6 +46,8 @@ _MODEL = ModelInstanceIndex(2)
 _NAMED = 12
 # Between a body's name and the number in the names of the bodies that carry its point masses.
 _POINT_MASS = "_point_mass_"
+# Name of the frame of what is elsewhere than the model has it.
+_SHIFTED = "{}_shifted"
 # A corner of a foot touches the ground in one point, and is far stiffer than any ground.
 _CORNER_RADIUS, _CORNER_STIFFNESS = 1e-9, 1e12
 
@@ -133,7 +135,10 @@ class Robot:
 
     @cached_property
     def imu(self) -> Frame:
-        return self.plant.GetFrameByName(self.description.imu or self.description.base)
+        """Where it really is, which may not be where the description has it."""
+        name = self.description.imu or self.description.base
+        moved = _SHIFTED.format(name)
+        return self.plant.GetFrameByName(moved if self.plant.HasFrameNamed(moved) else name)
 
     @cached_property
     def torque_units(self) -> list[str]:
@@ -334,12 +339,22 @@ def gravity_on_slope(gravity: np.ndarray, slope: Sequence[float]) -> np.ndarray:
     return Rotation.from_rotvec([*slope, 0.0]).inv().apply(gravity)
 
 
+@dataclass(frozen=True)
+class Shifts:
+    """How far parts of a robot are from where its model has them [m]."""
+
+    # Joints in the frames of the bodies that carry them, (3,) by name.
+    joints: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # The IMU in its own axes, (3,).
+    imu: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
 def make_robot(
     description: str | Path,
     *,
     rotor_inertia: Mapping[str, float] | None = None,
     point_masses: Sequence[PointMass] = (),
-    joint_shifts: Mapping[str, np.ndarray] | None = None,
+    shifts: Shifts | None = None,
     gantry_height: float | None = None,
     builder: DiagramBuilder | None = None,
     config: MultibodyPlantConfig | None = None,
@@ -352,8 +367,7 @@ def make_robot(
         description: name or path of a robot description (`models/*.yaml`).
         rotor_inertia: reflected rotor inertia [kg m^2] by joint, see `RobotDescription.per_joint`.
         point_masses: further masses on bodies of the model.
-        joint_shifts: how far joints are moved in the frames of the bodies that carry them,
-            (3,) [m], by joint.
+        shifts: what is elsewhere than the model has it; by default nothing.
         gantry_height: hangs the base in a gantry: welds it to the world at this height [m],
             upright.
         builder: the diagram that gets the plant and its scene graph; by default one that is thrown
@@ -374,7 +388,9 @@ def make_robot(
         _add_frames(plant, names)
         _check_names(plant, names)
         _hold_other_joints(plant, names)
-    _shift_joints(plant, joint_shifts or {})
+    shifts = shifts or Shifts()
+    _shift_joints(plant, shifts.joints)
+    _shift_imu(plant, names, shifts.imu)
     inertia = names.per_joint(rotor_inertia or {}, key="rotor_inertia", default=0.0)
     _add_actuators(plant, dict(zip(names.joint_names, inertia, strict=True)))
     implicit = implicit or ImplicitTorque.none(len(names.joint_names))
@@ -569,7 +585,7 @@ def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> No
             if plant.get_joint_actuator(index).joint() is joint:
                 plant.RemoveJointActuator(plant.get_joint_actuator(index))
         moved = FixedOffsetFrame(
-            f"{name}_shifted",
+            _SHIFTED.format(name),
             body.body_frame(),
             RigidTransform(X_PF.rotation(), X_PF.translation() + shift),
             joint.model_instance(),
@@ -588,6 +604,15 @@ def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> No
         again.set_velocity_limits(joint.velocity_lower_limits(), joint.velocity_upper_limits())
         plant.RemoveJoint(joint)
         plant.AddJoint(again)
+
+
+def _shift_imu(plant: MultibodyPlant, names: RobotDescription, shift: np.ndarray) -> None:
+    """Adds the frame of an IMU that is moved in its own axes; see `Robot.imu`."""
+    if shift.any():
+        frame = plant.GetFrameByName(names.imu or names.base)
+        plant.AddFrame(
+            FixedOffsetFrame(_SHIFTED.format(frame.name()), frame, RigidTransform(shift))
+        )
 
 
 def _add_actuators(plant: MultibodyPlant, rotor_inertia: Mapping[str, float]) -> None:

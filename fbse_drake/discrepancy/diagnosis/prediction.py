@@ -421,15 +421,34 @@ class Predictor:
 
     def _smoothed(self, blocks: Instants) -> Instants:
         """Averages with accelerations that are smoothed further, for their noise is in the residual
-        too. Not those of a recording that is low-passed: little noise is left in them, and
-        smoothing would take motion."""
-        if self.motion.recording.cutoff > 0:
-            return blocks
-        smooth = {
-            name: smoothed(getattr(blocks, name))
-            for name in ("joint_acceleration", "angular_acceleration")
+        too: of what smoothing takes off, the share is left that is motion (N. Wiener,
+        "Extrapolation, Interpolation, and Smoothing of Stationary Time Series", 1949)."""
+        result = {}
+        for name, share in self._rough_motion.items():
+            values = getattr(blocks, name)
+            smooth = smoothed(values)
+            result[name] = smooth + share * (values - smooth)
+        return replace(blocks, **result)
+
+    @cached_property
+    def _rough_motion(self) -> dict[str, np.ndarray]:
+        """Of what smoothing takes off accelerations, the share that no noise explains, by joint and
+        axis. All of a recording that is low-passed: little noise is left in it."""
+        motion, sensors = self.motion, self.motion.sensors
+        noise = {
+            "joint_acceleration": joint_velocity_noise(sensors),
+            "angular_acceleration": sensors.imu.angular_velocity_noise,
         }
-        return replace(blocks, **smooth)
+        if motion.recording.cutoff > 0:
+            return dict.fromkeys(noise, np.ones(1))
+        result = {}
+        for name, deviation in noise.items():
+            values = getattr(motion.blocks, name)
+            power = np.mean((values - smoothed(values)) ** 2, axis=0)
+            # Velocities at both ends of three blocks count 1, -3, 3 and -1 quarters.
+            noisy = 1.25 * (deviation / (motion.length * motion.period)) ** 2
+            result[name] = 1.0 - np.minimum(noisy / np.maximum(power, 1e-300), 1.0)
+        return result
 
     @cached_property
     def _residual_at_blocks(self) -> np.ndarray:

@@ -173,6 +173,7 @@ _RECIPES = {
     "AccelerometerBias": Recipe((0.05, 0.4), _vector("xyz")),
     "GyroscopeBias": Recipe((2e-3, 4e-2), _vector("xyz")),
     "ImuMisalignment": Recipe((5e-3, 4e-2), _vector("xyz")),
+    "ImuPosition": Recipe((1e-2, 5e-2), _vector("xyz")),
     "EncoderOffset": Recipe((1e-3, 1e-2), _signed("offset")),
     "MotorEncoderOffset": Recipe((1e-3, 1e-2), _signed("offset")),
     "TransmissionElasticity": Recipe(
