@@ -653,7 +653,8 @@ class TransmissionElasticity(SensorEffect):
     )
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "compliance": Parameter("rad/Nm", linear=True, plausible=(1e-5, 1e-4)),
+        # From stiff harmonic drives to series elastic actuators.
+        "compliance": Parameter("rad/Nm", linear=True, plausible=(1e-5, 1e-3)),
         "time_constant": Parameter(
             "s", linear=False, plausible=(4e-3, 2e-2), bounds=(1e-6, np.inf)
         ),

@@ -421,38 +421,47 @@ class Predictor:
 
     def _smoothed(self, blocks: Instants) -> Instants:
         """Averages with accelerations that are smoothed further, for their noise is in the residual
-        too: of what smoothing takes off, the share is left that is motion (N. Wiener,
-        "Extrapolation, Interpolation, and Smoothing of Stationary Time Series", 1949)."""
-        result = {}
-        for name, share in self._rough_motion.items():
-            values = getattr(blocks, name)
-            smooth = smoothed(values)
-            result[name] = smooth + share * (values - smooth)
-        return replace(blocks, **result)
+        too. Not those of a recording that is low-passed: little noise is left in them, and
+        smoothing would take motion."""
+        if self.motion.recording.cutoff > 0:
+            return blocks
+        smooth = {
+            name: smoothed(getattr(blocks, name))
+            for name in ("joint_acceleration", "angular_acceleration")
+        }
+        return replace(blocks, **smooth)
 
     @cached_property
-    def _rough_motion(self) -> dict[str, np.ndarray]:
-        """Of what smoothing takes off accelerations, the share that no noise explains, by joint and
-        axis. All of a recording that is low-passed: little noise is left in it."""
+    def _residual_at_blocks(self) -> np.ndarray:
+        return self.motion.equation.residual(self._smooth_blocks)
+
+    @cached_property
+    def _blocks_but_for_noise(self) -> Instants:
+        """Averages with accelerations from which only noise is taken: of what smoothing takes off,
+        the share is left that noise does not explain, by joint and axis (N. Wiener,
+        "Extrapolation, Interpolation, and Smoothing of Stationary Time Series", 1949).
+
+        Smoothing would make an impact smaller, and a place larger that is told by impacts.
+        """
         motion, sensors = self.motion, self.motion.sensors
         noise = {
             "joint_acceleration": joint_velocity_noise(sensors),
             "angular_acceleration": sensors.imu.angular_velocity_noise,
         }
-        if motion.recording.cutoff > 0:
-            return dict.fromkeys(noise, np.ones(1))
         result = {}
         for name, deviation in noise.items():
-            values = getattr(motion.blocks, name)
-            power = np.mean((values - smoothed(values)) ** 2, axis=0)
+            smooth = getattr(self._smooth_blocks, name)
+            rough = getattr(motion.blocks, name) - smooth
             # Velocities at both ends of three blocks count 1, -3, 3 and -1 quarters.
             noisy = 1.25 * (deviation / (motion.length * motion.period)) ** 2
-            result[name] = 1.0 - np.minimum(noisy / np.maximum(power, 1e-300), 1.0)
-        return result
+            power = np.maximum(np.mean(rough**2, axis=0), noisy)
+            share = np.divide(noisy, power, out=np.zeros_like(power), where=power > 0)
+            result[name] = smooth + rough * (1.0 - share)
+        return replace(motion.blocks, **result)
 
     @cached_property
-    def _residual_at_blocks(self) -> np.ndarray:
-        return self.motion.equation.residual(self._smooth_blocks)
+    def _residual_but_for_noise(self) -> np.ndarray:
+        return self.motion.equation.residual(self._blocks_but_for_noise)
 
     @cached_property
     def _noisier_signals(self) -> SensorSignals:
@@ -618,7 +627,8 @@ class Predictor:
             here = self._believed_slope
             return self._on_slope(here + linear) - self._on_slope(here)
         if issubclass(effect, GeometryEffect):
-            return self._residual_at_blocks - self._with(changed).residual(self._smooth_blocks)
+            blocks = self._blocks_but_for_noise
+            return self._residual_but_for_noise - self._with(changed).residual(blocks)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         signals = self.reading.undone(resolved, self._memory(effect, resolved))
