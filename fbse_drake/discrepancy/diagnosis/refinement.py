@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
-from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, Fits
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.identification.inertial import (
     IdentifiedInertia,
@@ -88,11 +88,14 @@ def _narrowed(
     fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray
 ) -> Candidate:
     """A candidate that is no joint torque effect with its nonlinear values where they fit best
-    beside others, if the log tells them at all: what shows in a transmission alone."""
-    if not fits.dictionary.is_deflection(candidate.signature):
-        return candidate
+    beside others, if the log tells them at all: what shows in a transmission alone, or far
+    better with another value."""
+    needed = 0.0 if fits.dictionary.is_deflection(candidate.signature) else MARGIN
     for k in range(len(candidate.nonlinear)):
-        candidate = _with_fitting_value(fits, others, candidate, linear, k)
+        narrower = _with_fitting_value(fits, others, candidate, linear, k)
+        there, here = (fits.explain([*others, c]).deviance for c in (narrower, candidate))
+        if here - there >= needed:
+            candidate = narrower
     return candidate
 
 
