@@ -86,6 +86,7 @@ from .effects.counterbalance import Counterbalance as Counterbalance
 from .effects.geometry import GeometryEffect as GeometryEffect
 from .effects.geometry import ImuPosition as ImuPosition
 from .effects.geometry import LinkLength as LinkLength
+from .robot.plant import Shifts as Shifts
 from .effects.inertia import InertiaEffect as InertiaEffect
 from .effects.inertia import BodyCentreOfMass as BodyCentreOfMass
 from .effects.inertia import BodyMass as BodyMass
