@@ -1,11 +1,14 @@
 """How well missing physics is found in another simulator: `python -m benchmarks.mujoco_hidden
-[--quick] [--sample N] [--only NAME] [--jobs N] [--keep] [--out DIR]`.
+[--quick] [--sample N] [--only NAME] [--random N [--first NUMBER]] [--jobs N] [--keep] [--out DIR]`.
 
 A biped and an arm, the same bodies as in their models, run in MuJoCo (extra `mujoco`) with physics
 that MuJoCo or the loop around it makes, with nothing hidden, and with what the library of effects
 does not have. Each log is diagnosed. Every case becomes a row of a campaign in DIR; those that are
 there already, made by the same sources, are not run again. Prints the figures beside what was asked
 for and a line for each case that went wrong, and saves both as DIR/figures.json.
+
+With `--random` the cases are drawn, of a quadruped too: nobody has tuned anything to them. What is
+hidden there may be too small to be found; then only what is named wrongly counts.
 """
 
 import argparse
@@ -18,6 +21,9 @@ from benchmarks.cases import Result, add_options, drawn, share
 from benchmarks.console import print_table
 from fbse_drake.files import write_json
 from fbse_drake.report.html import Table
+
+# Robots together.
+_ALL = "all"
 
 
 def is_alarm(decoy: Result) -> bool:
@@ -37,16 +43,27 @@ def is_misled(result: Result) -> bool:
     return result.is_wrong(result.tree["case"]["allowed"])
 
 
+def is_telling(result: Result) -> bool:
+    """Does a case that was drawn say anything? Not if the robot fell by what is hidden, so that
+    there is no log, nor if nothing wrong is said of what is smaller than its log can show."""
+    if "error" in result.tree:
+        return "FellError" not in result.tree["error"]
+    if result.group != "effect" or is_answered(result) or is_misled(result):
+        return True
+    effects = result.diagnosis["effects"].items()
+    return result.is_visible({name: of["smallest_detectable_by_target"] for name, of in effects})
+
+
 def figures(everything: Sequence[Result]) -> Table:
     """What was asked for and what came out."""
     results = [result for result in everything if "error" not in result.tree]
     rows = []
-    for robot in ("arm", "biped", "both"):
-        mine = [r for r in results if robot in (r.tree["case"]["robot"], "both")]
+    for robot in (*dict.fromkeys(r.tree["case"]["robot"] for r in everything), _ALL):
+        mine = [r for r in results if robot in (r.tree["case"]["robot"], _ALL)]
         effects, decoys, strangers = (
             [r for r in mine if r.group == group] for group in ("effect", "decoy", "stranger")
         )
-        asked = (">= 95 %", "0", "<= 1") if robot == "both" else ("", "", "")
+        asked = (">= 95 %", "0", "<= 1") if robot == _ALL else ("", "", "")
         exact = [value for r in effects for value in r.score["targets"].values()]
         counts = (
             (
@@ -71,7 +88,7 @@ def figures(everything: Sequence[Result]) -> Table:
         )
         rows += [(robot, *count) for count in counts]
     failed, total = len(everything) - len(results), len(everything)
-    rows.append(("both", "diagnoses that ended in an error", "0", f"{failed}", f"{total}"))
+    rows.append((_ALL, "diagnoses that ended in an error", "0", f"{failed}", f"{total}"))
     return Table(("robot", "figure", "asked", "measured", "of"), tuple(rows))
 
 
@@ -96,17 +113,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="How well missing physics is found in another simulator."
     )
     add_options(parser, "out/mujoco", "every fourth case", "arm or decoy-biped")
+    number = "draw so many cases instead, see --first"
+    parser.add_argument("--random", type=int, default=None, metavar="N", help=number)
+    first = "number of the first case that is drawn (default 0)"
+    parser.add_argument("--first", type=int, default=0, metavar="NUMBER", help=first)
     options = parser.parse_args(arguments)
     if find_spec("mujoco") is None:
         print("MuJoCo is not installed (pip install 'fbse_drake[mujoco]'): no case runs in it.")
         return
     from benchmarks.in_mujoco.cases import all_cases, sources
+    from benchmarks.in_mujoco.random_cases import random_case
     from benchmarks.store import Store
 
     console = Console(width=190)
-    cases = [case for group in all_cases() for case in group[:: 4 if options.quick else 1]]
+    if options.random is None:
+        cases = [case for group in all_cases() for case in group[:: 4 if options.quick else 1]]
+    else:
+        cases = [random_case(options.first + k) for k in range(options.random)]
     store = Store(
-        options.out / "cases",
+        options.out / ("cases" if options.random is None else "random"),
         "benchmarks.in_mujoco.cases:judge",
         drawn(cases, options),
         None if options.keep else sources(),
@@ -114,6 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     store.run(console, "hiding in MuJoCo and finding", only=options.only, workers=options.jobs)
 
     everything = store.read()
+    if options.random is not None:
+        everything = [result for result in everything if is_telling(result)]
     table, lines = figures(everything), failures(everything)
     print_table(console, "Hidden physics in MuJoCo", table)
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)

@@ -37,7 +37,7 @@ needs_mujoco = pytest.mark.skipif(
 if find_spec("mujoco") is not None:
     import mujoco
 
-    from benchmarks.in_mujoco.cases import Case, arm_motion, arm_scenario, best_score
+    from benchmarks.in_mujoco.cases import Case, arm_motion, arm_scenario, best_score, setting
     from benchmarks.in_mujoco.loop import Run, record
     from benchmarks.in_mujoco.physics import (
         AccelerometerBias,
@@ -57,6 +57,7 @@ if find_spec("mujoco") is not None:
         Ripple,
         Spring,
     )
+    from benchmarks.in_mujoco.random_cases import named, random_case
     from benchmarks.in_mujoco.robot import Machine, make_machine, pad_bodies
 
 STEP = 1e-3
@@ -361,6 +362,21 @@ def test_faulty_sensor_reads_what_its_answer_says(name: str) -> None:
     assert any(
         np.abs(getattr(read, channel) - value).max() > 1e-3 for channel, value in true.items()
     )
+
+
+@needs_mujoco
+def test_cases_are_drawn_alike_each_time_and_hide_what_the_robot_can_have() -> None:
+    for number in range(5):
+        case = random_case(number)
+        assert named(case.name) == case
+        assert (case.group == "decoy") == isinstance(case.physics, Nothing)
+        scenario, _ = setting(case)
+        robot = build_robot(scenario.believed)
+        for hidden in case.physics.answers:
+            # Refused if the robot has no such target, or the value cannot be.
+            hidden.make().resolve(robot.description)
+            assert hidden.size > 0
+    assert named("arm-payload") is None
 
 
 @needs_mujoco

@@ -74,7 +74,7 @@ _LOWEST_FREQUENCY = (0.1, 0.25)
 # The arm moves for this long, and from rest to rest [s].
 _ARM_DURATION, _RAMP = 10.0, 1.5
 # Of a torque that is measured or had from the motor's current [Nm].
-_BIPED_TORQUE_NOISE = {"all": 0.5}
+_LEGS_TORQUE_NOISE = {"all": 0.5}
 _WALK = (
     "duration=5.5",
     "reference.single_supports=3",
@@ -82,6 +82,7 @@ _WALK = (
     # Without friction in the joints, more damping than the paper's.
     "control.kd={all: 10}",
 )
+_TROT = ("duration=5", "estimator=!NoEstimator {}")
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Case:
 
     name: str
     group: Literal["effect", "decoy", "stranger"]
-    robot: Literal["arm", "biped"]
+    robot: Literal["arm", "biped", "quadruped"]
     physics: Physics = field(default_factory=Nothing)
     # What is known of the run: another motion of the arm, other words of the walk's scenario,
     # another noise of the torques.
@@ -239,14 +240,23 @@ def all_cases() -> tuple[list[Case], list[Case], list[Case]]:
 
 def judge(material: Material) -> dict[str, str]:
     """Runs the case of this name; see `benchmarks.store.Store`."""
+    # They are drawn from what is here.
+    from benchmarks.in_mujoco.random_cases import named
+
     name = material.values["case"]["name"]
-    (case,) = (case for group in all_cases() for case in group if case.name == name)
+    known = (case for group in all_cases() for case in group)
+    case = named(name) or next(case for case in known if case.name == name)
     return judged(case, _run(case), sources())
+
+
+def setting(case: Case) -> tuple[Scenario, Reference]:
+    """What is believed of a case's robot and sensors, and the motion that it is to follow."""
+    return {"arm": _arm, "biped": _biped, "quadruped": _quadruped}[case.robot](case)
 
 
 def _run(case: Case) -> dict[str, Any]:
     """Runs a case and diagnoses its log."""
-    scenario, reference = (_arm if case.robot == "arm" else _biped)(case)
+    scenario, reference = setting(case)
     run = Run(
         scenario,
         case.seed,
@@ -351,10 +361,20 @@ def _arm(case: Case) -> tuple[Scenario, Reference]:
 
 def _biped(case: Case) -> tuple[Scenario, Reference]:
     scenario = load_scenario("frictionless_walk", overrides=(*_WALK, *case.overrides))
-    noise = {joint: case.torque_noise * value for joint, value in _BIPED_TORQUE_NOISE.items()}
+    return _walking(scenario, case, "The paper's walk in MuJoCo.")
+
+
+def _quadruped(case: Case) -> tuple[Scenario, Reference]:
+    scenario = load_scenario("quadruped_trot", overrides=(*_TROT, *case.overrides))
+    bare = replace(scenario, robot=replace(scenario.robot, effects={}))
+    return _walking(bare, case, "A trot in MuJoCo.")
+
+
+def _walking(scenario: Scenario, case: Case, title: str) -> tuple[Scenario, Reference]:
+    noise = {joint: case.torque_noise * value for joint, value in _LEGS_TORQUE_NOISE.items()}
     scenario = replace(
         scenario,
-        title="The paper's walk in MuJoCo.",
+        title=title,
         model=scenario.robot,
         recording=replace(scenario.recording, torque_noise=noise),
     )
