@@ -45,13 +45,17 @@ def is_misled(result: Result) -> bool:
 
 def is_telling(result: Result) -> bool:
     """Does a case that was drawn say anything? Not if the robot fell by what is hidden, so that
-    there is no log, nor if nothing wrong is said of what is smaller than its log can show."""
+    there is no log, nor if nothing wrong is said of what its log can hardly show: what is smaller
+    than stated, or rightly called too small to matter."""
     if "error" in result.tree:
         return "FellError" not in result.tree["error"]
     if result.group != "effect" or is_answered(result) or is_misled(result):
         return True
+    true = {hidden["effect"] for hidden in result.hidden}
+    too_small = any(f["too_small"] and f["effect"] in true for f in result.diagnosis["ranking"])
     effects = result.diagnosis["effects"].items()
-    return result.is_visible({name: of["smallest_detectable_by_target"] for name, of in effects})
+    stated = {name: of["smallest_detectable_by_target"] for name, of in effects}
+    return not too_small and result.is_visible(stated)
 
 
 def figures(everything: Sequence[Result]) -> Table:

@@ -444,6 +444,7 @@ def finding(effect: str, *confusable: str) -> dict:
         "parameters": {},
         "confusable_with": list(confusable),
         "chosen": True,
+        "too_small": False,
     }
 
 
@@ -487,6 +488,33 @@ def test_a_payload_is_to_be_called_a_payload() -> None:
 
 
 @needs_mujoco
+def test_of_what_is_drawn_only_what_its_log_can_show_counts() -> None:
+    def drawn(stated: float, *ranking: dict) -> Result:
+        case = result("effect", "nothing_missing", *ranking)
+        sizes = {"smallest_detectable_by_target": {"axis_2": stated}}
+        case.diagnosis["effects"] = {"TorqueGain": sizes}
+        case.score["first"] = False
+        case.tree["answer"] = {
+            "effects": [
+                {
+                    "effect": "TorqueGain",
+                    "targets": ["axis_2"],
+                    "size": 0.1,
+                    "parameters": {"shortfall": {"axis_2": 0.1}},
+                }
+            ]
+        }
+        return case
+
+    assert mujoco_hidden.is_telling(drawn(0.05))
+    assert not mujoco_hidden.is_telling(drawn(0.2))
+    small = finding("TorqueGain") | {"chosen": False, "too_small": True}
+    assert not mujoco_hidden.is_telling(drawn(0.05, small))
+    fell = Result({"case": {"group": "effect"}, "error": "FellError: fell at 1.2 s"})
+    assert not mujoco_hidden.is_telling(fell)
+    assert mujoco_hidden.is_telling(Result({"case": {"group": "effect"}, "error": "KeyError"}))
+
+
 def test_stranger_is_unknown() -> None:
     case = Case("x", "stranger", "arm", EncoderScale("axis_3", 1.05))
     found = {"verdict": "unknown_effect", "ranking": [], "unexplained": [{"row": "axis_3"}]}
