@@ -101,15 +101,16 @@ hidden: $(DEVELOPED)
 	$(VENV)/bin/python -m benchmarks.hidden
 	$(VENV)/bin/python -m benchmarks.mujoco_hidden
 
-# Installs again when the package's needs change.
+# Installs again when the package's needs change. Modules are compiled when they are first imported:
+# most never are.
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet --upgrade pip
-	$(VENV)/bin/pip install --quiet --editable . --constraint constraints.txt
+	$(VENV)/bin/pip install --quiet --no-compile --editable . --constraint constraints.txt
 	touch $@
 
 $(DEVELOPED): $(INSTALLED)
-	$(VENV)/bin/pip install --quiet --editable ".[dev]" --constraint constraints.txt
+	$(VENV)/bin/pip install --quiet --no-compile --editable ".[dev]" --constraint constraints.txt
 	touch $@
 
 clean:
