@@ -487,7 +487,6 @@ def test_a_payload_is_to_be_called_a_payload() -> None:
     assert first(finding("TorqueGain")) == (False, True)
 
 
-@needs_mujoco
 def test_of_what_is_drawn_only_what_its_log_can_show_counts() -> None:
     def drawn(stated: float, *ranking: dict) -> Result:
         case = result("effect", "nothing_missing", *ranking)
@@ -515,6 +514,7 @@ def test_of_what_is_drawn_only_what_its_log_can_show_counts() -> None:
     assert mujoco_hidden.is_telling(Result({"case": {"group": "effect"}, "error": "KeyError"}))
 
 
+@needs_mujoco
 def test_stranger_is_unknown() -> None:
     case = Case("x", "stranger", "arm", EncoderScale("axis_3", 1.05))
     found = {"verdict": "unknown_effect", "ranking": [], "unexplained": [{"row": "axis_3"}]}
