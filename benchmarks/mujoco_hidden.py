@@ -130,13 +130,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from benchmarks.store import Store
 
     console = Console(width=190)
+    kind = "cases" if options.random is None else "random_cases"
     if options.random is None:
         cases = [case for group in all_cases() for case in group[:: 4 if options.quick else 1]]
     else:
         cases = [random_case(options.first + k) for k in range(options.random)]
     store = Store(
-        options.out / ("cases" if options.random is None else "random"),
-        "benchmarks.in_mujoco.cases:judge",
+        options.out / kind,
+        f"benchmarks.in_mujoco.{kind}:judge",
         drawn(cases, options),
         None if options.keep else sources(),
     )

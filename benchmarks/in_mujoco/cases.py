@@ -240,13 +240,9 @@ def all_cases() -> tuple[list[Case], list[Case], list[Case]]:
 
 def judge(material: Material) -> dict[str, str]:
     """Runs the case of this name; see `benchmarks.store.Store`."""
-    # They are drawn from what is here.
-    from benchmarks.in_mujoco.random_cases import named
-
     name = material.values["case"]["name"]
-    known = (case for group in all_cases() for case in group)
-    case = named(name) or next(case for case in known if case.name == name)
-    return judged(case, _run(case), sources())
+    (case,) = (case for group in all_cases() for case in group if case.name == name)
+    return run_and_judge(case)
 
 
 def setting(case: Case) -> tuple[Scenario, Reference]:
@@ -254,8 +250,12 @@ def setting(case: Case) -> tuple[Scenario, Reference]:
     return {"arm": _arm, "biped": _biped, "quadruped": _quadruped}[case.robot](case)
 
 
+def run_and_judge(case: Case) -> dict[str, str]:
+    """Runs a case and diagnoses its log; see `benchmarks.cases.judged`."""
+    return judged(case, _run(case), sources())
+
+
 def _run(case: Case) -> dict[str, Any]:
-    """Runs a case and diagnoses its log."""
     scenario, reference = setting(case)
     run = Run(
         scenario,

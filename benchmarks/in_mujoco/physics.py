@@ -475,6 +475,17 @@ class Misalignment(ImuError):
 
 
 @dataclass(frozen=True)
+class MovedImu(ImuError):
+    """An IMU that sits elsewhere [m]."""
+
+    effect: ClassVar[str] = "ImuPosition"
+
+    @property
+    def imu_shift(self) -> tuple[float, float, float]:
+        return self.vector
+
+
+@dataclass(frozen=True)
 class FootGain(Physics):
     """The force sensors of a foot read so many times the force."""
 
@@ -536,14 +547,3 @@ def _with(values: np.ndarray, column: int, value: float) -> np.ndarray:
     result = values.copy()
     result[column] = value
     return result
-
-
-@dataclass(frozen=True)
-class MovedImu(ImuError):
-    """An IMU that sits elsewhere [m]."""
-
-    effect: ClassVar[str] = "ImuPosition"
-
-    @property
-    def imu_shift(self) -> tuple[float, float, float]:
-        return self.vector

@@ -8,7 +8,8 @@ from math import exp, log
 
 import numpy as np
 
-from benchmarks.in_mujoco.cases import Case, setting
+from benchmarks.in_mujoco.cases import Case, run_and_judge, setting
+from benchmarks.in_mujoco.loop import Run
 from benchmarks.in_mujoco.physics import (
     AccelerometerBias,
     CentreOfMass,
@@ -32,13 +33,13 @@ from benchmarks.in_mujoco.physics import (
     Ripple,
     Spring,
 )
+from fbse_drake.campaign.steps import Material
 from fbse_drake.effects.geometry import LinkLength
 from fbse_drake.effects.inertia import BodyCentreOfMass
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import build_robot
 from fbse_drake.walking.reference import Reference
 
-_PREFIX = "random"
 # So often nothing is hidden.
 _DECOYS = 0.2
 # Deviation of the torques' noise over the usual one.
@@ -47,8 +48,6 @@ _TORQUE_NOISE = (0.0, 0.0, 0.5, 1.0, 2.0)
 _SHARE = (0.02, 0.3)
 # A joint moves if the deviation of its velocity is more than this [rad/s].
 _MOVES = 0.1
-# MuJoCo's steps, of which a delay is a multiple [s].
-_STEP = 2.5e-4
 
 
 def random_case(number: int) -> Case:
@@ -56,7 +55,7 @@ def random_case(number: int) -> Case:
     random = np.random.default_rng(number)
     robot = ("arm", "biped", "quadruped")[random.integers(3)]
     decoy = Case(
-        f"{_PREFIX}-{robot}-{number}",
+        f"random-{robot}-{number}",
         "decoy",
         robot,
         motion=number,
@@ -70,10 +69,9 @@ def random_case(number: int) -> Case:
     return replace(decoy, group="effect", physics=physics)
 
 
-def named(name: str) -> Case | None:
-    """The random case of this name; None if it is none of a random case."""
-    prefix, *_, number = name.split("-")
-    return random_case(int(number)) if prefix == _PREFIX else None
+def judge(material: Material) -> dict[str, str]:
+    """Runs the case of this number; see `benchmarks.store.Store`."""
+    return run_and_judge(random_case(material.values["case"]["motion"]))
 
 
 def _steps(random: np.random.Generator) -> tuple[str, ...]:
@@ -172,7 +170,9 @@ class _Draw:
 
         def delay() -> Physics:
             value = min(self._loss() / self._rate(self._torque), 0.01)
-            return MotorDelay(self._joint, max(1, round(value / _STEP)) * _STEP)
+            # Of whole steps of MuJoCo.
+            step = Run.time_step
+            return MotorDelay(self._joint, max(1, round(value / step)) * step)
 
         def limit() -> Physics:
             quantile = self.random.uniform(0.7, 0.97)
