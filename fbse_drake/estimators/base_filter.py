@@ -19,7 +19,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.estimators.attitude import AttitudeConfig
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.bias_limits import leash_biases, remember_biases
+from fbse_drake.estimators.bias_limits import leash_biases, remember_biases, unleash_biases
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.cross_check import (
     cross_check,
@@ -68,6 +68,7 @@ from fbse_drake.estimators.spatial import (
     Vector,
     add,
     cross,
+    norm,
     put,
     quaternion,
     quaternion_from_gravity,
@@ -98,11 +99,22 @@ from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 
 _NOT_FINITE, _IMPLAUSIBLE = float(Status.NOT_FINITE), float(Status.IMPLAUSIBLE)
+# How wrong the first posterior may be: the tilt [rad]; the velocity, in rest [m/s] and for each
+# rad/s of the fastest joint [m]; and that the accelerometer shows gravity [m/s^2], [m/s].
+_START = {
+    "tilt": 0.2,
+    "velocity": 0.1,
+    "velocity_by_rate": 0.5,
+    "acceleration": 0.1,
+    "acceleration_by_rate": 5.0,
+}
 # While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2], and how
 # long that lasts [s].
 _UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
 # When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
 _LOST_AFTER = 0.25
+# When that happens again within this time [s], it is the IMU's biases.
+_LOST_AGAIN = 3.0
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
 # Below this share of its weight, the robot is not carried by its feet.
@@ -253,6 +265,7 @@ def _start(x: Record, measured: Record, model: Record, known: Record) -> None:
     x.foot_habit[:] = 1.0
     x.foot_age[:] = known.config.foot_time
     x.force_habit[:] = 1.0
+    x.lost_ago = _LOST_AGAIN
     R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
     for foot in range(feet):
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
@@ -264,14 +277,17 @@ def _start(x: Record, measured: Record, model: Record, known: Record) -> None:
     about = skew(vector(known.origin))
     add_product(P, POSITION, about, P, ATTITUDE)
     add_product(P.T, POSITION, about, P.T, ATTITUDE)
-    add_noise(P, VELOCITY, known.start.velocity**2)
+    fastest = np.abs(measured.joint_velocity).max()
+    moving = (known.start.velocity_by_rate * fastest) ** 2
+    add_noise(P, VELOCITY, known.start.velocity**2 + moving)
     add_noise(P, GYRO_BIAS, sensors.angular_velocity_bias**2 + 1e-12)
     add_noise(P, ACCELEROMETER_BIAS, sensors.acceleration_bias**2 + 1e-12)
-    # What the accelerometer reads is gravity, its bias and some motion.
     correction, spare = np.zeros(len(P)), np.zeros(3)
+    # What the accelerometer reads is gravity, its bias and some motion.
     reading = rotate(R, f)
     z = add(reading, vector(known.gravity))
-    noise = isotropic(known.start.acceleration**2 + sensors.acceleration_noise**2)
+    own = known.start.acceleration**2 + (known.start.acceleration_by_rate * fastest) ** 2
+    noise = isotropic(own + sensors.acceleration_noise**2)
     update(
         P, correction, z, ATTITUDE, skew(reading), ACCELEROMETER_BIAS, R, noise, 0.0, spare,
         spare.copy(), np.empty((2, 3)),
@@ -350,7 +366,7 @@ def _estimate_base(
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
-    all_move, resting = True, False
+    all_move, resting, least_moved = True, False, math.inf
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
@@ -359,6 +375,7 @@ def _estimate_base(
             share = max(load, 1.0) / weight
             moves = listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
             all_move, resting = all_move and moves, True
+            least_moved = min(least_moved, norm(vector(x.foot_agreement[foot, FOOT_VELOCITY])))
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
         in_foot = (mean_wrench[foot, 3], mean_wrench[foot, 4], mean_wrench[foot, 5])
@@ -404,9 +421,13 @@ def _estimate_base(
     correct(x, correction)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
+    if not first:
+        x.lost_ago += elapsed
+    x.lost_by = least_moved if resting and all_move else 0.0
     # Nor is it they if the IMU is found to be wrong meanwhile: it was so before.
     if x.lost_for > _LOST_AFTER or (x.lost_for > 0.0 and trust[1] == _IMPLAUSIBLE):
-        _start_over(x, model, known)
+        by_biases = x.lost_for > _LOST_AFTER and x.lost_ago < _LOST_AGAIN
+        _start_over(x, by_biases, model, known)
     leash_biases(x, first, elapsed, known.config)
     is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
     is_doubtful = is_doubtful or contradiction > 0.0 or x.lost_for > 0.0
@@ -415,8 +436,9 @@ def _estimate_base(
 
 
 @njit(cache=True)
-def _start_over(x: Record, model: Record, known: Record) -> None:
-    """Attitude, velocity and place are no better known than at the start; biases are.
+def _start_over(x: Record, by_biases: bool, model: Record, known: Record) -> None:
+    """Attitude, velocity and place are no better known than at the start, nor are the IMU's biases
+    if it is by them.
 
     All feet that stand are put down anew.
     """
@@ -427,7 +449,11 @@ def _start_over(x: Record, model: Record, known: Record) -> None:
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
             land(x, P, spare, foot, model, known)
-    x.lost_for = 0.0
+    if by_biases:
+        add_noise(P, GYRO_BIAS, known.sensors.angular_velocity_bias**2)
+        add_noise(P, ACCELEROMETER_BIAS, known.sensors.acceleration_bias**2)
+        unleash_biases(x)
+    x.lost_for, x.lost_ago = 0.0, 0.0
 
 
 @njit(cache=True)
@@ -470,7 +496,8 @@ def _conclude(
         x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[GYRO_BIAS + i, GYRO_BIAS + i]))
         at = ACCELEROMETER_BIAS + i
         x.acceleration_bias_std[i] = math.sqrt(max(0.0, P[at, at]))
-        x.velocity_std[i] = moved_std(P, VELOCITY, i, velocity)
+        # Whether it is the feet that move or the robot nobody knows yet.
+        x.velocity_std[i] = math.hypot(moved_std(P, VELOCITY, i, velocity), x.lost_by)
         x.position_std[i] = moved_std(P, POSITION, i, position)
 
 
@@ -536,8 +563,9 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        before that low-pass was undone [N]
         kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
                                base axes, and the newer's age [s]
-        lost_for               ()      for how long all feet that stand have contradicted the
-                                       velocity [s]
+        lost_for, lost_by      (), ()  for how long all feet that stand have contradicted the
+                                       velocity [s], and by how much [m/s]
+        lost_ago               ()      for how long they have not made the filter start over [s]
         leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
                                and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
@@ -571,7 +599,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             force_variance=required(sensors.force_noise, "force_noise") ** 2 * len(pads.foot),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
             gravity=plant.gravity_field().gravity_vector(),
-            start=record(tilt=0.2, velocity=0.1, acceleration=0.05),
+            start=record(**_START),
             origin=np.array([*origin, 0.0]),
             period=clock.period,
         )
@@ -650,6 +678,8 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         leash=(2, 4, 3),
         leashed_for=(),
         lost_for=(),
+        lost_by=(),
+        lost_ago=(),
         check=cross_check_type(feet),
         force_delay=force_delay_type(clock),
         force_lag=force_lag_type(clock),

@@ -45,6 +45,16 @@ def leash_biases(x: Record, first: bool, elapsed: float, config: Record) -> None
 
 
 @njit(cache=True)
+def unleash_biases(x: Record) -> None:
+    """Of the IMU's biases nothing is known any more but by their covariance."""
+    P, leash = x.error_covariance, x.leash
+    for i in range(3):
+        for known in range(2):
+            leash[known, 2, i] = P[GYRO_BIAS + i, GYRO_BIAS + i]
+            leash[known, 3, i] = P[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i]
+
+
+@njit(cache=True)
 def _set_bias(x: Record, sensor: int, axis: int, value: float) -> None:
     """Sets a bias of the gyro (0) or the accelerometer (1), and moves with it what is known by it.
 

@@ -9,7 +9,7 @@ from fbse_drake.estimators.records import record_type
 from fbse_drake.estimators.spatial import (
     Vector,
     add,
-    dot,
+    norm,
     put,
     rotate,
     rotation,
@@ -60,11 +60,6 @@ def _clipped(a: Vector, limit: float) -> Vector:
         min(max(a[1], -limit), limit),
         min(max(a[2], -limit), limit),
     )
-
-
-@njit(cache=True)
-def _norm(a: Vector) -> float:
-    return math.sqrt(dot(a, a))
 
 
 @njit(cache=True)
@@ -122,8 +117,8 @@ def cross_check(
                 x.load[span, foot, i] += gain * (reading - x.load[span, foot, i])
     for i in range(3):
         x.rolling[i] += brief * (min(max(rolling[i], -10.0), 10.0) - x.rolling[i])
-    turned = _norm(subtract(rate, vector(x.last_rate)))
-    rolled = _norm(subtract(rolling, vector(x.last_rolling)))
+    turned = norm(subtract(rate, vector(x.last_rate)))
+    rolled = norm(subtract(rolling, vector(x.last_rolling)))
     if rests and x.was_firm > 0 and min(turned, rolled) > _RATE_STEP and x.stepped == 0:
         x.doubt[:], x.doubt[0], x.stepped = 0.0, 1.0, elapsed
     elif x.stepped > 0:
@@ -132,9 +127,9 @@ def cross_check(
     put(x.last_rate, rate)
     put(x.last_rolling, rolling)
     z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
-    excess = _norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
+    excess = norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
     is_late = 0.0 < x.stepped < _PATIENCE
-    turns = _norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
+    turns = norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
     turns = turns or (is_late and not rests)
     if x.age < _LONG:
         return
@@ -169,7 +164,7 @@ def force_contradiction(x: np.ndarray, largest: Vector) -> float:
     z = subtract(z, vector(x.habit))
     for i in range(3):
         if abs(z[i]) > largest[i]:
-            return _norm(z)
+            return norm(z)
     return 0.0
 
 
@@ -178,13 +173,13 @@ def _blame(x: np.ndarray, turns: bool) -> None:
     """Sets who is doubted: the IMU, or the feet whose forces changed most."""
     change = np.zeros(4)
     for k in range(3):
-        change[k] = _norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
+        change[k] = norm(subtract(vector(x.mean[0, k]), vector(x.mean[1, k])))
     if turns or change[0] + change[1] > change[2]:
         x.doubt[0] = 1.0
         return
     feet, largest = len(x.doubt) - 1, 0.0
     for foot in range(feet):
-        moved = _norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
+        moved = norm(subtract(vector(x.load[0, foot]), vector(x.load[1, foot])))
         x.doubt[1 + foot] = moved
         largest = max(largest, moved)
     for foot in range(feet):

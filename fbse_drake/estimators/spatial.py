@@ -117,6 +117,12 @@ def rotation_vector_to_quaternion(r: Vector) -> Quaternion:
 
 
 @njit(cache=True)
+def norm(a: Vector) -> float:
+    """Length of a vector."""
+    return math.sqrt(dot(a, a))
+
+
+@njit(cache=True)
 def normalized(q: Quaternion) -> Quaternion:
     """The norm correction: the quaternion of unit length in q's direction."""
     factor = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])

@@ -28,6 +28,7 @@ from fbse_drake.estimators.spatial import (
     cross,
     dot,
     matrix_product,
+    norm,
     put,
     quaternion,
     quaternion_of,
@@ -58,6 +59,9 @@ _RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = (0.1, 0.1, 0.03, 0.03), 1e-4
 _MOST_TOLD, _LARGEST_SURPRISE = 0.05, 100.0
 # For how long feet must have erred less than believed to be trusted more [s].
 _HABIT_TIME = 0.4
+# Beyond so many times the variance believed of a standing foot's velocity it is not usual, and the
+# robot's velocity is wrong.
+_LARGEST_HABIT = 36.0
 # A foot that carries less than this share of the weight moves more easily the less it carries.
 _FIRM_LOAD = 0.5
 
@@ -78,7 +82,7 @@ def unrest(v: Vector) -> float:
     Args:
         v: velocity of the IMU [m/s].
     """
-    return min(1.0, max(_AT_REST, math.sqrt(dot(v, v)) / _WALKING_SPEED))
+    return min(1.0, max(_AT_REST, norm(v) / _WALKING_SPEED))
 
 
 @njit(cache=True)
@@ -209,7 +213,7 @@ def listen_to_foot(
         agreement[FOOT_VELOCITY], innovation[FOOT_VELOCITY], explained,
     )  # fmt: skip
     _learn_motion(x, foot, FOOT_VELOCITY, own, sensed, explained, elapsed)
-    possible = max(1.0, x.foot_habit[foot, FOOT_VELOCITY].mean()) * own
+    possible = min(max(1.0, x.foot_habit[foot, FOOT_VELOCITY].mean()), _LARGEST_HABIT) * own
     for i in range(3):
         possible += P[VELOCITY + i, VELOCITY + i] / 3.0
     mean = vector(agreement[FOOT_VELOCITY])
