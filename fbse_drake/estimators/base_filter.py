@@ -113,8 +113,9 @@ _START = {
 _UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
 # When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
 _LOST_AFTER = 0.25
-# When that happens again within this time [s], it is the IMU's biases.
-_LOST_AGAIN = 3.0
+# When that happens again within this time [s], and still after this time [s], it is the IMU's
+# biases: a fault that lasts for a second is over by then.
+_LOST_AGAIN, _LOST_LONG = 3.0, 0.75
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
 # Below this share of its weight, the robot is not carried by its feet.
@@ -265,7 +266,7 @@ def _start(x: Record, measured: Record, model: Record, known: Record) -> None:
     x.foot_habit[:] = 1.0
     x.foot_age[:] = known.config.foot_time
     x.force_habit[:] = 1.0
-    x.lost_ago = _LOST_AGAIN
+    x.lost_ago = 2.0 * _LOST_AGAIN
     R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
     for foot in range(feet):
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
@@ -423,11 +424,11 @@ def _estimate_base(
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
     if not first:
         x.lost_ago += elapsed
+        x.lost_since += elapsed
     x.lost_by = least_moved if resting and all_move else 0.0
     # Nor is it they if the IMU is found to be wrong meanwhile: it was so before.
     if x.lost_for > _LOST_AFTER or (x.lost_for > 0.0 and trust[1] == _IMPLAUSIBLE):
-        by_biases = x.lost_for > _LOST_AFTER and x.lost_ago < _LOST_AGAIN
-        _start_over(x, by_biases, model, known)
+        _start_over(x, model, known)
     leash_biases(x, first, elapsed, known.config)
     is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
     is_doubtful = is_doubtful or contradiction > 0.0 or x.lost_for > 0.0
@@ -436,9 +437,9 @@ def _estimate_base(
 
 
 @njit(cache=True)
-def _start_over(x: Record, by_biases: bool, model: Record, known: Record) -> None:
+def _start_over(x: Record, model: Record, known: Record) -> None:
     """Attitude, velocity and place are no better known than at the start, nor are the IMU's biases
-    if it is by them.
+    if that goes on happening.
 
     All feet that stand are put down anew.
     """
@@ -449,7 +450,9 @@ def _start_over(x: Record, by_biases: bool, model: Record, known: Record) -> Non
     for foot in range(len(x.foot_standing)):
         if x.foot_standing[foot] > 0:
             land(x, P, spare, foot, model, known)
-    if by_biases:
+    if x.lost_ago > _LOST_AGAIN:
+        x.lost_since = 0.0
+    if x.lost_since > _LOST_LONG:
         add_noise(P, GYRO_BIAS, known.sensors.angular_velocity_bias**2)
         add_noise(P, ACCELEROMETER_BIAS, known.sensors.acceleration_bias**2)
         unleash_biases(x)
@@ -565,7 +568,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                base axes, and the newer's age [s]
         lost_for, lost_by      (), ()  for how long all feet that stand have contradicted the
                                        velocity [s], and by how much [m/s]
-        lost_ago               ()      for how long they have not made the filter start over [s]
+        lost_since, lost_ago   (), ()  how long ago that made the filter start over, for the first
+                                       and for the last time of late [s]
         leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
                                and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
@@ -679,6 +683,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         leashed_for=(),
         lost_for=(),
         lost_by=(),
+        lost_since=(),
         lost_ago=(),
         check=cross_check_type(feet),
         force_delay=force_delay_type(clock),
