@@ -1,10 +1,34 @@
 """Kinematics and inverse dynamics of a plant at many instants, by Drake."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
+
+
+@dataclass(frozen=True)
+class KinematicPath:
+    """Places in a plant's positions and velocities of the joints between a frame and the world."""
+
+    positions: np.ndarray
+    velocities: np.ndarray
+
+
+def path(plant: MultibodyPlant, frame: Frame) -> KinematicPath:
+    """Of a frame of a finalized plant; its motion in the world depends on nothing else."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    inboard = {joint.child_body().index(): joint for joint in joints}
+    positions: list[int] = []
+    velocities: list[int] = []
+    body = frame.body()
+    while body.index() in inboard:
+        joint = inboard[body.index()]
+        positions += range(joint.position_start(), joint.position_start() + joint.num_positions())
+        velocities += range(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        body = joint.parent_body()
+    return KinematicPath(np.array(positions, dtype=int), np.array(velocities, dtype=int))
 
 
 class PlantDynamics:

@@ -43,7 +43,7 @@ from fbse_drake.held_readings import (
     unseen_variance,
 )
 from fbse_drake.log import Log
-from fbse_drake.robot.dynamics import PlantDynamics
+from fbse_drake.robot.dynamics import PlantDynamics, path
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
@@ -377,15 +377,44 @@ class Unseen:
 
 
 class _LastResults:
-    """The last results of a function of arrays. The function itself is not held, so that it may be
-    a method of what holds this."""
+    """The last results of a calculation, by the arrays that they depend on."""
 
     def __init__(self) -> None:
         self._results: Memory[np.ndarray] = Memory(_REMEMBERED)
 
-    def of(self, function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
-        key = tuple(array.tobytes() for array in arrays)
-        return self._results.or_made(key, lambda: function(*arrays))
+    def of(self, *arrays: np.ndarray, made: Callable[[], np.ndarray]) -> np.ndarray:
+        return self._results.or_made(tuple(array.tobytes() for array in arrays), made)
+
+
+class _Sole:
+    """How a sole moves with the plant.
+
+    An effect that is tried changes some signals. What a sole's motion does not depend on, as on
+    those of another leg, does not make it computed again.
+    """
+
+    def __init__(self, robot: Robot, dynamics: PlantDynamics, side: str, order: np.ndarray):
+        """Takes the place of the wanted velocities in the plant's."""
+        self._frame, self._dynamics, self._order = robot.sole(side), dynamics, order
+        self._path = path(robot.plant, self._frame)
+        self._jacobians, self._bias_accelerations = _LastResults(), _LastResults()
+
+    def jacobian(self, positions: np.ndarray) -> np.ndarray:
+        """Of the sole's spatial velocity, in its frame, (M, 6, v)."""
+        return self._jacobians.of(
+            positions[:, self._path.positions],
+            made=lambda: self._dynamics.jacobians([self._frame], positions)[0][..., self._order],
+        )
+
+    def bias_acceleration(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+        """Of the sole's translational acceleration, in its frame, (M, 3)."""
+        return self._bias_accelerations.of(
+            positions[:, self._path.positions],
+            velocities[:, self._path.velocities],
+            made=lambda: self._dynamics.bias_accelerations(
+                [self._frame], np.hstack([positions, velocities])
+            )[0][:, 3:],
+        )
 
 
 class EquationOfMotion:
@@ -412,16 +441,12 @@ class EquationOfMotion:
         self._upright = robot.base_pose_positions(RigidTransform())
         self._joints = slice(len(self._order) - n, None)
         self._soles = (
-            [robot.sole(side) for side in robot.description.sides]
+            [_Sole(robot, self.dynamics, side, self._order) for side in robot.description.sides]
             if robot.has_floating_base
             else []
         )
         self._pairs = foot_pairs(robot) if robot.has_floating_base else []
-        # An effect that is tried changes some signals; what depends on the others is not computed
-        # again.
         self._inverse_dynamics = _LastResults()
-        self._jacobians = _LastResults()
-        self._bias_accelerations = _LastResults()
 
     def sole_rotations(self, joint_position: np.ndarray) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each, in postures (M, n)."""
@@ -473,19 +498,22 @@ class EquationOfMotion:
             ]
             return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
-        generalized = self._inverse_dynamics.of(self._calc_inverse_dynamics, states, accelerations)
-        rates, kinematic_rows = states[:, self.robot.plant.num_positions() + self._order], []
+        generalized = self._inverse_dynamics.of(
+            states, accelerations, made=lambda: self._calc_inverse_dynamics(states, accelerations)
+        )
+        positions, velocities = np.split(states, [self.robot.plant.num_positions()], axis=1)
+        rates, kinematic_rows = velocities[:, self._order], []
         if self.robot.has_floating_base:
-            J = self._jacobians.of(
-                self._calc_jacobians, states[:, : self.robot.plant.num_positions()]
-            )
+            J = self._jacobians(positions)
             for foot, wrench in enumerate(self.wrenches(at.pad_force)):
                 generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
             if kinematic:
                 velocity = np.einsum("fmij,mj->fmi", J, rates)
                 specific_force = np.einsum(
                     "fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]
-                ) + self._bias_accelerations.of(self._calc_bias_accelerations, states)
+                )
+                for foot, sole in enumerate(self._soles):
+                    specific_force[foot] += sole.bias_acceleration(positions, velocities)
                 specific_force[:, :, 2] -= self.gravity
                 kinematic_rows = [
                     rows[foot]
@@ -510,23 +538,18 @@ class EquationOfMotion:
             (feet, M, 6, joints) [rad/s, m/s].
         """
         states, _ = self.plant_motion(at)
-        positions = self.robot.plant.num_positions()
-        rates = states[:, positions + self._order[self._joints]]
-        J = self._jacobians.of(self._calc_jacobians, states[:, :positions])
-        return J[..., self._joints] * rates[:, None]
+        positions, velocities = np.split(states, [self.robot.plant.num_positions()], axis=1)
+        rates = velocities[:, self._order[self._joints]]
+        return self._jacobians(positions)[..., self._joints] * rates[:, None]
 
     def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Generalized forces without those of the feet, (M, v), in our order."""
         fixed = not self.robot.has_floating_base
         return self.dynamics.inverse_dynamics(states, accelerations, forces=fixed)[:, self._order]
 
-    def _calc_jacobians(self, positions: np.ndarray) -> np.ndarray:
+    def _jacobians(self, positions: np.ndarray) -> np.ndarray:
         """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
-        return self.dynamics.jacobians(self._soles, positions)[..., self._order]
-
-    def _calc_bias_accelerations(self, states: np.ndarray) -> np.ndarray:
-        """Bias of the translational acceleration of each sole, in its frame, (feet, M, 3)."""
-        return self.dynamics.bias_accelerations(self._soles, states)[..., 3:]
+        return np.stack([sole.jacobian(positions) for sole in self._soles])
 
     @property
     def row_velocities(self) -> np.ndarray:
@@ -604,7 +627,7 @@ class EquationOfMotion:
             return
         place, relative = v, []
         for J, deviation, unseen_wrench in zip(
-            self._calc_jacobians(positions),
+            self._jacobians(positions),
             wrench_deviations(sensors.foot_force, robot),
             unseen.wrenches,
             strict=True,
