@@ -246,6 +246,18 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
     assert all(finding.targets == (joint,) for finding in found[2.0])
 
 
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_what_was_found_would_have_been_seen_from_the_size_on_that_nothing_hides(
+    hidden: str,
+) -> None:
+    """Where it was found too, though beside itself nothing of it is left to be seen."""
+    name, target, _ = HIDDEN[hidden]
+    alone, found = (
+        diagnosis_of(there).effects[name].smallest_detectable[target] for there in ("", hidden)
+    )
+    assert found == pytest.approx(alone, rel=0.2)
+
+
 def test_a_standing_robot_shows_no_friction() -> None:
     """Too little excitation reads `not_visible`, never `absent`, with the experiment that would
     show it."""

@@ -17,7 +17,7 @@ from fbse_drake.robot.plant import PointMass, Robot
 
 # The model's masses and centres of mass are suspected in bodies heavier than this share of the
 # robot.
-_LIGHT_BODY = 0.03
+_LIGHT_BODY = 0.01
 # Share of an inertia that may be lost in rounding.
 _ROUNDING = 1e-9
 

@@ -2,6 +2,7 @@
 effects are told apart."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,11 +18,17 @@ _HOPELESS = 1e3
 
 def smallest_detectable(fits: Fits, base: Explanation, effect: type[Effect]) -> dict[str, float]:
     """Size of an effect's first parameter that would have been found beside an explanation, by
-    target; infinite where none would.
+    target; infinite where none would. Where the explanation has the effect itself: beside the rest
+    of it.
 
     The size at which the effect's sum of squares reaches what its parameters must bring and cost.
     """
     sizes = _sizes_that_reach(fits, base, effect)
+    for found in (c for c in base.candidates if c.effect is effect):
+        others = fits.explain([c for c in base.candidates if c is not found])
+        # The noise is what the whole leaves.
+        beside_others = _sizes_that_reach(fits, replace(others, sse=base.sse), effect)
+        sizes |= {target: beside_others[target] for target in found.targets}
     return {
         target: size
         if size < _HOPELESS * fits.dictionary.largest_plausible(effect, target)
