@@ -549,7 +549,10 @@ class EquationOfMotion:
 
     def _jacobians(self, positions: np.ndarray) -> np.ndarray:
         """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
-        return np.stack([sole.jacobian(positions) for sole in self._soles])
+        result = np.empty((len(self._soles), len(positions), 6, len(self._order)))
+        for foot, sole in enumerate(self._soles):
+            result[foot] = sole.jacobian(positions)
+        return result
 
     @property
     def row_velocities(self) -> np.ndarray:
