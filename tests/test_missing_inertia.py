@@ -49,27 +49,6 @@ def test_rotors_that_the_model_lacks_are_found_and_their_torque_is_no_friction(
     assert coverage(log) > 0.98
 
 
-@pytest.mark.parametrize(
-    ("start", "delay", "largest"), [(0.02, 0.0, 0.1), (0.3, 0.0, 0.1), (0.0, 0.008, 0.15)]
-)
-def test_rotors_are_found_without_the_first_jerk_of_the_walk(
-    run: Run, start: float, delay: float, largest: float
-):
-    """Which does not show to an estimator that is switched on later, or whose foot forces are late.
-    What a light foot's model foresees is wrong then, and passed for noise of the encoders."""
-    rotors = "robot.effects.rotors=!ReflectedInertia {inertia: {all: 0.05}}"
-    log = run(*WALK, rotors, f"sensors.foot_force.delay={delay}")
-    log = log.part(slice(int(np.searchsorted(log.time, start)), None))
-    walk = scenario(*WALK)
-    other = estimated(log, walk, walk.estimator)
-    of_legs, late = columns(log), log.time >= 1.8
-    found = other["estimate/joint/missing_inertia"][-1, of_legs]
-    np.testing.assert_allclose(found, 0.05, atol=0.01)
-    error = rms(friction_error(other)[late][:, of_legs])
-    assert error < largest * rms(log["truth/joint/friction_torque"][late][:, of_legs])
-    assert coverage(other) > 0.98
-
-
 def test_rotors_that_the_robot_lacks_are_found_too(run: Run):
     """The model's own are taken back; without any, there is nothing to take."""
     log, walk = run(*WALK), scenario(*WALK)

@@ -428,8 +428,7 @@ def test_a_wrong_torque_command_is_torque_that_is_lacking_and_no_law(
     learned = result["estimate/friction/parameters"][rows.stop] - parameters
     assert np.all(np.abs(learned) < 3 * np.sqrt(deviation) + 0.05)
     as_before = np.abs(moved) < 3 * std[1]
-    # Measured: 0.988 and more.
-    assert np.mean(as_before[rows.stop + 50 :]) > 0.985
+    assert np.mean(as_before[rows.stop + 50 :]) > 0.99
     assert np.all(as_before[rows.stop + 450 :])
 
 

@@ -492,10 +492,7 @@ class WholeBodyFilter(RecursiveEstimator):
                                          least 1
         pushed                   (r,)    commands, feet and all that is not friction [Nm]
         noise                    (r,)    by how much the variance of gyro and encoders is larger
-                                         than believed, at least 1; of
-        step_noise, bend_noise   (r,)    by their steps less those that the model foresees, and by
-                                         how their steps differ
-        reading_step             (r,)    what was read less what was a tick ago [rad/s]
+                                         than believed, at least 1
         foot_noise               (feet,) the same of standing feet's turning
         force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
         pad_mean                 (P, 3)  force on each pad, mean of late [N]
@@ -539,7 +536,6 @@ class WholeBodyFilter(RecursiveEstimator):
         feet = len(legs)
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
-        per_row += ["step_noise", "bend_noise", "reading_step"]
         per_row += ["reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
         per_joint += ["doubt", "rested", "law_velocity", "friction_there", "slope", "steepest"]
@@ -655,7 +651,7 @@ class WholeBodyFilter(RecursiveEstimator):
         n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"] = start["weights"]
-        start["noise"] = start["step_noise"] = start["bend_noise"] = start["foot_noise"] = 1.0
+        start["noise"] = start["foot_noise"] = 1.0
         start["surprise"] = start["agreement"] = start["acceleration_noise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)

@@ -20,8 +20,6 @@ NOTICED = 3.0
 # A foot that carries less than the first of these shares of the load does not stand, and below the
 # second it moves more easily the less it carries.
 _LEAST_LOAD, _FIRM_LOAD = 0.05, 0.5
-# The inertia that a model lacks is known when it is so many times surer than at the start.
-_INERTIA_KNOWN = 3.0
 
 
 @njit(cache=True)
@@ -65,17 +63,6 @@ def is_contradicted(x: Record, row: int) -> bool:
 
 
 @njit(cache=True)
-def is_inertia_known(x: Record, joint: int, known: Record) -> bool:
-    """Is the inertia that a model lacks in a joint known much better than at the start?
-
-    It is the last weight of the joint.
-    """
-    n, m = x.weights.shape
-    at = len(x.covariance) + m * (joint - n) + m - 1
-    return x.covariance[at, at] <= known.weight_variance[m - 1] / _INERTIA_KNOWN**2
-
-
-@njit(cache=True)
 def judge(
     x: Record, last: Record, missed: np.ndarray, elapsed: float, known: Record
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,19 +83,10 @@ def judge(
     # The standard deviation of an exponential mean of white squares is the root.
     beyond_chance = GATE * math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep))
     for i in range(r):
-        # How noisy a sensor is shows in its steps, whatever the model is wrong by; but not while it
-        # may lack most of a joint's inertia, when it shows in how these steps differ.
-        x.reading_step[i] = x.reading[i] - last.reading[i]
-        step = x.reading_step[i] - (x.velocity[i] - last.velocity[i])
-        believed = 2.0 * last.step_noise[i] * known.variance[i] + missed[i]
-        share = step * step / believed
-        x.step_noise[i] = learned_noise(last.step_noise[i], share, LOG_OF_ONE, elapsed)
-        bend = x.reading_step[i] - last.reading_step[i]
-        share = bend * bend / (6.0 * last.bend_noise[i] * known.variance[i])
-        x.bend_noise[i] = learned_noise(last.bend_noise[i], share, LOG_OF_ONE, elapsed)
-        x.noise[i] = x.step_noise[i]
-        if i >= 3 and not is_inertia_known(x, i - 3, known):
-            x.noise[i] = min(x.step_noise[i], x.bend_noise[i])
+        # How noisy a sensor is shows in its steps, whatever the model is wrong by.
+        step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
+        believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
+        x.noise[i] = learned_noise(last.noise[i], step * step / believed, LOG_OF_ONE, elapsed)
         S = P[i, i] + x.noise[i] * known.variance[i]
         share = innovation[i] ** 2 / S
         # The velocity is elsewhere, and nobody knows why.
