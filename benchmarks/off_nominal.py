@@ -161,12 +161,12 @@ def run(case: Case, seed: int, duration: float, alone: bool) -> Walked:
     common = [f"seed={seed}", f"duration={duration}", *case.told]
     nobody = ["estimator=!NoEstimator {}"]
     result = simulate(load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold]))
+    if result.failure is not None:
+        return Walked(case.name, result.failure, {})
     believed = load_scenario(case.scenario, overrides=common)
     # The same model of the friction, by the other filter.
     told = [text.replace("!WholeBody", "!ModelAided") for text in common]
     other = load_scenario(case.scenario, overrides=["estimator.friction=!ModelAided {}", *told])
-    if result.failure is not None:
-        return Walked(case.name, result.failure, {})
     figures = {
         (method, variant): Figures.of(estimate(replace(believed, estimator=config), result.log).log)
         for method, variant, config in watchers(believed.estimator, other.estimator, alone)

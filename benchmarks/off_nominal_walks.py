@@ -149,7 +149,7 @@ def _disturbances(random: np.random.Generator, is_paper: bool) -> Iterator[str]:
     yield f"sensors.imu.acceleration_bias={vector(0.2)}"
     yield f"sensors.imu.angular_velocity_bias={vector(0.03)}"
     yield f"sensors.imu.misalignment={vector(0.01)}"
-    yield effect("ImuPosition", **dict(zip("xyz", vector(0.02)[1:-1].split(", "), strict=True)))
+    yield effect("ImuPosition", **{axis: f"{random.uniform(-0.02, 0.02):.4f}" for axis in "xyz"})
     yield f"sensors.imu.acceleration_noise={between(0.01, 0.2):.3f}"
     yield f"sensors.encoders.velocity_noise={between(1e-4, 5e-3):.5f}"
     yield effect("EncoderOffset", offset=one("left_knee_pitch", "right_hip_roll", size=0.005))

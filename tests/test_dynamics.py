@@ -7,10 +7,10 @@ from fbse_drake.robot.dynamics import PlantDynamics, path
 from fbse_drake.robot.plant import make_robot
 
 
-@pytest.mark.parametrize("robot", ["biped", "hexapod", "strider"])
-def test_nothing_but_its_path_moves_a_sole(robot: str):
+@pytest.mark.parametrize("name", ["biped", "hexapod", "strider"])
+def test_nothing_but_its_path_moves_a_sole(name: str):
     """To the last bit: what is computed for one state of its path is that of all others."""
-    robot, _ = make_robot(robot)
+    robot, _ = make_robot(name)
     plant, dynamics, random = robot.plant, PlantDynamics(robot.plant), np.random.default_rng(1)
     q = plant.GetPositions(plant.CreateDefaultContext())
     state = np.concatenate([q, random.normal(size=plant.num_velocities())])

@@ -19,15 +19,13 @@ class KinematicPath:
 def path(plant: MultibodyPlant, frame: Frame) -> KinematicPath:
     """Of a frame of a finalized plant; its motion in the world depends on nothing else."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    inboard = {joint.child_body().index(): joint for joint in joints}
     positions: list[int] = []
     velocities: list[int] = []
-    body = frame.body()
-    while body.index() in inboard:
-        joint = inboard[body.index()]
-        positions += range(joint.position_start(), joint.position_start() + joint.num_positions())
-        velocities += range(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
-        body = joint.parent_body()
+    for joint in (joint for joint in joints if joint.num_velocities()):
+        if frame.body().index() in plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
+            q, v = joint.position_start(), joint.velocity_start()
+            positions += range(q, q + joint.num_positions())
+            velocities += range(v, v + joint.num_velocities())
     return KinematicPath(np.array(positions, dtype=int), np.array(velocities, dtype=int))
 
 
