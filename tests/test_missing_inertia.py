@@ -64,15 +64,38 @@ def test_rotors_that_the_robot_lacks_are_found_too(run: Run):
         assert error < 0.1 * rms(log["truth/joint/friction_torque"][late][:, of_legs])
 
 
+@pytest.mark.parametrize("cut", [20, 300])
+def test_rotors_are_found_without_the_first_jerk_of_the_walk(run: Run, cut: int):
+    """Of light feet the model foresees far more motion than there is, which seems noise of the
+    encoders, beyond which nothing accelerates."""
+    effect = "robot.effects.rotors=!ReflectedInertia {inertia: {all: 0.05}}"
+    steps = ("reference.single_support=0.5", "reference.double_support=0.3")
+    walk = ("paper_walk_fbse", "duration=2.8", *steps)
+    log = run(*walk, effect).part(slice(cut, None))
+    result = estimated(log, scenario(*walk), scenario(*walk).estimator)
+    late = result.time >= 2.0
+    error = friction_error(result)[late]
+    std = result["estimate/joint/missing_inertia_std"][-1]
+    missing = result["estimate/joint/missing_inertia"][-1] - 0.05
+    assert np.all(np.abs(missing) < 3 * std + 0.01)
+    assert rms(error) < 0.05
+
+
 def test_noise_of_a_velocity_is_no_acceleration():
     """Only what is beyond three standard deviations of the change counts."""
     n, sigma, T = 2, 5e-4, 1e-3
     known = record(variance=np.full(3 + n, sigma**2))
-    x = record(velocity=np.zeros(3 + n), noise=np.ones(3 + n), regressor=np.ones((n, 3)))
+    noise = {name: np.ones(3 + n) for name in ("noise", "bend_noise")}
+    x = record(velocity=np.zeros(3 + n), **noise, regressor=np.ones((n, 3)))
     tick = record(velocity=np.sqrt(2.0) * sigma * np.array([2.9, -3.1]), duration=T)
     put_acceleration(x[()], tick[()], known[()])
     np.testing.assert_allclose(x["regressor"][:, -1], [0.0, tick["velocity"][1] / T])
     np.testing.assert_array_equal(x["regressor"][:, :-1], 1.0)
+    # Noise that only a model sees is the model's error, if it is far beyond that of the readings.
+    for noisier, accelerates in ((24.0, False), (26.0, True)):
+        x["noise"] = noisier
+        put_acceleration(x[()], tick[()], known[()])
+        assert (x["regressor"][1, -1] != 0.0) == accelerates
 
 
 def test_a_model_lacks_no_less_than_minus_its_own_rotors():

@@ -492,7 +492,9 @@ class WholeBodyFilter(RecursiveEstimator):
                                          least 1
         pushed                   (r,)    commands, feet and all that is not friction [Nm]
         noise                    (r,)    by how much the variance of gyro and encoders is larger
-                                         than believed, at least 1
+                                         than believed, at least 1, by steps that the model foresees
+        bend_noise, reading_step (r,)    the same by second differences of the readings, which need
+                                         no model; and their first differences [rad/s]
         foot_noise               (feet,) the same of standing feet's turning
         force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
         pad_mean                 (P, 3)  force on each pad, mean of late [N]
@@ -536,7 +538,7 @@ class WholeBodyFilter(RecursiveEstimator):
         feet = len(legs)
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
-        per_row += ["reading", "pushed", "agreement", "contradiction"]
+        per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
         per_joint += ["doubt", "rested", "law_velocity", "friction_there", "slope", "steepest"]
         per_joint += ["missing_inertia", "missing_inertia_std"]
@@ -651,7 +653,7 @@ class WholeBodyFilter(RecursiveEstimator):
         n = len(start["weights"])
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"] = start["weights"]
-        start["noise"] = start["foot_noise"] = 1.0
+        start["noise"] = start["bend_noise"] = start["foot_noise"] = 1.0
         start["surprise"] = start["agreement"] = start["acceleration_noise"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)

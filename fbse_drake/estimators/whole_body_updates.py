@@ -87,6 +87,11 @@ def judge(
         step = x.reading[i] - last.reading[i] - (x.velocity[i] - last.velocity[i])
         believed = 2.0 * last.noise[i] * known.variance[i] + missed[i]
         x.noise[i] = learned_noise(last.noise[i], step * step / believed, LOG_OF_ONE, elapsed)
+        # Unless steps are foreseen wrong: noise is in the second differences of readings as well.
+        x.reading_step[i] = x.reading[i] - last.reading[i]
+        bend = x.reading_step[i] - last.reading_step[i]
+        share = bend * bend / (6.0 * last.bend_noise[i] * known.variance[i])
+        x.bend_noise[i] = learned_noise(last.bend_noise[i], share, LOG_OF_ONE, elapsed)
         S = P[i, i] + x.noise[i] * known.variance[i]
         share = innovation[i] ** 2 / S
         # The velocity is elsewhere, and nobody knows why.
