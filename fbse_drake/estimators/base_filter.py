@@ -41,6 +41,7 @@ from fbse_drake.estimators.force_lag import (
     undo_lag,
     watch_force_lag,
 )
+from fbse_drake.estimators.imu_noise import imu_noise_type, watch_noise
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.invariant_error import (
     ACCELEROMETER_BIAS,
@@ -90,6 +91,7 @@ from fbse_drake.estimators.standing_foot import (
     FOOT_RATE,
     FOOT_VELOCITY,
     TOLD,
+    centre_of_pressure,
     land,
     listen_to_foot,
     trusted,
@@ -309,7 +311,8 @@ def _estimate_base(
 
     Args:
         known: record with the numbers of `InvariantFilter` and `SensorBeliefs`, `mount`, see
-            `ImuMount`, `pads`, see `FootPads`, `is_flat` (feet,), 1 of a foot that is no point,
+            `ImuMount`, `pads`, see `FootPads`, `soles` (feet, 2, 2), least and largest x and y of
+            their pads [m], `is_flat` (feet,), 1 of a foot that is no point,
             `mass` [kg], `gravity` (3,) [m/s^2], `start`, how sure the first posterior is, `origin`,
             where the middle of the soles is at the start (3,) [m], and the `period` of ticks [s].
     """
@@ -329,6 +332,11 @@ def _estimate_base(
     R_BI, p_BI = rotation(known.mount.R_BI), vector(known.mount.p_BI)
     w_raw = rotate(R_BI, vector(measured.angular_velocity))
     f_mean = rotate(R_BI, vector(measured.mean.specific_force))
+    if trust[0] == 0 and trust[1] == 0:
+        watch_noise(x.gyro, w_raw, sensors.angular_velocity_noise, elapsed)
+        watch_noise(x.accelerometer, f_mean, sensors.acceleration_noise, elapsed)
+    gyro_noise = math.sqrt(x.gyro.noise) * sensors.angular_velocity_noise
+    accelerometer_noise = math.sqrt(x.accelerometer.noise) * sensors.acceleration_noise
     wrench = foot_wrenches(measured.pad_force, known.pads.position, known.pads.foot, feet)
     x.pad_force_read[:] = x.pad_force[:] = measured.mean.pad_force
     read_wrench = foot_wrenches(x.pad_force, known.pads.position, known.pads.foot, feet)
@@ -339,7 +347,7 @@ def _estimate_base(
     weight = known.mass * 9.81
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
     firm = x.foot_standing * known.is_flat
-    rests, rolling = firm_foot_rate(firm, wrench, weight, w_now, model)
+    rests, rolling = firm_foot_rate(firm, wrench, known.soles, weight, w_now, model)
     contradiction = force_contradiction(x.check, force_errors(f_mean, known.config))
     if first:
         _start(x, measured, model, known)
@@ -347,7 +355,7 @@ def _estimate_base(
         w = rotate(R_BI, vector(measured.mean.angular_velocity))
         w = subtract(w, vector(x.gyro_bias_B))
         f = subtract(f_mean, vector(x.accelerometer_bias_B))
-        rate_noise, force_noise = sensors.angular_velocity_noise, sensors.acceleration_noise
+        rate_noise, force_noise = gyro_noise, accelerometer_noise
         if trust[1] > 0:
             f = rotate_back(rotation(x.rotation), scale(-1.0, vector(known.gravity)))
             rate_noise, force_noise = _UNKNOWN_RATE, _UNKNOWN_ACCELERATION
@@ -374,7 +382,10 @@ def _estimate_base(
             land(x, P, correction, foot, model, known)
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
-            moves = listen_to_foot(x, P, correction, foot, share, w_raw, model, elapsed, known)
+            pivot = centre_of_pressure(wrench[foot], known.soles[foot])
+            moves = listen_to_foot(
+                x, P, correction, foot, share, pivot, w_raw, model, elapsed, known
+            )
             all_move, resting = all_move and moves, True
             least_moved = min(least_moved, norm(vector(x.foot_agreement[foot, FOOT_VELOCITY])))
         x.foot_standing[foot] = measured.support[foot]
@@ -550,6 +561,7 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance
         force_habit            (3,)    the same of the forces' error
         foot_age, force_age    (feet,), ()  for how long each has been listened to [s]
+        gyro, accelerometer    by how much each is noisier than believed, see `imu_noise_type`
         check                  what `cross_check` remembers: `doubt` (1 + feet,), positive for the
                                IMU and the feet that contradict the rest; `mean` (2, 3, 3) and
                                `load` (2, feet, 3) of the last 10 ms and 50 ms; `spread`; `rolling`
@@ -599,6 +611,9 @@ class InvariantBaseFilter(RecursiveEstimator):
             sensors=sensors,
             mount=record(**vars(ImuMount(robot))),
             pads=record(position=pads.position, foot=pads.foot),
+            soles=np.array(
+                [[of.min(axis=0)[:2], of.max(axis=0)[:2]] for of in pads.split(pads.position)]
+            ),
             is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
             force_variance=required(sensors.force_noise, "force_noise") ** 2 * len(pads.foot),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
@@ -685,6 +700,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         lost_by=(),
         lost_since=(),
         lost_ago=(),
+        **dict.fromkeys(("gyro", "accelerometer"), imu_noise_type()),
         check=cross_check_type(feet),
         force_delay=force_delay_type(clock),
         force_lag=force_lag_type(clock),

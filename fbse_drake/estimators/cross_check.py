@@ -17,6 +17,7 @@ from fbse_drake.estimators.spatial import (
     subtract,
     vector,
 )
+from fbse_drake.estimators.standing_foot import centre_of_pressure
 
 # Over which times accelerations are compared [s], and after how long without contradiction the
 # sensors are believed again.
@@ -27,6 +28,9 @@ _BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
 _CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
 # The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
 _ROLLING, _FIRM_SHARE = 0.4, 0.3
+# A foot rolls over an edge of its sole, where its load is then: beyond this share of the way there
+# from the middle.
+_NEAR_EDGE = 0.9
 # A gyro that changes by so much in a tick, and a standing foot says it does not, is doubted until
 # that foot rests again [rad/s], or for so long [s].
 _RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
@@ -188,12 +192,21 @@ def _blame(x: np.ndarray, turns: bool) -> None:
 
 @njit(cache=True)
 def firm_foot_rate(
-    stands: np.ndarray, wrench: np.ndarray, weight: float, w: Vector, model: np.ndarray
+    stands: np.ndarray,
+    wrench: np.ndarray,
+    soles: np.ndarray,
+    weight: float,
+    w: Vector,
+    model: np.ndarray,
 ) -> tuple[bool, Vector]:
     """Angular velocity of the standing foot that carries most, in base axes [rad/s].
 
+    Args:
+        wrench: [moment, force] on each foot at the sole's origin in the sole frame, (feet, 6).
+        soles: least and largest x and y of each sole, (feet, 2, 2) [m].
+
     Returns:
-        Does it carry enough to stand firmly? If not, the velocity is zero.
+        Does it carry enough, and not on an edge, to stand firmly? If not, the velocity is zero.
     """
     best = -1
     for foot in range(len(stands)):
@@ -201,6 +214,11 @@ def firm_foot_rate(
             best = foot
     if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
         return False, (0.0, 0.0, 0.0)
+    centre = centre_of_pressure(wrench[best], soles[best])
+    for i in range(2):
+        least, largest = soles[best, 0, i], soles[best, 1, i]
+        if abs(centre[i] - 0.5 * (least + largest)) > _NEAR_EDGE * 0.5 * (largest - least):
+            return False, (0.0, 0.0, 0.0)
     J, w_F = model.foot_jacobian[best], (0.0, 0.0, 0.0)
     for j in range(6, J.shape[1]):
         w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))

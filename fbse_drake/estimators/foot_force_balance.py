@@ -61,7 +61,7 @@ def listen_to_forces(
     f = subtract(f_raw, vector(x.accelerometer_bias_B))
     z = subtract(add(f, relative), scale(1.0 / known.mass, force))
     lasting = max(1.0, 2.0 * config.force_time / elapsed)
-    sensed = _acceleration_noise(model, elapsed, known)
+    sensed = _acceleration_noise(x, model, elapsed, known)
     own, noise, once = np.empty(3), np.zeros((3, 3)), np.empty(3)
     explained = np.empty((2, 3))
     for i in range(3):
@@ -92,12 +92,12 @@ def listen_to_forces(
 
 
 @njit(cache=True)
-def _acceleration_noise(model: Record, elapsed: float, known: Record) -> np.ndarray:
+def _acceleration_noise(x: Record, model: Record, elapsed: float, known: Record) -> np.ndarray:
     """Variance of what the sensors' noise adds to the acceleration of the centre of mass by them,
     less that by the foot forces, (3,)."""
     sensors = known.sensors
     rate = 2.0 * (sensors.joint_velocity_noise / elapsed) ** 2
-    turning = 2.0 * (sensors.angular_velocity_noise / elapsed) ** 2
+    turning = 2.0 * x.gyro.noise * (sensors.angular_velocity_noise / elapsed) ** 2
     arm = subtract(vector(model.com), vector(known.mount.p_BI))
     variance = np.empty(3)
     for i in range(3):
@@ -105,6 +105,7 @@ def _acceleration_noise(model: Record, elapsed: float, known: Record) -> np.ndar
         for joint in range(len(model.mass_matrix)):
             moved += (model.mass_matrix[joint, 3 + i] / known.mass) ** 2
         turned = dot(arm, arm) - arm[i] ** 2
-        variance[i] = rate * moved + turning * turned + sensors.acceleration_noise**2
+        variance[i] = rate * moved + turning * turned
+        variance[i] += x.accelerometer.noise * sensors.acceleration_noise**2
         variance[i] += known.force_variance / known.mass**2
     return variance

@@ -86,6 +86,24 @@ def unrest(v: Vector) -> float:
 
 
 @njit(cache=True)
+def centre_of_pressure(wrench: np.ndarray, sole: np.ndarray) -> Vector:
+    """Where the load of a foot is, on its sole, in the sole frame [m]; the middle without a load.
+
+    Args:
+        wrench: [moment, force] at the sole's origin in the sole frame, (6,) [Nm, N].
+        sole: least and largest x and y, (2, 2) [m].
+    """
+    load = wrench[5]
+    if not load > 0.0:
+        return (0.5 * (sole[0, 0] + sole[1, 0]), 0.5 * (sole[0, 1] + sole[1, 1]), 0.0)
+    return (
+        min(max(-wrench[1] / load, sole[0, 0]), sole[1, 0]),
+        min(max(wrench[0] / load, sole[0, 1]), sole[1, 1]),
+        0.0,
+    )
+
+
+@njit(cache=True)
 def land(
     x: Record,
     P: np.ndarray,
@@ -138,6 +156,7 @@ def listen_to_foot(
     correction: np.ndarray,
     foot: int,
     share: float,
+    pivot: Vector,
     w_raw: Vector,
     model: Record,
     elapsed: float,
@@ -148,6 +167,7 @@ def listen_to_foot(
 
     Args:
         share: of the weight, that it carries.
+        pivot: centre of pressure in the sole frame [m]: a foot that rolls rests there.
         w_raw: the gyro's reading in base axes.
 
     Returns:
@@ -163,7 +183,7 @@ def listen_to_foot(
     lasting = max(1.0, 2.0 * config.foot_time / elapsed)
     held = unrest(v) ** 2 - 1.0
     angle, rate = sensors.joint_position_noise**2, sensors.joint_velocity_noise**2
-    gyro = sensors.angular_velocity_noise**2
+    gyro = x.gyro.noise * sensors.angular_velocity_noise**2
     turning, moving = _leg_noise(J, 0), _leg_noise(J, 3)
     agreement, innovation = x.foot_agreement[foot], x.foot_innovation[foot]
     explained = np.empty((2, 3))
@@ -201,12 +221,13 @@ def listen_to_foot(
     for j in range(6, J.shape[1]):
         w_F = add(w_F, scale(model.velocity[j], (J[0, j], J[1, j], J[2, j])))
         v_F = add(v_F, scale(model.velocity[j], (J[3, j], J[4, j], J[5, j])))
-    w_BF, v_BF = rotate(R_BF, w_F), rotate(R_BF, v_F)
+    w_BF, v_BP = rotate(R_BF, w_F), rotate(R_BF, add(v_F, cross(w_F, pivot)))
+    p_IP = add(p_IF, rotate(R_BF, pivot))
     w = subtract(w_raw, vector(x.gyro_bias_B))
     own = light * config.foot_velocity**2
-    sensed = moving * rate + dot(p_IF, p_IF) * gyro
-    z = rotate(R_FW, subtract(scale(-1.0, rotate(R, add(cross(w, p_IF), v_BF))), v))
-    of_bias = matrix_product(R_FW, matrix_product(R, skew(p_IF)))
+    sensed = moving * rate + dot(p_IP, p_IP) * gyro
+    z = rotate(R_FW, subtract(scale(-1.0, rotate(R, add(cross(w, p_IP), v_BP))), v))
+    of_bias = matrix_product(R_FW, matrix_product(R, skew(p_IP)))
     noise = _diagonal(x, foot, FOOT_VELOCITY, own * lasting, sensed)
     update(
         P, correction, z, VELOCITY, R_FW, GYRO_BIAS, of_bias, noise, keep,

@@ -36,7 +36,8 @@ from fbse_drake.estimators.implicit_friction import (
     mirror,
     own_covariance,
 )
-from fbse_drake.estimators.innovations import AGREEMENT_TIME, LOG_OF_THREE, learned_noise
+from fbse_drake.estimators.imu_noise import imu_noise_type, watch_noise
+from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.law_learning import forget_laws, learning_states, make_dissipative
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.missing_inertia import (
@@ -203,7 +204,8 @@ def _begin(
     pads, feet = known.pads, len(known.wrench_variance)
     wrench = foot_wrenches(pad_force, pads.position, pads.foot, feet)
     watch_forces(x, last, elapsed, wrench, known)
-    _watch_accelerometer(x, last, elapsed, measured.mean.specific_force, known)
+    specific_force = vector(measured.mean.specific_force)
+    watch_noise(x.accelerometer, specific_force, known.sensors.acceleration_noise, elapsed)
     x.status, now = measured.trust.max(), x.now
     if math.isnan(elapsed):
         elapsed = 0.0
@@ -242,7 +244,7 @@ def _begin(
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     put_push(
         tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
-        x.acceleration_noise, known,
+        x.accelerometer.noise, known,
     )  # fmt: skip
     A, tick.duration, share = full_inertia(x, then.inertia), T, start_share(T, known.reading)
     tick.inertia[:] = A
@@ -261,19 +263,6 @@ def _begin(
     else:
         velocity, _ = implicit_step(x, x.velocity, A, tick.push, T)
         tick.velocity[:] = velocity[3:]
-
-
-@njit(cache=True)
-def _watch_accelerometer(
-    x: Record, last: Record, elapsed: float, force: np.ndarray, known: Record
-) -> None:
-    """Learns by how much the accelerometer is noisier than believed, see `watch_forces`."""
-    x.specific_force[:] = force
-    x.specific_force_change[:] = force - last.specific_force
-    if not math.isnan(elapsed):
-        bend, noise = x.specific_force_change - last.specific_force_change, last.acceleration_noise
-        share = bend @ bend / (18.0 * noise * known.sensors.acceleration_noise**2)
-        x.acceleration_noise = learned_noise(noise, share, LOG_OF_THREE, elapsed)
 
 
 @njit(cache=True)
@@ -413,12 +402,13 @@ def _finish(
         x.rested[joint] = 0.0 if moves else last.rested[joint] + tick.duration
         # The law's slope changes within the velocity's doubt.
         x.steepest[joint] = max(x.slope[joint], brief * last.steepest[joint])
-        variance += x.steepest[joint] ** 2 * of_error
-        variance += 2.0 * slope * P[of_velocity, of_lacking]
+        by_velocity = x.steepest[joint] ** 2 * of_error
+        by_velocity += 2.0 * slope * P[of_velocity, of_lacking]
         unsettled = 0.0
         for j in range(m):
             share, at = x.regressor[joint, j], first + j
-            variance += 2.0 * share * (slope * P[of_velocity, at] + P[of_lacking, at])
+            by_velocity += 2.0 * share * slope * P[of_velocity, at]
+            variance += 2.0 * share * P[of_lacking, at]
             for k in range(m):
                 variance += share * x.regressor[joint, k] * P[at, first + k]
             settled = keep * last.settled[joint, j] + (1.0 - keep) * x.weights[joint, j]
@@ -437,7 +427,12 @@ def _finish(
         doubt = max(abs(lacking) + abs(unsettled), contradicted)
         x.doubt[joint] = max(doubt, keep * last.doubt[joint])
         # The Birge ratio widens what follows from readings that contradict the model.
-        variance = max(0.0, variance) * max(x.surprise, x.agreement[of_velocity])
+        ratio = max(x.surprise, x.agreement[of_velocity])
+        by_law = abs(x.friction_there[joint])
+        x.largest[joint] = max(by_law, last.largest[joint])
+        # However wrong the velocity may be, the law says no more than it ever has.
+        by_velocity = min(ratio * by_velocity, (by_law + x.largest[joint]) ** 2)
+        variance = max(0.0, ratio * variance + by_velocity)
         x.friction_std[joint] = math.sqrt(variance + x.doubt[joint] ** 2)
         x.missing_inertia[joint] = x.weights[joint, m - 1]
         x.missing_inertia_std[joint] = math.sqrt(max(0.0, P[first + m - 1, first + m - 1]))
@@ -498,8 +493,7 @@ class WholeBodyFilter(RecursiveEstimator):
         foot_noise               (feet,) the same of standing feet's turning
         force_noise, wrench, wrench_change  see `LinkTorqueEstimator`
         pad_mean                 (P, 3)  force on each pad, mean of late [N]
-        acceleration_noise, specific_force, specific_force_change   the same of the accelerometer:
-                                 (), (3,) and (3,) [m/s^2]
+        accelerometer            by how much it is noisier than believed, see `imu_noise_type`
         reading                  (r,)    what gyro and encoders read, free of the bias [rad/s]
         late                     ()      how many ticks ago the forces were what is read now: all
                                          but the friction is of that tick
@@ -512,6 +506,7 @@ class WholeBodyFilter(RecursiveEstimator):
         rested                   (n,)    for how long a joint has not moved, beyond doubt [s]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
         steepest                 (n,)    the largest slope of late [Nm s/rad]
+        largest                  (n,)    the largest friction by the law so far [Nm]
     """
 
     def __init__(
@@ -540,7 +535,15 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
-        per_joint += ["doubt", "rested", "law_velocity", "friction_there", "slope", "steepest"]
+        per_joint += [
+            "doubt",
+            "rested",
+            "law_velocity",
+            "friction_there",
+            "slope",
+            "steepest",
+            "largest",
+        ]
         per_joint += ["missing_inertia", "missing_inertia_std"]
         posterior_type = record_type(
             time=(),
@@ -548,8 +551,7 @@ class WholeBodyFilter(RecursiveEstimator):
             late=(),
             lag=(),
             surprise=(),
-            acceleration_noise=(),
-            **dict.fromkeys(("specific_force", "specific_force_change"), (3,)),
+            accelerometer=imu_noise_type(),
             **dict.fromkeys(per_row, (r,)),
             **dict.fromkeys(per_joint, (n,)),
             **dict.fromkeys(("foot_noise", "force_noise"), (feet,)),
@@ -654,7 +656,7 @@ class WholeBodyFilter(RecursiveEstimator):
         start["weights"][:, : regressor.parameters] = regressor.initial
         start["settled"] = start["weights"]
         start["noise"] = start["bend_noise"] = start["foot_noise"] = 1.0
-        start["surprise"] = start["agreement"] = start["acceleration_noise"] = 1.0
+        start["surprise"] = start["agreement"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
         deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
