@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from benchmarks import off_nominal_walks
 from benchmarks.console import print_table
@@ -160,18 +161,31 @@ def run(case: Case, seed: int, duration: float, alone: bool) -> Walked:
     does not fall."""
     common = [f"seed={seed}", f"duration={duration}", *case.told]
     nobody = ["estimator=!NoEstimator {}"]
-    result = simulate(load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold]))
+    happens = load_scenario(case.scenario, overrides=[*common, *nobody, *case.untold])
+    result = simulate(happens)
     if result.failure is not None:
         return Walked(case.name, result.failure, {})
+    log = _levelled(result.log, happens.ground.slope)
     believed = load_scenario(case.scenario, overrides=common)
     # The same model of the friction, by the other filter.
     told = [text.replace("!WholeBody", "!ModelAided") for text in common]
     other = load_scenario(case.scenario, overrides=["estimator.friction=!ModelAided {}", *told])
     figures = {
-        (method, variant): Figures.of(estimate(replace(believed, estimator=config), result.log).log)
+        (method, variant): Figures.of(estimate(replace(believed, estimator=config), log).log)
         for method, variant, config in watchers(believed.estimator, other.estimator, alone)
     }
     return Walked(case.name, result.failure, figures)
+
+
+def _levelled(log: Log, slope: Sequence[float]) -> Log:
+    """A log whose true base is not in axes of sloping ground but in level ones, as it is for
+    estimators that nobody told of the slope [rad]."""
+    level, base = Rotation.from_rotvec([*slope, 0.0]), "truth/base"
+    orientation = Rotation.from_quat(log[f"{base}/orientation"], scalar_first=True)
+    channels = {f"{base}/orientation": (level * orientation).as_quat(scalar_first=True)}
+    for name in ("position", "velocity"):
+        channels[f"{base}/{name}"] = level.apply(log[f"{base}/{name}"])
+    return replace(log, channels={**log.channels, **channels})
 
 
 @dataclass(frozen=True)
