@@ -41,13 +41,15 @@ class SensorBeliefs:
     moment_noise: float | None = None
     # Are foot forces watched for noise that is larger than that?
     learns_force_noise: bool = True
+    # By what share forces of a foot may all be read wrong [1]; a gain of 0 is not estimated.
+    force_gain: float = 0.0
     # How large a constant bias of accelerometer [m/s^2] and gyro [rad/s] may be.
     acceleration_bias: float = 0.3
     angular_velocity_bias: float = 0.05
 
     def __post_init__(self) -> None:
         require_positive(self, *_NOISES)
-        require_not_negative(self, "acceleration_bias", "angular_velocity_bias")
+        require_not_negative(self, "force_gain", "acceleration_bias", "angular_velocity_bias")
 
     def completed(self, usual: "SensorBeliefs") -> "SensorBeliefs":
         """The same with what is not given taken from another one."""

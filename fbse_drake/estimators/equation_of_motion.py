@@ -167,6 +167,8 @@ def put_push(
     wrench: np.ndarray,
     force_noise: np.ndarray,
     acceleration_noise: float,
+    force_gain: np.ndarray,
+    by_foot: np.ndarray,
     known: Record,
 ) -> None:
     """Fills the push (r,) in an equation of motion, feet included, and its variance (r, r).
@@ -179,6 +181,8 @@ def put_push(
         pad_touches: see `touching`, (P,).
         force_noise, acceleration_noise: by how much the variance of each foot's forces, and of the
             accelerometer, is larger than believed.
+        force_gain: by what share forces are larger than they are read, (feet,).
+        by_foot: filled with the push by each foot as it is read, (r, feet).
         known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
             (feet, 6) of each foot, and `pads`, see `FootPads`.
     """
@@ -187,6 +191,7 @@ def put_push(
         push[i], factor = of_tick.push[i], vector(of_tick.of_linear[i])
         for j in range(r):
             variance[i, j] = noise * dot(factor, vector(of_tick.of_linear[j]))
+    by_foot[:] = 0.0
     for foot in range(len(known.has_pads)):
         if known.has_pads[foot]:
             of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)
@@ -200,9 +205,11 @@ def put_push(
         by_noise = of_noise @ lever
         for k in range(6):
             for i in range(r):
-                push[i] += lever[k, i] * of_foot[k]
+                by_foot[i, foot] += lever[k, i] * of_foot[k]
                 for j in range(r):
                     variance[i, j] += lever[k, i] * by_noise[k, j]
+        for i in range(r):
+            push[i] += (1.0 + force_gain[foot]) * by_foot[i, foot]
 
 
 @njit(cache=True)

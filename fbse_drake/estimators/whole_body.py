@@ -73,6 +73,10 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 from fbse_drake.wiring import weakly
 
 _NOT_FINITE = float(Status.NOT_FINITE)
+# How fast the gain of a foot's forces may change, if it is learned: random walk [1/sqrt(s)].
+GAIN_WALK = 0.003
+# A gain that is less wrong is not told of [1].
+_TOLD_GAIN = 0.005
 # Of no delay it is known how long it has shown.
 _NO_DELAY = np.zeros(0)
 
@@ -142,15 +146,16 @@ class WholeBody:
         return WholeBodyFilter(self, sensors, robot, **arguments)
 
 
-def _tick_type(n: int, size: int) -> np.dtype:
+def _tick_type(n: int, feet: int, size: int) -> np.dtype:
     """What a tick's forces and equation of motion say, whatever the friction is.
 
     `duration` () [s], 0 where not all is known that it needs, and the rest means nothing; `inertia`
     (r, r), the model's with what it lacks; `push` (r,), commands, feet and all that is not friction
     [Nm], and its `variance` (r, r); `missed` (r,), the part of that which is missed between rare
-    readings; `impulse` (r, size), covariance of the tick's impulse, but for the friction's, with
-    the states; `velocity` (n,) of the joints, where the tick is expected to end; and `believed`, of
-    the model's own effects, see `believed_torque_type`.
+    readings; `by_foot` (r, feet), the push by each foot as it is read; `impulse` (r, size),
+    covariance of the tick's impulse, but for the friction's, with the states; `velocity` (n,) of
+    the joints, where the tick is expected to end; and `believed`, of the model's own effects, see
+    `believed_torque_type`.
     """
     r = 3 + n
     return record_type(
@@ -158,6 +163,7 @@ def _tick_type(n: int, size: int) -> np.dtype:
         inertia=(r, r),
         push=(r,),
         variance=(r, r),
+        by_foot=(r, feet),
         missed=(r,),
         impulse=(r, size),
         velocity=(n,),
@@ -231,6 +237,10 @@ def _begin(
     for i in range(r):
         walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
         x.covariance[r + i, r + i] += walk**2 * elapsed
+    of_gains = 2 * r + x.weights.size
+    if known.sensors.force_gain > 0.0:
+        for at in range(of_gains, len(x.covariance)):
+            x.covariance[at, at] += GAIN_WALK**2 * elapsed
     T, x.lag = then.duration * then.known if is_known else 0.0, lag
     if (x.lag > 0.0) != (last.lag > 0.0):
         T = 0.0
@@ -244,7 +254,7 @@ def _begin(
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     put_push(
         tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
-        x.accelerometer.noise, known,
+        x.accelerometer.noise, x.force_gain, tick.by_foot, known,
     )  # fmt: skip
     A, tick.duration, share = full_inertia(x, then.inertia), T, start_share(T, known.reading)
     tick.inertia[:] = A
@@ -252,6 +262,9 @@ def _begin(
     for i in range(r):
         for k in range(len(x.covariance)):
             tick.impulse[i, k] -= T * x.covariance[r + i, k]
+            for foot in range(len(x.force_gain)):
+                covariance = x.covariance[of_gains + foot, k]
+                tick.impulse[i, k] += T * tick.by_foot[i, foot] * covariance
         # What rare readings leave out is as large as they differ.
         tick.missed[i] = (share * (tick.push[i] - last.pushed[i])) ** 2
         tick.variance[i, i] += tick.missed[i]
@@ -475,7 +488,8 @@ class WholeBodyFilter(RecursiveEstimator):
                                          [kg m^2]
         weights, settled         (n, m)  parameters, those of other shapes and the missing inertia;
                                          the same some time ago
-        covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
+        force_gain               (feet,) by what share a foot's forces are larger than read
+        covariance               of [velocity, lacking, weights, force_gain], (size, size)
         innovation, innovation_variance   (r,)  of gyro and encoders [rad/s]
         correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
         unexplained, unexplained_variance (r,)  running mean of the corrections [Nm]
@@ -526,11 +540,13 @@ class WholeBodyFilter(RecursiveEstimator):
             measurements, model_over_step, attitude: types of the inputs.
             torque_effects: of the model; the law that is learned is what is left beside them.
         """
-        self._config = config
+        self._config, self._force_gain = config, sensors.force_gain
+        self._feet = tuple(robot.description.legs)
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
         n, m = len(robot.joint_names), self._regressor.weights + 1
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         feet = len(legs)
+        size = 2 * r + n * m + feet
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
@@ -558,12 +574,13 @@ class WholeBodyFilter(RecursiveEstimator):
             **dict.fromkeys(("wrench", "wrench_change"), (feet, 6)),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
-            covariance=(2 * r + n * m, 2 * r + n * m),
+            force_gain=(feet,),
+            covariance=(size, size),
             now=motion_type(robot),
             pad_mean=(len(pads.position), 3),
         )
         super().__init__(posterior_type, clock)
-        self._tick_type = _tick_type(n, 2 * r + n * m)
+        self._tick_type = _tick_type(n, feet, size)
         gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
         encoder = required(sensors.joint_velocity_noise, "joint_velocity_noise")
         self._known = record(
@@ -602,6 +619,16 @@ class WholeBodyFilter(RecursiveEstimator):
             "model_over_step": model_type(robot),
             "attitude": record_type(acceleration_bias=(3,), angular_velocity_bias=(3,)),
         }
+
+    def findings(self, context: Context) -> tuple[str, ...]:
+        x = as_record(context.get_discrete_state().value(0), self.posterior_type)
+        gains, variance = x["force_gain"], np.diag(x["covariance"])[-len(self._feet) :]
+        return tuple(
+            f"Forces of the {foot} foot were found to be read {abs(100 * gain / (1 + gain)):.1f} % "
+            f"too {'small' if gain > 0 else 'large'} (in a model: !FootForceGain)."
+            for foot, gain, of_gain in zip(self._feet, gains, variance, strict=True)
+            if abs(gain) > max(_TOLD_GAIN, NOTICED * math.sqrt(of_gain))
+        )
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
@@ -659,7 +686,8 @@ class WholeBodyFilter(RecursiveEstimator):
         start["surprise"] = start["agreement"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
-        deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
+        gains = np.full(len(start["force_gain"]), self._force_gain)
+        deviations = np.concatenate([np.zeros(3 + n), lacking, weights, gains])
         start["covariance"] = np.diag(deviations**2)
         # As a posterior is: functions are compiled once for both.
         start.flags.writeable = False
