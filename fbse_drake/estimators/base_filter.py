@@ -613,7 +613,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             pads=record(position=pads.position, foot=pads.foot),
             soles=np.array(
                 [[of.min(axis=0)[:2], of.max(axis=0)[:2]] for of in pads.split(pads.position)]
-            ),
+            ).reshape(-1, 2, 2),
             is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
             force_variance=required(sensors.force_noise, "force_noise") ** 2 * len(pads.foot),
             mass=plant.CalcTotalMass(plant.CreateDefaultContext()),

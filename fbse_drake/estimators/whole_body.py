@@ -551,16 +551,8 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
-        per_joint += [
-            "doubt",
-            "rested",
-            "law_velocity",
-            "friction_there",
-            "slope",
-            "steepest",
-            "largest",
-        ]
-        per_joint += ["missing_inertia", "missing_inertia_std"]
+        per_joint += ["doubt", "rested", "law_velocity", "friction_there", "largest"]
+        per_joint += ["slope", "steepest", "missing_inertia", "missing_inertia_std"]
         posterior_type = record_type(
             time=(),
             status=(),
@@ -622,7 +614,8 @@ class WholeBodyFilter(RecursiveEstimator):
 
     def findings(self, context: Context) -> tuple[str, ...]:
         x = as_record(context.get_discrete_state().value(0), self.posterior_type)
-        gains, variance = x["force_gain"], np.diag(x["covariance"])[-len(self._feet) :]
+        gains = x["force_gain"]
+        variance = np.diag(x["covariance"])[len(x["covariance"]) - len(gains) :]
         return tuple(
             f"Forces of the {foot} foot were found to be read {abs(100 * gain / (1 + gain)):.1f} % "
             f"too {'small' if gain > 0 else 'large'} (in a model: !FootForceGain)."
