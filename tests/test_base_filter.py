@@ -852,21 +852,22 @@ def test_feet_that_roll_are_not_believed_to_rest(
 
 
 def test_a_robot_that_rocks_on_an_edge_of_its_foot_is_believed(run: Run):
-    """Long and fast steps, after which it tips by half a degree about a standing foot's edge, with
-    up to 0.7 rad/s. The IMU was doubted for that, and all forgotten: 70 mm/s and 2.6 deg."""
+    """Long and fast steps, after one of which it tips about a standing foot's edge with 0.7 rad/s.
+    Measured at most 2.6 mm/s and 0.03 deg. The IMU was doubted for that, and the velocity was off
+    by up to 150 mm/s, the tilt by 1.5 deg."""
     steps = ("single_support=0.414", "double_support=0.338", "step_length=0.129")
     changes = [f"reference.{change}" for change in (*steps, "step_height=0.046")]
     log = run("paper_walk_fbse", "duration=3", *changes)
     assert (log["estimate/sensors/status"][:, 1] == Status.OK).all()
     later = log.time > 1.0
     error = (log["estimate/base/velocity"] - log["truth/base/velocity"])[later]
-    assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.01
+    assert np.abs(error).max() < 0.01
     estimate, truth = (
         Rotation.from_quat(log[f"{source}/base/orientation"][later], scalar_first=True)
         for source in ("estimate", "truth")
     )
     tilt = (truth * estimate.inv()).as_rotvec()[:, :2]
-    assert np.rad2deg(np.sqrt(np.mean(tilt**2, axis=0))).max() < 0.1
+    assert np.rad2deg(np.abs(tilt)).max() < 0.1
 
 
 def test_a_foot_that_rolls_rests_where_its_load_is():

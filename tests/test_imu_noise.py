@@ -18,7 +18,7 @@ NORMAL_99 = 2.58
 
 @pytest.mark.parametrize("times", [1.0, 5.0])
 def test_noise_is_told_from_motion(times: float):
-    """A motion of 2 Hz that is a thousand times as large as the noise bends by a fifth of it."""
+    """A motion of 2 Hz that is a thousand times as large as the noise bends by a sixth of it."""
     generator, T, believed = np.random.default_rng(0), 1e-3, 0.02
     x, found = np.zeros((), imu_noise_type()), []
     for tick in range(3000):
