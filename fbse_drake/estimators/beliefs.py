@@ -41,8 +41,8 @@ class SensorBeliefs:
     moment_noise: float | None = None
     # Are foot forces watched for noise that is larger than that?
     learns_force_noise: bool = True
-    # By what share forces of a foot may all be read wrong [1]; a gain of 0 is not estimated.
-    force_gain: float = 0.0
+    # By what share forces of a foot may all be read wrong [1]; 0 where they are known to be right.
+    force_gain: float = 0.05
     # How large a constant bias of accelerometer [m/s^2] and gyro [rad/s] may be.
     acceleration_bias: float = 0.3
     angular_velocity_bias: float = 0.05

@@ -16,6 +16,7 @@ from fbse_drake.estimators.spatial import (
     add,
     cross,
     dot,
+    norm,
     put,
     rotate,
     rotation,
@@ -41,7 +42,9 @@ def motion_type(robot: Robot) -> np.dtype:
     and those of the joints, `inertia` (r, r), `push` (r,), its part `of_linear` (r, 3) in the IMU's
     acceleration, and the `lever` (feet, 6, r) of the wrenches on the soles; and how soles turn
     about their normals without accelerations, `turning` (feet,) [rad/s^2]; and what the model's own
-    effects take of the joints' torques, `believed`, see `believed_torque_type`.
+    effects take of the joints' torques, `believed`, see `believed_torque_type`. Along `up` (3,),
+    against gravity in the base's axes, `up_of_sole` (feet, 3) in the soles', all feet together push
+    with `weight` () [N] and what accelerations add to it.
     """
     r, feet = 3 + len(robot.joint_names), len(robot.description.legs)
     return record_type(
@@ -53,6 +56,9 @@ def motion_type(robot: Robot) -> np.dtype:
         push=(r,),
         lever=(feet, 6, r),
         turning=(feet,),
+        up=(3,),
+        up_of_sole=(feet, 3),
+        weight=(),
         believed=believed_torque_type(r - 3),
     )
 
@@ -102,12 +108,17 @@ def put_equation_of_motion(
     for i in range(3):
         for j in range(3, r):
             A[i, j] = A[j, i]
+    up = scale(1.0 / max(norm(force), 1e-9), rotate(R_BI, force))
+    put(now.up, up)
+    now.weight = base[3, 3] * dot(up, linear) + dot(up, vector(base_bias[3:]))
     for foot in range(len(known.has_pads)):
         J, lever = model.foot_jacobian[foot], now.lever[foot]
         for i in range(6):
             for j in range(r):
                 lever[i, j] = J[i, j if j < 3 else 3 + j]
             _move(lever[i], vector(J[i, 3:6]), p)
+        for i in range(3):
+            now.up_of_sole[foot, i] = dot(vector(J[3 + i, 3:6]), up)
         now.turning[foot] = model.foot_bias[foot, 2]
 
 
@@ -168,7 +179,6 @@ def put_push(
     force_noise: np.ndarray,
     acceleration_noise: float,
     force_gain: np.ndarray,
-    by_foot: np.ndarray,
     known: Record,
 ) -> None:
     """Fills the push (r,) in an equation of motion, feet included, and its variance (r, r).
@@ -182,7 +192,6 @@ def put_push(
         force_noise, acceleration_noise: by how much the variance of each foot's forces, and of the
             accelerometer, is larger than believed.
         force_gain: by what share forces are larger than they are read, (feet,).
-        by_foot: filled with the push by each foot as it is read, (r, feet).
         known: see `put_equation_of_motion`; and the beliefs of the `sensors`, the `wrench_variance`
             (feet, 6) of each foot, and `pads`, see `FootPads`.
     """
@@ -191,7 +200,6 @@ def put_push(
         push[i], factor = of_tick.push[i], vector(of_tick.of_linear[i])
         for j in range(r):
             variance[i, j] = noise * dot(factor, vector(of_tick.of_linear[j]))
-    by_foot[:] = 0.0
     for foot in range(len(known.has_pads)):
         if known.has_pads[foot]:
             of_foot, of_noise = _pad_wrench(pad_force, pad_touches, foot, force_noise[foot], known)
@@ -205,11 +213,9 @@ def put_push(
         by_noise = of_noise @ lever
         for k in range(6):
             for i in range(r):
-                by_foot[i, foot] += lever[k, i] * of_foot[k]
+                push[i] += (1.0 + force_gain[foot]) * lever[k, i] * of_foot[k]
                 for j in range(r):
                     variance[i, j] += lever[k, i] * by_noise[k, j]
-        for i in range(r):
-            push[i] += (1.0 + force_gain[foot]) * by_foot[i, foot]
 
 
 @njit(cache=True)

@@ -69,7 +69,7 @@ def implicit_step(
 def impulse_covariance(x: Record, tick: Record) -> np.ndarray:
     """Covariance of the tick's impulse, friction included, with the states, (r, size)."""
     P, impulse, (n, m) = x.covariance, tick.impulse.copy(), x.weights.shape
-    first = 2 * len(x.velocity)
+    first = len(P) - n * m
     for joint in range(n):
         for j in range(m):
             share = tick.duration * x.regressor[joint, j]
@@ -98,9 +98,6 @@ def own_covariance(
             for j in range(m):
                 share = T * x.regressor[joint, j]
                 own[i, 3 + joint] -= share * impulse[i, 2 * r + m * joint + j]
-        for foot in range(len(x.force_gain)):
-            for k in range(r):
-                own[i, k] += T * impulse[i, 2 * r + n * m + foot] * tick.by_foot[k, foot]
     own = inverse @ own @ inverse
     return 0.5 * (own + own.T)
 

@@ -14,7 +14,7 @@ _MANY = 0.3
 
 @njit(cache=True)
 def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
-    """Which states are corrected: 1, but 0 for what is not to be learned from a tick, (size,).
+    """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
     A joint whose velocity has not been known from zero for some time says nothing of its law:
     coefficient and velocity, known by their product alone, would drift apart. Of what contradicts a
@@ -22,8 +22,6 @@ def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
     where torque keeps being lacking in the joint's row, where innovations are no noise, and in a
     tick whose innovation is an outlier. What contradicts many rows is wrong with the base or with a
     foot: innovations that are near noise already teach laws that are well known no more.
-
-    Nor is by what share forces are read wrong.
 
     Args:
         x: record with the innovations of this tick.
@@ -43,16 +41,14 @@ def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
             or (many and doubted[row] and _is_known(last, joint, _WELL_KNOWN, known))
         ):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
-    if many:
-        learning[2 * r + n * m :] = 0.0
     return learning
 
 
 @njit(cache=True)
 def _is_known(x: Record, joint: int, times: float, known: Record) -> bool:
     """Is a joint's law, where it is asked, known so many times as well as at the start?"""
-    m = x.weights.shape[1]
-    first, now, start = 2 * len(x.velocity) + m * joint, 0.0, 0.0
+    n, m = x.weights.shape
+    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
     for j in range(m):
         start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
         for k in range(m):
@@ -77,7 +73,7 @@ def make_dissipative(x: Record, believed: Record) -> None:
     """
     n, m = x.weights.shape
     for joint in range(n):
-        row, first = x.regressor[joint, : m - 1], 2 * len(x.velocity) + m * joint
+        row, first = x.regressor[joint, : m - 1], len(x.covariance) + m * (joint - n)
         last = first + m - 1
         torque = row @ x.weights[joint, : m - 1]
         if believed.torque[joint] * x.law_velocity[joint] > 0.0:
@@ -91,7 +87,7 @@ def make_dissipative(x: Record, believed: Record) -> None:
 
 @njit(cache=True)
 def forget_laws(x: Record, known: Record) -> None:
-    """The laws are those of the start, and so is what is known of the feet's forces."""
+    """The laws are those of the start."""
     P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
     x.weights[:], x.settled[:] = known.weights, known.weights
     P[of_laws:] = 0.0
@@ -100,6 +96,3 @@ def forget_laws(x: Record, known: Record) -> None:
         for k in range(m):
             at = of_laws + m * joint + k
             P[at, at] = known.weight_variance[k]
-    x.force_gain[:] = 0.0
-    for at in range(of_laws + n * m, len(P)):
-        P[at, at] = known.sensors.force_gain**2

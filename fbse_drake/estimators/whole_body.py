@@ -26,6 +26,7 @@ from fbse_drake.estimators.equation_of_motion import (
     touching,
 )
 from fbse_drake.estimators.floating_base import ImuMount, model_type
+from fbse_drake.estimators.force_balance import force_balance_type, watch_balance
 from fbse_drake.estimators.force_delay import remembered_ticks, tick_of
 from fbse_drake.estimators.friction_regressor import FrictionRegressor
 from fbse_drake.estimators.implicit_friction import (
@@ -55,7 +56,7 @@ from fbse_drake.estimators.recursive import (
     ticks_ago,
 )
 from fbse_drake.estimators.sensor_monitor import measurements_type
-from fbse_drake.estimators.spatial import put, rotate, rotation, subtract, vector
+from fbse_drake.estimators.spatial import dot, put, rotate, rotation, subtract, vector
 from fbse_drake.estimators.whole_body_updates import (
     DOUBT_TIME,
     GATE,
@@ -73,8 +74,6 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 from fbse_drake.wiring import weakly
 
 _NOT_FINITE = float(Status.NOT_FINITE)
-# How fast the gain of a foot's forces may change, if it is learned: random walk [1/sqrt(s)].
-GAIN_WALK = 0.003
 # A gain that is less wrong is not told of [1].
 _TOLD_GAIN = 0.005
 # Of no delay it is known how long it has shown.
@@ -98,6 +97,9 @@ class WholeBody:
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
     keep contradicting the model, torque is lacking in the rows that their corrections point at, and
     the laws of these joints, once known, are not learned; nor are those of joints that rest.
+
+    Feet whose forces are read wrong by a share of them are told by the robot's weight, as its load
+    moves from foot to foot.
     """
 
     # Does it go back to the tick that late forces belong to?
@@ -146,16 +148,15 @@ class WholeBody:
         return WholeBodyFilter(self, sensors, robot, **arguments)
 
 
-def _tick_type(n: int, feet: int, size: int) -> np.dtype:
+def _tick_type(n: int, size: int) -> np.dtype:
     """What a tick's forces and equation of motion say, whatever the friction is.
 
     `duration` () [s], 0 where not all is known that it needs, and the rest means nothing; `inertia`
     (r, r), the model's with what it lacks; `push` (r,), commands, feet and all that is not friction
     [Nm], and its `variance` (r, r); `missed` (r,), the part of that which is missed between rare
-    readings; `by_foot` (r, feet), the push by each foot as it is read; `impulse` (r, size),
-    covariance of the tick's impulse, but for the friction's, with the states; `velocity` (n,) of
-    the joints, where the tick is expected to end; and `believed`, of the model's own effects, see
-    `believed_torque_type`.
+    readings; `impulse` (r, size), covariance of the tick's impulse, but for the friction's, with
+    the states; `velocity` (n,) of the joints, where the tick is expected to end; and `believed`, of
+    the model's own effects, see `believed_torque_type`.
     """
     r = 3 + n
     return record_type(
@@ -163,7 +164,6 @@ def _tick_type(n: int, feet: int, size: int) -> np.dtype:
         inertia=(r, r),
         push=(r,),
         variance=(r, r),
-        by_foot=(r, feet),
         missed=(r,),
         impulse=(r, size),
         velocity=(n,),
@@ -237,10 +237,6 @@ def _begin(
     for i in range(r):
         walk = known.config.moment_walk if i < 3 else known.config.disturbance_walk
         x.covariance[r + i, r + i] += walk**2 * elapsed
-    of_gains = 2 * r + x.weights.size
-    if known.sensors.force_gain > 0.0:
-        for at in range(of_gains, len(x.covariance)):
-            x.covariance[at, at] += GAIN_WALK**2 * elapsed
     T, x.lag = then.duration * then.known if is_known else 0.0, lag
     if (x.lag > 0.0) != (last.lag > 0.0):
         T = 0.0
@@ -254,7 +250,7 @@ def _begin(
     touches = touching(x.pad_mean, pad_force, elapsed, x.force_noise, known)
     put_push(
         tick.push, tick.variance, then, pad_force, touches, wrench, x.force_noise,
-        x.accelerometer.noise, x.force_gain, tick.by_foot, known,
+        x.accelerometer.noise, x.force_balance.gains, known,
     )  # fmt: skip
     A, tick.duration, share = full_inertia(x, then.inertia), T, start_share(T, known.reading)
     tick.inertia[:] = A
@@ -262,9 +258,6 @@ def _begin(
     for i in range(r):
         for k in range(len(x.covariance)):
             tick.impulse[i, k] -= T * x.covariance[r + i, k]
-            for foot in range(len(x.force_gain)):
-                covariance = x.covariance[of_gains + foot, k]
-                tick.impulse[i, k] += T * tick.by_foot[i, foot] * covariance
         # What rare readings leave out is as large as they differ.
         tick.missed[i] = (share * (tick.push[i] - last.pushed[i])) ** 2
         tick.variance[i, i] += tick.missed[i]
@@ -352,7 +345,26 @@ def _update(
     listen(x, excess, weight, learning, T, known)
     listen_to_feet(x, last, then, measured, learning, T, known)
     watch_corrections(x, last, A, correction, expected, T)
-    x.joint_acceleration[:] = (x.velocity - last.velocity)[3:] / T
+    acceleration = (x.velocity - last.velocity) / T
+    x.joint_acceleration[:] = acceleration[3:]
+    if known.sensors.force_gain > 0.0:
+        _weigh(x, then, acceleration, T, known)
+
+
+@njit(cache=True)
+def _weigh(x: Record, then: Record, acceleration: np.ndarray, T: float, known: Record) -> None:
+    """Compares what the feet carry with the robot's weight, which shows feet that are read wrong.
+
+    Args:
+        then: equation of motion of the tick.
+        acceleration: in it, (r,) [rad/s^2].
+    """
+    load, weight = np.empty(len(x.wrench)), then.weight
+    for i in range(len(acceleration)):
+        weight += dot(vector(then.of_linear[i]), vector(then.up)) * acceleration[i]
+    for foot in range(len(load)):
+        load[foot] = dot(vector(then.up_of_sole[foot]), vector(x.wrench[foot, 3:])) / known.weight
+    watch_balance(x.force_balance, load, weight / known.weight, T, known.sensors.force_gain)
 
 
 @njit(cache=True)
@@ -488,8 +500,9 @@ class WholeBodyFilter(RecursiveEstimator):
                                          [kg m^2]
         weights, settled         (n, m)  parameters, those of other shapes and the missing inertia;
                                          the same some time ago
-        force_gain               (feet,) by what share a foot's forces are larger than read
-        covariance               of [velocity, lacking, weights, force_gain], (size, size)
+        covariance               of [velocity, lacking, weights], (2 r + n m, 2 r + n m)
+        force_balance            by what share each foot's forces are larger than read, see
+                                 `force_balance_type`
         innovation, innovation_variance   (r,)  of gyro and encoders [rad/s]
         correction, correction_variance   (r,)  of the velocities in this tick, as torque [Nm]
         unexplained, unexplained_variance (r,)  running mean of the corrections [Nm]
@@ -540,13 +553,11 @@ class WholeBodyFilter(RecursiveEstimator):
             measurements, model_over_step, attitude: types of the inputs.
             torque_effects: of the model; the law that is learned is what is left beside them.
         """
-        self._config, self._force_gain = config, sensors.force_gain
-        self._feet = tuple(robot.description.legs)
+        self._config, self._feet = config, tuple(robot.description.legs)
         self._regressor = FrictionRegressor.of(config.model, robot, tuple(config.factors))
         n, m = len(robot.joint_names), self._regressor.weights + 1
         r, pads, legs = 3 + n, FootPads(robot), robot.description.legs
         feet = len(legs)
-        size = 2 * r + n * m + feet
         per_row = ["velocity", "lacking", "innovation", "innovation_variance", "correction"]
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
@@ -566,13 +577,13 @@ class WholeBodyFilter(RecursiveEstimator):
             **dict.fromkeys(("wrench", "wrench_change"), (feet, 6)),
             **dict.fromkeys(("parameters", "parameter_variance"), (n, self._regressor.parameters)),
             **dict.fromkeys(("weights", "settled", "regressor"), (n, m)),
-            force_gain=(feet,),
-            covariance=(size, size),
+            covariance=(2 * r + n * m, 2 * r + n * m),
+            force_balance=force_balance_type(feet),
             now=motion_type(robot),
             pad_mean=(len(pads.position), 3),
         )
         super().__init__(posterior_type, clock)
-        self._tick_type = _tick_type(n, feet, size)
+        self._tick_type = _tick_type(n, 2 * r + n * m)
         gyro = required(sensors.angular_velocity_noise, "angular_velocity_noise")
         encoder = required(sensors.joint_velocity_noise, "joint_velocity_noise")
         self._known = record(
@@ -588,6 +599,7 @@ class WholeBodyFilter(RecursiveEstimator):
             weight_variance=self._weight_deviations() ** 2,
             weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
+            weight=9.81 * robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext()),
             rotor_inertia=np.array([robot.rotor_inertia(joint) for joint in robot.joint_names]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)
@@ -614,13 +626,11 @@ class WholeBodyFilter(RecursiveEstimator):
 
     def findings(self, context: Context) -> tuple[str, ...]:
         x = as_record(context.get_discrete_state().value(0), self.posterior_type)
-        gains = x["force_gain"]
-        variance = np.diag(x["covariance"])[len(x["covariance"]) - len(gains) :]
         return tuple(
             f"Forces of the {foot} foot were found to be read {abs(100 * gain / (1 + gain)):.1f} % "
             f"too {'small' if gain > 0 else 'large'} (in a model: !FootForceGain)."
-            for foot, gain, of_gain in zip(self._feet, gains, variance, strict=True)
-            if abs(gain) > max(_TOLD_GAIN, NOTICED * math.sqrt(of_gain))
+            for foot, gain in zip(self._feet, x["force_balance"]["gains"], strict=True)
+            if abs(gain) > _TOLD_GAIN
         )
 
     def _tick(
@@ -679,8 +689,7 @@ class WholeBodyFilter(RecursiveEstimator):
         start["surprise"] = start["agreement"] = 1.0
         lacking = np.repeat([config.moment_uncertainty, config.disturbance_uncertainty], [3, n])
         weights = np.tile(self._weight_deviations(), n)
-        gains = np.full(len(start["force_gain"]), self._force_gain)
-        deviations = np.concatenate([np.zeros(3 + n), lacking, weights, gains])
+        deviations = np.concatenate([np.zeros(3 + n), lacking, weights])
         start["covariance"] = np.diag(deviations**2)
         # As a posterior is: functions are compiled once for both.
         start.flags.writeable = False

@@ -36,12 +36,11 @@ def correct(
         gain: of the states, transposed, (m, size).
         learning: see `learning_states`.
     """
-    P, r, size, (n, m) = x.covariance, len(x.velocity), len(learning), x.weights.shape
+    P, r, size = x.covariance, len(x.velocity), len(learning)
     change, less = learning * (innovation @ gain), columns.T @ gain
     x.velocity += change[:r]
     x.lacking += change[r : 2 * r]
-    x.weights += change[2 * r : 2 * r + n * m].reshape(x.weights.shape)
-    x.force_gain += change[2 * r + n * m :]
+    x.weights += change[2 * r :].reshape(x.weights.shape)
     for j in range(size):
         if learning[j] > 0.0:
             for k in range(size):
