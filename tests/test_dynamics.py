@@ -17,18 +17,15 @@ def test_nothing_but_its_path_moves_a_sole(name: str):
     joints = np.setdiff1d(np.arange(len(state)), range(7))
     moves = 0
     for side in robot.description.sides:
-        sole = [robot.sole(side)]
-        on_path = path(plant, *sole)
+        sole = robot.sole(side)
+        on_path = path(plant, sole)
         columns = np.append(on_path.positions, len(q) + on_path.velocities)
         for column in joints:
             moved = state.copy()
             moved[column] += 0.1
             same_J, same_bias = (
-                np.array_equal(calc(sole, [state[:part]]), calc(sole, [moved[:part]]))
-                for calc, part in (
-                    (dynamics.jacobians, len(q)),
-                    (dynamics.bias_accelerations, len(state)),
-                )
+                np.array_equal(*dynamics.evaluated([quantity], np.array([state, moved]))[0])
+                for quantity in (dynamics.jacobian(sole), dynamics.bias_acceleration(sole))
             )
             if column in columns:
                 moves += not same_bias

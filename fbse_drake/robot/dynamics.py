@@ -1,7 +1,8 @@
 """Kinematics and inverse dynamics of a plant at many instants, by Drake."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -29,6 +30,15 @@ def path(plant: MultibodyPlant, frame: Frame) -> KinematicPath:
     return KinematicPath(np.array(positions, dtype=int), np.array(velocities, dtype=int))
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """A function of a plant's state."""
+
+    shape: tuple[int, ...]
+    # Of the state that the plant is in, the k-th of several.
+    at: Callable[[int], np.ndarray]
+
+
 class PlantDynamics:
     """What the equation of motion of a plant takes, at M instants."""
 
@@ -36,66 +46,64 @@ class PlantDynamics:
         """Takes a finalized plant, with its default parameters."""
         self._plant, self._context = plant, plant.CreateDefaultContext()
 
-    def inverse_dynamics(
-        self, states: np.ndarray, accelerations: np.ndarray, *, forces: bool
-    ) -> np.ndarray:
-        """Generalized forces that a motion needs, (M, velocities).
+    def evaluated(self, quantities: Sequence[Quantity], states: np.ndarray) -> list[np.ndarray]:
+        """Values of several quantities, (M, ...) each.
+
+        State by state: the kinematics that Drake finds for one of them serve the others.
 
         Args:
-            states: positions and velocities of the plant, (M, positions + velocities).
-            accelerations: (M, velocities).
+            states: positions and velocities of the plant, (M, positions + velocities), or
+                positions alone where no quantity depends on more.
+        """
+        plant, context = self._plant, self._context
+        whole = states.shape[1] == plant.num_multibody_states()
+        take = plant.SetPositionsAndVelocities if whole else plant.SetPositions
+        results = [np.empty((len(states), *quantity.shape)) for quantity in quantities]
+        for k, state in enumerate(states if quantities else ()):
+            take(context, state)
+            for result, quantity in zip(results, quantities, strict=True):
+                result[k] = quantity.at(k)
+        return results
+
+    def required_forces(self, accelerations: np.ndarray, *, forces: bool) -> Quantity:
+        """Generalized forces that a motion needs, (velocities,).
+
+        Args:
+            accelerations: of each state, (M, velocities).
             forces: is there what its gravity, springs and dampers give?
         """
         plant, context, given = self._plant, self._context, MultibodyForces(self._plant)
-        result = np.empty(accelerations.shape)
-        for k, (state, acceleration) in enumerate(zip(states, accelerations, strict=True)):
-            plant.SetPositionsAndVelocities(context, state)
+
+        def at(k: int) -> np.ndarray:
             if forces:
                 plant.CalcForceElementsContribution(context, given)
-            result[k] = plant.CalcInverseDynamics(context, acceleration, given)
-        return result
+            return plant.CalcInverseDynamics(context, accelerations[k], given)
 
-    def jacobians(self, frames: Sequence[Frame], positions: np.ndarray) -> np.ndarray:
-        """Jacobian of the spatial velocity [angular, linear] of some frames of the plant in the
-        world, in their own axes, (frames, M, 6, velocities)."""
-        plant, context, world = self._plant, self._context, self._plant.world_frame()
-        result = np.empty((len(frames), len(positions), 6, plant.num_velocities()))
-        for k, position in enumerate(positions):
-            plant.SetPositions(context, position)
-            for f, frame in enumerate(frames):
-                result[f, k] = plant.CalcJacobianSpatialVelocity(
-                    context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
-                )
-        return result
+        return Quantity((plant.num_velocities(),), at)
 
-    def mass_matrices(self, positions: np.ndarray) -> np.ndarray:
-        """Mass matrix of the plant, (M, velocities, velocities)."""
-        velocities = self._plant.num_velocities()
-        result = np.empty((len(positions), velocities, velocities))
-        for k, position in enumerate(positions):
-            self._plant.SetPositions(self._context, position)
-            result[k] = self._plant.CalcMassMatrix(self._context)
-        return result
+    def jacobian(self, frame: Frame) -> Quantity:
+        """Of the spatial velocity [angular, linear] of a frame of the plant in the world, in its
+        own axes, (6, velocities)."""
+        calculate, how = self._plant.CalcJacobianSpatialVelocity, self._how(frame)
+        return Quantity((6, self._plant.num_velocities()), lambda _: calculate(*how))
 
-    def bias_accelerations(self, frames: Sequence[Frame], states: np.ndarray) -> np.ndarray:
-        """Spatial acceleration [angular, linear] of some frames in the world without any
-        accelerations of joints, in their own axes, (frames, M, 6)."""
-        plant, context, world = self._plant, self._context, self._plant.world_frame()
-        result = np.empty((len(frames), len(states), 6))
-        for k, state in enumerate(states):
-            plant.SetPositionsAndVelocities(context, state)
-            for f, frame in enumerate(frames):
-                bias = plant.CalcBiasSpatialAcceleration(
-                    context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
-                )
-                result[f, k] = bias.get_coeffs()
-        return result
+    def bias_acceleration(self, frame: Frame) -> Quantity:
+        """Spatial acceleration [angular, linear] of a frame in the world without any accelerations
+        of joints, in its own axes, (6,)."""
+        calculate, how = self._plant.CalcBiasSpatialAcceleration, self._how(frame)
+        return Quantity((6,), lambda _: calculate(*how).get_coeffs())
 
-    def rotations(self, frames: Sequence[Frame], positions: np.ndarray) -> np.ndarray:
-        """Orientation R_WS of some frames S in the world W, (frames, M, 3, 3)."""
-        result = np.empty((len(frames), len(positions), 3, 3))
-        for k, position in enumerate(positions):
-            self._plant.SetPositions(self._context, position)
-            for f, frame in enumerate(frames):
-                result[f, k] = frame.CalcRotationMatrixInWorld(self._context).matrix()
-        return result
+    def _how(self, frame: Frame) -> tuple[Any, ...]:
+        """For Drake: of the frame's origin, in the world, in the frame's axes."""
+        world = self._plant.world_frame()
+        return self._context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
+
+    def mass_matrix(self) -> Quantity:
+        """Of the plant, (velocities, velocities)."""
+        size, calculate = self._plant.num_velocities(), self._plant.CalcMassMatrix
+        return Quantity((size, size), lambda _: calculate(self._context))
+
+    def rotation(self, frame: Frame) -> Quantity:
+        """Orientation R_WS of a frame S in the world W, (3, 3)."""
+        calculate = frame.CalcRotationMatrixInWorld
+        return Quantity((3, 3), lambda _: calculate(self._context).matrix())

@@ -58,7 +58,7 @@ _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
 _EVALUATIONS = 8
 # Most numbers that one array of columns may have before it is averaged over blocks.
-_CHUNK = 5_000_000
+_CHUNK = 250_000
 # Effects that add in proportion to their linear parameters, however large these are.
 _PROPORTIONAL = (JointTorqueEffect, ContactEffect)
 

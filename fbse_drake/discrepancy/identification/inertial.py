@@ -86,10 +86,9 @@ def inertial_regressor(equation: EquationOfMotion, at: Instants, body: str) -> n
     gravity = (
         np.zeros(3) if equation.robot.has_floating_base else plant.gravity_field().gravity_vector()
     )
-    positions = states[:, : plant.num_positions()]
-    (J,) = equation.dynamics.jacobians([frame], positions)
-    (bias,) = equation.dynamics.bias_accelerations([frame], states)
-    (R_WB,) = equation.dynamics.rotations([frame], positions)
+    dynamics = equation.dynamics
+    wanted = [dynamics.jacobian(frame), dynamics.bias_acceleration(frame), dynamics.rotation(frame)]
+    J, bias, R_WB = dynamics.evaluated(wanted, states)
     g = gravity @ R_WB
     V = np.einsum("mij,mj->mi", J, states[:, plant.num_positions() :])
     A = np.einsum("mij,mj->mi", J, accelerations) + bias

@@ -23,7 +23,7 @@ import fnmatch
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -43,7 +43,7 @@ from fbse_drake.held_readings import (
     unseen_variance,
 )
 from fbse_drake.log import Log
-from fbse_drake.robot.dynamics import PlantDynamics, path
+from fbse_drake.robot.dynamics import PlantDynamics, Quantity, path
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.foot_force import wrench_deviations
@@ -376,14 +376,13 @@ class Unseen:
         return Unseen(self.torque[instants], self.specific_force[instants], wrenches)
 
 
-class _LastResults:
-    """The last results of a calculation, by the arrays that they depend on."""
+class _Remembered:
+    """A function of the plant's state, with its last results by the arrays that they depend on."""
 
-    def __init__(self) -> None:
-        self._results: Memory[np.ndarray] = Memory(_REMEMBERED)
-
-    def of(self, *arrays: np.ndarray, made: Callable[[], np.ndarray]) -> np.ndarray:
-        return self._results.or_made(tuple(array.tobytes() for array in arrays), made)
+    def __init__(self, quantity: Callable[[np.ndarray], Quantity]):
+        """Takes the function by the accelerations of the states, (M, velocities)."""
+        self.quantity = quantity
+        self.results: Memory[np.ndarray] = Memory(_REMEMBERED)
 
 
 class _Sole:
@@ -393,28 +392,28 @@ class _Sole:
     those of another leg, does not make it computed again.
     """
 
-    def __init__(self, robot: Robot, dynamics: PlantDynamics, side: str, order: np.ndarray):
-        """Takes the place of the wanted velocities in the plant's."""
-        self._frame, self._dynamics, self._order = robot.sole(side), dynamics, order
-        self._path = path(robot.plant, self._frame)
-        self._jacobians, self._bias_accelerations = _LastResults(), _LastResults()
+    def __init__(self, robot: Robot, dynamics: PlantDynamics, side: str):
+        frame = robot.sole(side)
+        self._path = path(robot.plant, frame)
+        self._jacobian = _Remembered(lambda _: dynamics.jacobian(frame))
+        self._bias_acceleration = _Remembered(lambda _: dynamics.bias_acceleration(frame))
 
-    def jacobian(self, positions: np.ndarray) -> np.ndarray:
+    def jacobian(self, positions: np.ndarray) -> "_Wanted":
         """Of the sole's spatial velocity, in its frame, (M, 6, v)."""
-        return self._jacobians.of(
-            positions[:, self._path.positions],
-            made=lambda: self._dynamics.jacobians([self._frame], positions)[0][..., self._order],
-        )
+        return _Wanted(self._jacobian, (positions[:, self._path.positions].tobytes(),))
 
-    def bias_acceleration(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """Of the sole's translational acceleration, in its frame, (M, 3)."""
-        return self._bias_accelerations.of(
-            positions[:, self._path.positions],
-            velocities[:, self._path.velocities],
-            made=lambda: self._dynamics.bias_accelerations(
-                [self._frame], np.hstack([positions, velocities])
-            )[0][:, 3:],
-        )
+    def bias_acceleration(self, positions: np.ndarray, velocities: np.ndarray) -> "_Wanted":
+        """Of the sole's spatial acceleration, in its frame, (M, 6)."""
+        at = positions[:, self._path.positions], velocities[:, self._path.velocities]
+        return _Wanted(self._bias_acceleration, tuple(array.tobytes() for array in at))
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """A function that is wanted at some states, and what its results there depend on."""
+
+    function: _Remembered
+    key: tuple[bytes, ...]
 
 
 class EquationOfMotion:
@@ -441,19 +440,22 @@ class EquationOfMotion:
         self._upright = robot.base_pose_positions(RigidTransform())
         self._joints = slice(len(self._order) - n, None)
         self._soles = (
-            [_Sole(robot, self.dynamics, side, self._order) for side in robot.description.sides]
+            [_Sole(robot, self.dynamics, side) for side in robot.description.sides]
             if robot.has_floating_base
             else []
         )
         self._pairs = foot_pairs(robot) if robot.has_floating_base else []
-        self._inverse_dynamics = _LastResults()
+        # Without the forces of the feet.
+        self._inverse_dynamics = _Remembered(
+            partial(self.dynamics.required_forces, forces=not robot.has_floating_base)
+        )
 
     def sole_rotations(self, joint_position: np.ndarray) -> list[np.ndarray]:
         """R_BF of each sole, (M, 3, 3) each, in postures (M, n)."""
         soles = [self.robot.sole(side) for side in self.robot.description.sides]
         positions = np.tile(self._upright, (len(joint_position), 1))
         positions[:, self.robot.position_index] = joint_position
-        return list(self.dynamics.rotations(soles, positions))
+        return self.dynamics.evaluated([*map(self.dynamics.rotation, soles)], positions)
 
     def wrenches(self, pad_force: np.ndarray) -> list[np.ndarray]:
         """Wrench [moment, force] on each sole in its frame, (M, 6) each, from (M, P, 3)."""
@@ -498,13 +500,18 @@ class EquationOfMotion:
             ]
             return np.concatenate([self.residual(piece, kinematic=kinematic) for piece in pieces])
         states, accelerations = self.plant_motion(at)
-        generalized = self._inverse_dynamics.of(
-            states, accelerations, made=lambda: self._calc_inverse_dynamics(states, accelerations)
-        )
         positions, velocities = np.split(states, [self.robot.plant.num_positions()], axis=1)
+        wanted = [
+            _Wanted(self._inverse_dynamics, (states.tobytes(), accelerations.tobytes())),
+            *(sole.jacobian(positions) for sole in self._soles),
+        ]
+        if kinematic:
+            wanted += [sole.bias_acceleration(positions, velocities) for sole in self._soles]
+        required, *of_soles = self._evaluated(wanted, states, accelerations)
+        generalized = required[:, self._order]
         rates, kinematic_rows = velocities[:, self._order], []
         if self.robot.has_floating_base:
-            J = self._jacobians(positions)
+            J = self._in_our_order(of_soles[: len(self._soles)], len(positions))
             for foot, wrench in enumerate(self.wrenches(at.pad_force)):
                 generalized = generalized - np.einsum("mi,mij->mj", wrench, J[foot])
             if kinematic:
@@ -512,8 +519,8 @@ class EquationOfMotion:
                 specific_force = np.einsum(
                     "fmij,mj->fmi", J[:, :, 3:], accelerations[:, self._order]
                 )
-                for foot, sole in enumerate(self._soles):
-                    specific_force[foot] += sole.bias_acceleration(positions, velocities)
+                for foot, bias in enumerate(of_soles[len(self._soles) :]):
+                    specific_force[foot] += bias[:, 3:]
                 specific_force[:, :, 2] -= self.gravity
                 kinematic_rows = [
                     rows[foot]
@@ -542,17 +549,31 @@ class EquationOfMotion:
         rates = velocities[:, self._order[self._joints]]
         return self._jacobians(positions)[..., self._joints] * rates[:, None]
 
-    def _calc_inverse_dynamics(self, states: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
-        """Generalized forces without those of the feet, (M, v), in our order."""
-        fixed = not self.robot.has_floating_base
-        return self.dynamics.inverse_dynamics(states, accelerations, forces=fixed)[:, self._order]
-
     def _jacobians(self, positions: np.ndarray) -> np.ndarray:
         """Jacobian of the spatial velocity of each sole, in its frame, (feet, M, 6, v)."""
-        result = np.empty((len(self._soles), len(positions), 6, len(self._order)))
-        for foot, sole in enumerate(self._soles):
-            result[foot] = sole.jacobian(positions)
+        wanted = [sole.jacobian(positions) for sole in self._soles]
+        found = self._evaluated(wanted, positions, np.zeros((len(positions), 0)))
+        return self._in_our_order(found, len(positions))
+
+    def _in_our_order(self, jacobians: Sequence[np.ndarray], instants: int) -> np.ndarray:
+        """Jacobians of all soles by our velocities, (feet, M, 6, v)."""
+        result = np.empty((len(jacobians), instants, 6, len(self._order)))
+        for foot, jacobian in enumerate(jacobians):
+            result[foot] = jacobian[..., self._order]
         return result
+
+    def _evaluated(
+        self, wanted: Sequence[_Wanted], states: np.ndarray, accelerations: np.ndarray
+    ) -> list[np.ndarray]:
+        """Functions of the plant's state; those of which no result is remembered together, see
+        `PlantDynamics.evaluated`."""
+        new = [one for one in wanted if one.key not in one.function.results]
+        found = self.dynamics.evaluated(
+            [one.function.quantity(accelerations) for one in new], states
+        )
+        for one, result in zip(new, found, strict=True):
+            one.function.results[one.key] = result
+        return [one.function.results[one.key] for one in wanted]
 
     @property
     def row_velocities(self) -> np.ndarray:
@@ -620,7 +641,8 @@ class EquationOfMotion:
             [np.full(3 * floating, gyro), np.zeros(3 * floating), np.full(n, velocity_noise)]
         )
         joints_first = np.concatenate([np.arange(v - n, v), np.arange(v - n)])
-        H = self.dynamics.mass_matrices(positions)[:, self._order[joints_first]][:, :, self._order]
+        (mass,) = self.dynamics.evaluated([self.dynamics.mass_matrix()], positions)
+        H = mass[:, self._order[joints_first]][:, :, self._order]
         if floating:
             white[:, :v] += accelerometer**2 * (H[:, :, 3:6] ** 2).sum(axis=2)
             white[:, :v] += np.einsum("mij,mj->mi", H[:, :, 3:6] ** 2, unseen.specific_force)
