@@ -29,6 +29,7 @@ from fbse_drake.discrepancy.diagnosis.compare import Comparison
 from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, Finding, plausible_effects
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.identify import Identification
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.reading import Reading
@@ -54,6 +55,7 @@ from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy import (
     Illustrated,
     how_it_falls,
+    what_was_looked_for,
     where_it_fails,
     why_it_fails,
     write_compare_report,
@@ -412,7 +414,8 @@ def diagnose(
         progress: is told what is being done, and may end the work with what is known then
             (`ProgressLines(print, limit=60)`).
         jobs: how many things are done side by side: from two on, effects are predicted while the
-            log is inspected, and pictures of its report are drawn while it searches.
+            log is inspected, experiments planned and pictures of its report drawn while it
+            searches.
 
     Raises:
         InputError: see `compare`; or no joint is left whose torque can be trusted.
@@ -432,22 +435,27 @@ def diagnose(
         tried = plausible_effects(averaged) if effects is None else list(effects)
         dictionary = Dictionary(averaged, tried, beside)
         dictionary.begin(processes)
+        # While it is begun the log is inspected; mostly all of it is trusted.
+        trusted = case.predictor.of(case.trusted)
+        experiments = Experiments(trusted.scenario)
+        experiments.begin(processes, beside)
 
         def draw_where(_: Progress) -> Section:
             return drawn(where_it_fails(case.comparison, case.predictor))
 
         where = processes.begin(draw_where)
-        # While it is begun the log is inspected; mostly all of it is trusted.
-        trusted = case.predictor.of(case.trusted)
         tested = {test: Predictor(case.trusted, other) for test, other in case.tests.items()}
         diagnosis = diagnose_confirmed(
-            trusted, tried, tested, progress=beside, dictionary=dictionary
+            trusted, tried, tested, progress=beside, dictionary=dictionary, experiments=experiments
         )
         if diagnosis.partial is not None:
             # It was cancelled together with the search.
             where = processes.begin(draw_where)
-        why = processes.begin(lambda _: [*map(drawn, why_it_fails(diagnosis))])
-        path = processes.begin(lambda _: [*map(drawn, how_it_falls(diagnosis, trusted.robot))])
+        others = [
+            processes.begin(lambda _: [*map(drawn, why_it_fails(diagnosis))]),
+            processes.begin(lambda _: [drawn(what_was_looked_for(diagnosis))]),
+            processes.begin(lambda _: [*map(drawn, how_it_falls(diagnosis, trusted.robot))]),
+        ]
         set_aside = {}
         if diagnosis.chosen:
             completed = addition.add(case.trusted, diagnosis.chosen)
@@ -457,7 +465,8 @@ def diagnose(
         illustrated = None
         if jobs > 1:
             (of_where,) = processes.results([where], silent, "drawing")
-            illustrated = Illustrated(of_where, *processes.results([why, path], silent, "drawing"))
+            why, (looked_for,), path = processes.results(others, silent, "drawing")
+            illustrated = Illustrated(of_where, why, looked_for, path)
     diagnosis = replace(diagnosis, set_aside=set_aside)
     return _with_case(DiagnosisResult, diagnosis, case=case, illustrated=illustrated)
 

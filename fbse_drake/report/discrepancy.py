@@ -142,10 +142,11 @@ def write_compare_report(
 @dataclass(frozen=True)
 class Illustrated:
     """What the report of a diagnosis says in sections with pictures: `where_it_fails`,
-    `why_it_fails` and `how_it_falls`."""
+    `why_it_fails`, `what_was_looked_for` and `how_it_falls`."""
 
     where: Section
     why: Sequence[Section]
+    looked_for: Section
     path: Sequence[Section]
 
     @classmethod
@@ -160,6 +161,7 @@ class Illustrated:
         return cls(
             where_it_fails(comparison, predictor),
             why_it_fails(diagnosis),
+            what_was_looked_for(diagnosis),
             how_it_falls(diagnosis, predictor.robot),
         )
 
@@ -199,7 +201,7 @@ def write_diagnosis_report(
         _summary(rows),
         illustrated.where,
         *illustrated.why,
-        _what_was_looked_for(statuses),
+        illustrated.looked_for,
         *illustrated.path,
         _hygiene(predictor, inputs),
         _reproduce("diagnose", predictor, inputs),
@@ -412,6 +414,11 @@ def _why(
             "to."
         )
     return [Section("Why it fails", text, tuple(tables), tuple(blocks))] if tables or blocks else []
+
+
+def what_was_looked_for(diagnosis: Diagnosis) -> Section:
+    """What the data says of every effect of the library that can be in such a robot."""
+    return _what_was_looked_for(applicable(diagnosis.effects))
 
 
 def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:

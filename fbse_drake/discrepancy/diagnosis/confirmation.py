@@ -17,6 +17,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import (
     plausible_effects,
 )
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.validation import LEVEL, validated
 from fbse_drake.effects.effect import Effect
@@ -34,15 +35,20 @@ def diagnose_confirmed(
     *,
     progress: Progress = silent,
     dictionary: Dictionary | None = None,
+    experiments: Experiments | None = None,
 ) -> Diagnosis:
     """A diagnosis as by `diagnose`, without effects that raise the error of data set aside.
 
     Args:
         tests: the predictor's model over logs set aside, by name.
-        dictionary: see `diagnose`.
+        dictionary, experiments: see `diagnose`.
     """
     tried = plausible_effects(predictor) if effects is None else list(effects)
-    diagnosis = diagnose(predictor, tried, progress=progress, dictionary=dictionary)
+    # Planned once for all searches.
+    experiments = experiments or Experiments(predictor.scenario)
+    diagnosis = diagnose(
+        predictor, tried, progress=progress, dictionary=dictionary, experiments=experiments
+    )
     refuted: dict[str, tuple[Finding, ...]] = {}
     statuses: dict[str, EffectStatus] = {}
     for _ in range(_MOST_SEARCHES):
@@ -59,7 +65,7 @@ def diagnose_confirmed(
             if name in diagnosis.effects
         }
         tried = [effect for effect in tried if effect.__name__ not in refuted]
-        diagnosis = diagnose(predictor, tried, progress=progress)
+        diagnosis = diagnose(predictor, tried, progress=progress, experiments=experiments)
     together = tuple(finding for findings in refuted.values() for finding in findings)
     return replace(diagnosis, effects=diagnosis.effects | statuses, refuted=together)
 

@@ -176,6 +176,7 @@ def diagnose(
     *,
     progress: Progress = silent,
     dictionary: Dictionary | None = None,
+    experiments: Experiments | None = None,
 ) -> Diagnosis:
     """Finds the effects that a model lacks.
 
@@ -187,6 +188,7 @@ def diagnose(
         effects: what is tried; by default `plausible_effects`.
         progress: is told what is being done. If it interrupts the work, the diagnosis is partial.
         dictionary: of these effects, begun already; it is used where it is of this log and model.
+        experiments: of this robot, begun already; they are used where they serve this model.
     """
     predictor, averaging = averaged_to_bandwidth(predictor)
     tried = plausible_effects(predictor) if effects is None else list(effects)
@@ -215,7 +217,8 @@ def diagnose(
             if dictionary.inertia is not None:
                 alternatives = rivals(proposals, final)
             equal = indistinguishable(fits, alternatives, final)
-            experiments = Experiments(predictor.scenario)
+            if experiments is None or not experiments.serve(predictor.scenario):
+                experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
                 statuses[effect.__name__] = _status(fits, final, effect, equal, experiments)

@@ -157,6 +157,8 @@ class Dictionary:
 
     def begin(self, processes: Processes) -> None:
         """Begins to predict `fixed` beside other work."""
+        # Found once for both processes.
+        self.predictor.residual  # noqa: B018
         task = processes.begin(self._fixed)
 
         def result() -> list[list[FixedColumns]]:

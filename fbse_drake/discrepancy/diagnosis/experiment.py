@@ -1,7 +1,7 @@
 """Which experiment would decide between effects, told from the planned motions of scenarios."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +12,12 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants
+from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants, Residual
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log
+from fbse_drake.processes import Processes
+from fbse_drake.progress import Progress
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario, build_robot, load_scenario
 from fbse_drake.walking.plan import YawMotion
@@ -117,6 +119,17 @@ def _standing_forces(equation: EquationOfMotion, at: Instants, support: np.ndarr
     return forces.reshape(len(needed), pads, 3)
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """A motion of a shipped scenario, as the robot would make it."""
+
+    shipped: Scenario
+    # What it would record; what rigid bodies leave of that, and what the model leaves.
+    log: Log
+    rigid: Residual
+    white: WhitenedResidual
+
+
 class Experiments:
     """Motions that a robot could make, and what each would show."""
 
@@ -127,36 +140,71 @@ class Experiments:
             scenario: whose model and sensors make the motions of the shipped scenarios.
         """
         self._scenario = scenario
+        self._planned_beside: Callable[[], dict[str, _Motion]] | None = None
+
+    def serve(self, scenario: Scenario) -> bool:
+        """Would another scenario's robot make the same motions, and record the same?"""
+        return all(
+            getattr(self._scenario, name) == getattr(scenario, name)
+            for name in ("reference", "believed", "sensors", "estimator", "compensation")
+        )
+
+    def begin(self, processes: Processes, progress: Progress) -> None:
+        """Begins to plan the motions beside other work.
+
+        Args:
+            progress: is told where that is waited for.
+        """
+        task = processes.begin(lambda _: self._planned())
+
+        def result() -> dict[str, _Motion]:
+            (found,) = processes.results([task], progress, "planning experiments")
+            return found
+
+        self._planned_beside = result
+
+    @cached_property
+    def _motions(self) -> dict[str, _Motion]:
+        """By the scenario's name."""
+        return self._planned() if self._planned_beside is None else self._planned_beside()
+
+    def _planned(self) -> dict[str, _Motion]:
+        found = {}
+        for name, shipped in _shipped(self._scenario).items():
+            wanted = self._made_by_us(shipped)
+            try:
+                predictor = Predictor(wanted, planned_log(wanted))
+            except InputError:
+                continue  # A motion that this robot cannot make shows nothing.
+            white = WhitenedResidual(predictor.residual)
+            found[name] = _Motion(shipped, predictor.log, predictor.motion.residual, white)
+        return found
+
+    def _made_by_us(self, shipped: Scenario) -> Scenario:
+        """A shipped scenario with our model and sensors, to which its estimator need not fit."""
+        period = max(shipped.log.period, shipped.recording.block / _SAMPLES)
+        gantry_height = shipped.robot.gantry_height
+        return replace(
+            shipped,
+            model=replace(self._scenario.believed, gantry_height=gantry_height),
+            log=replace(shipped.log, period=period),
+            sensors=self._scenario.sensors,
+            estimator=self._scenario.estimator,
+            compensation=self._scenario.compensation,
+        )
 
     @cached_property
     def _predictors(self) -> dict[str, Predictor]:
-        """What each motion would record, by the scenario's name."""
         found = {}
-        for name, other in _motions(self._scenario).items():
-            model = replace(self._scenario.believed, gantry_height=other.robot.gantry_height)
-            period = max(other.log.period, other.recording.block / _SAMPLES)
-            try:
-                # With our sensors, to which the other's estimator need not fit.
-                wanted = replace(
-                    other,
-                    model=model,
-                    log=replace(other.log, period=period),
-                    sensors=self._scenario.sensors,
-                    estimator=self._scenario.estimator,
-                    compensation=self._scenario.compensation,
-                )
-                found[name] = Predictor(wanted, planned_log(wanted))
-            except InputError:
-                continue  # A motion that this robot cannot make shows nothing.
+        for name, motion in self._motions.items():
+            predictor = found[name] = Predictor(self._made_by_us(motion.shipped), motion.log)
+            # It may be another process that found it.
+            predictor.motion.residual = motion.rigid
         return found
-
-    @cached_property
-    def _whitened(self) -> dict[str, WhitenedResidual]:
-        return {name: WhitenedResidual(p.residual) for name, p in self._predictors.items()}
 
     def _fits(self, effect: type[Effect]) -> dict[str, Fits]:
         return {
-            name: Fits(Dictionary(predictor, [effect]), self._whitened[name])
+            name: Fits(Dictionary(predictor, [effect]), self._motions[name].white)
             for name, predictor in self._predictors.items()
         }
 
@@ -185,7 +233,7 @@ class Experiments:
         return best if best is not None and differences[best] > MARGIN else None
 
 
-def _motions(scenario: Scenario) -> dict[str, Scenario]:
+def _shipped(scenario: Scenario) -> dict[str, Scenario]:
     """Shipped scenarios in which the same robot moves otherwise, by name."""
     found: dict[str, Scenario] = {}
     for path in sorted(resources.folder("scenarios").glob("*.yaml")):
