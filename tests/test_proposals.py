@@ -20,7 +20,7 @@ def bound_and_drop(residual: np.ndarray, columns: np.ndarray) -> tuple[float, fl
     added = Signature(np.arange(ROWS), columns)
     before, after = regression.fit([known]), regression.fit([known, added])
     beside = Remainder(regression, (known,), before.parameters, white.scale(before.sse), tied=False)
-    alone = [fixed_gain(*beside.moments(added, row)) for row in range(ROWS)]
+    alone = [fixed_gain(*of_row) for of_row in beside.moments(added)]
     bound = largest_drop(white, before.sse, added.rows, alone)
     return bound, white.deviance(before.sse) - white.deviance(after.sse)
 

@@ -124,7 +124,7 @@ def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool, across:
     base = found.fit(known)
     scale = np.ones(ROWS)
     beside = Remainder(found, tuple(known), base.parameters, scale, tied=tied)
-    gram, right = beside.moments(new, 0)
+    gram, right = beside.moments(new)[0]
 
     def columns(signatures: Sequence[Signature]) -> np.ndarray:
         parts = []

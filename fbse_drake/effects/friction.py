@@ -7,7 +7,13 @@ from typing import ClassVar
 import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Reduction, Rise
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    OnDemand,
+    Reduction,
+    Rise,
+)
 
 _COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
 _VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
@@ -55,9 +61,9 @@ class CoulombFriction(JointTorqueEffect):
     @staticmethod
     def basis(
         motion: JointMotion, nonlinear: np.ndarray
-    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
-        return (sign,), (slope,)
+    ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
+        tanh = np.tanh(motion.velocity / nonlinear[0])
+        return (tanh,), OnDemand(lambda: ((1.0 - tanh * tanh) / nonlinear[0],))
 
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
@@ -203,8 +209,12 @@ class StribeckFriction(JointTorqueEffect):
     ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
         # Rows: gamma2, gamma3, gamma5.
         tanh = _tanh_each_once(nonlinear, motion.velocity)
-        slope = nonlinear * (1.0 - tanh * tanh)
-        return (tanh[0] - tanh[1], tanh[2], motion.velocity), (slope[0] - slope[1], slope[2], 1.0)
+
+        def slopes() -> Sequence[np.ndarray | float]:
+            slope = nonlinear * (1.0 - tanh * tanh)
+            return slope[0] - slope[1], slope[2], 1.0
+
+        return (tanh[0] - tanh[1], tanh[2], motion.velocity), OnDemand(slopes)
 
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004

@@ -10,9 +10,10 @@ it. An effect without linear parameters is one basis torque as it stands.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -203,6 +204,23 @@ class JointTorqueEffect(Effect):
         resolved = super().resolve(names, key=key, is_change=is_change)
         linear = resolved.linear if len(resolved.linear) else np.ones((1, len(resolved.targets)))
         return ResolvedJointTorque(type(self), resolved.targets, linear, resolved.nonlinear)
+
+
+class OnDemand(Sequence[np.ndarray | float]):
+    """Slopes that are found when they are asked for: a search asks for torques alone."""
+
+    def __init__(self, find: Callable[[], Sequence[np.ndarray | float]]):
+        self._find = find
+
+    @cached_property
+    def _found(self) -> Sequence[np.ndarray | float]:
+        return self._find()
+
+    def __getitem__(self, place: Any) -> Any:
+        return self._found[place]
+
+    def __len__(self) -> int:
+        return len(self._found)
 
 
 @dataclass(frozen=True)

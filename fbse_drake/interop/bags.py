@@ -6,13 +6,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.reader import make_reader
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.files import from_json
@@ -20,6 +16,11 @@ from fbse_drake.interop.mapping import ChannelMap, LogMap
 from fbse_drake.interop.messages import Layout
 from fbse_drake.interop.tables import Growing, Progress, listed, readable
 from fbse_drake.signals import is_channel
+
+# What reads bags is imported where there is one.
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 JOINT_STATE, IMU, WRENCH = (
     "sensor_msgs/msg/JointState",
@@ -65,7 +66,7 @@ def is_bag(path: Path) -> bool:
 class Bag:
     """An open bag."""
 
-    def __init__(self, reader: AnyReader):
+    def __init__(self, reader: "AnyReader"):
         self._reader = reader
         self._definitions = reader.typestore.fielddefs
         self._connections: dict[str, Connection] = {}
@@ -323,6 +324,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises:
         InputError: not a bag, damaged or truncated; also when that shows while it is being read.
     """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     with readable(path, "a bag"):
         if path.is_dir() and not (path / "metadata.yaml").is_file():
             files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
@@ -346,6 +350,8 @@ def own_meta(path: Path) -> dict[str, Any]:
     """
     if path.suffix != ".mcap":
         return {}
+    from mcap.reader import make_reader
+
     with readable(path, "a bag"), path.open("rb") as file:
         for record in make_reader(file).iter_metadata():
             if record.name == METADATA:

@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from fbse_drake.errors import InputError, located
 from fbse_drake.files import to_json, write_atomically, write_text
@@ -57,6 +55,9 @@ def write_mcap(log: Log, path: Path) -> None:
     Raises:
         InputError: times are negative, or it is not known where a foot's force sensors are.
     """
+    from mcap.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
     stamps = np.rint(log.time * 1e9).astype(np.int64)
     if stamps[0] < 0:
         raise InputError(

@@ -22,6 +22,8 @@ HOW_TO_ZOOM = (
 _MOST_NUMBERS = 750_000
 # Samples of an even clock are this close to a constant period.
 _EVEN = 1e-3
+# Level of gzip; with the highest a file is 4 % smaller, in more than twice the time.
+_PACKING = 4
 # Heights [px].
 _PANEL, _AROUND = 160, 110
 _BAND_OPACITY = 0.25
@@ -97,7 +99,8 @@ def plotly_gzip() -> str:
     """The library that draws charts: JavaScript, packed by gzip, in base64."""
     from plotly.offline import get_plotlyjs
 
-    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode("ascii")
+    packed = gzip.compress(get_plotlyjs().encode(), _PACKING, mtime=0)
+    return base64.b64encode(packed).decode("ascii")
 
 
 def _clock(time: np.ndarray) -> dict[str, object]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 from scipy.stats import norm
-from scipy.stats import t as student
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import FOLDS, WhitenedResidual
@@ -367,7 +367,7 @@ class _RowErrors:
             / count
         )
         mean, half = self._mean(self.error[places] * variable.sign[places], places)
-        half = max(half, norm.ppf(0.975) * noise)
+        half = max(half, ndtri(0.975) * noise)
         centre = float(variable.values[places].mean())
         return Bin(
             phase,
@@ -391,7 +391,7 @@ class _RowErrors:
         sums, sizes = np.bincount(stretch, values - mean), np.bincount(stretch)
         scatter = np.sqrt((sums**2).sum() * len(stretches) / (len(stretches) - 1)) / count
         freedom = max(1.0, count**2 / (sizes**2).sum() - 1)
-        return mean, float(student.ppf(0.975, freedom) * scatter)
+        return mean, float(stdtrit(freedom, 0.975) * scatter)
 
     def channel(self, zero: float) -> Channel:
         """What is said of the row beside its failures."""

@@ -44,7 +44,8 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
         for candidate in (c for c in fits.fixed_candidates if c.effect is effect):
             s = candidate.signature
             power = sum(
-                beside.moments(s, k)[0][0, 0] / beside.scale[row] for k, row in enumerate(s.rows)
+                gram[0, 0] / beside.scale[row]
+                for row, (gram, _) in zip(s.rows, beside.moments(s), strict=True)
             )
             result[candidate.targets[0]] = float(
                 np.sqrt(

@@ -72,15 +72,15 @@ class Proposals:
         # First, for the other effects are being predicted beside.
         for effect in dictionary.joint_effects:
             fits.grid(effect)
-        if rows is None:
-            rows = np.arange(len(beside.scale))
+        changed = np.zeros(len(beside.scale), dtype=bool)
+        changed[slice(None) if rows is None else rows] = True
         enough = share * fits.threshold[1]
         known = {c.key for c in base.candidates} | self._barred
         result = [
             self._settled(candidate, base)
             for candidate in fits.fixed_candidates
             if candidate.key not in known
-            and np.intersect1d(candidate.signature.rows, rows).size
+            and changed[candidate.signature.rows].any()
             and self._gains_enough(candidate, base, wanted, share)
         ]
         coarse: dict[tuple[str, ...], list[tuple[float, type[JointTorqueEffect], int]]] = {
@@ -94,7 +94,7 @@ class Proposals:
                 if (
                     taken & set(group)
                     or (effect, group) in self._barred
-                    or not np.intersect1d(places, rows).size
+                    or not changed[places].any()
                 ):
                     continue
                 moments = self._grid_moments(effect, places, beside)
@@ -198,7 +198,7 @@ class Proposals:
     ) -> bool:
         """Is a candidate that is no joint torque effect worth a fit?"""
         beside, s = self.fits.remainder(base), candidate.signature
-        moments = _moments(beside, s)
+        moments = beside.moments(s)
         gain = fixed_gain(*_weighted(moments, beside.scale[s.rows]))
         alone = (fixed_gain(*of_row) for of_row in moments)
         return gain > share * self.fits.required(candidate) and self._may_reach(
@@ -287,14 +287,9 @@ class Proposals:
         return chosen
 
 
-def _moments(beside: Remainder, signature: Signature) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Inner products of what an explanation leaves of columns, in each of their rows."""
-    return [beside.moments(signature, k) for k in range(len(signature.rows))]
-
-
 def _inner_products(beside: Remainder, signature: Signature) -> tuple[np.ndarray, np.ndarray]:
-    """The same, of all rows together."""
-    return _weighted(_moments(beside, signature), beside.scale[signature.rows])
+    """Inner products of what an explanation leaves of columns, in all their rows together."""
+    return _weighted(beside.moments(signature), beside.scale[signature.rows])
 
 
 def _weighted(

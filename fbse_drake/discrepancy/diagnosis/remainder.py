@@ -84,12 +84,19 @@ class Remainder:
             self._rows[row] = self._beside(row)
         return self._rows[row]
 
-    def moments(self, signature: Signature, place: int) -> tuple[np.ndarray, np.ndarray]:
-        """Inner products of a signature's columns in one of its rows, with each other (p, p) and
+    def moments(self, signature: Signature) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Inner products of a signature's columns in each of its rows, with each other (p, p) and
         with what is left (p,), of the parts that the explanation leaves."""
-        within = self._regression.products(signature, signature)[2][place]
-        gram, right = self.moments_of_sets(signature, place, within[None])
-        return gram[0], right[0]
+        within, rights = (
+            self._regression.products(signature, signature)[2],
+            self._regression.right(signature),
+        )
+        found = []
+        for place, (gram, right) in enumerate(zip(within, rights, strict=True)):
+            if self.beside(int(signature.rows[place])).signatures:
+                (gram,), (right,) = self.moments_of_sets(signature, place, gram[None])
+            found.append((gram, right))
+        return found
 
     def moments_of_sets(
         self, signature: Signature, place: int, gram: np.ndarray

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.residual import Residual
@@ -104,7 +104,7 @@ class Fit:
 
     def interval(self, confidence: float = 0.95) -> np.ndarray:
         """Confidence interval of each parameter, shape (P, 2)."""
-        half = student.ppf((1 + confidence) / 2, self.spread.freedom) * self.spread.deviation
+        half = stdtrit(self.spread.freedom, (1 + confidence) / 2) * self.spread.deviation
         return np.stack([self.parameters - half, self.parameters + half], axis=1)
 
 
@@ -286,7 +286,7 @@ class PartialFit:
                 where=borne.any(axis=0),
             )
             spread, degrees = np.sqrt(np.maximum(sandwich, least**2)), np.maximum(bearing - 1, 1.0)
-            wider = student.ppf(0.975, degrees) * spread > student.ppf(0.975, freedom) * deviation
+            wider = stdtrit(degrees, 0.975) * spread > stdtrit(freedom, 0.975) * deviation
             deviation, freedom = (
                 np.where(wider, spread, deviation),
                 np.where(wider, degrees, freedom),
