@@ -62,8 +62,8 @@ class CoulombFriction(JointTorqueEffect):
     def basis(
         motion: JointMotion, nonlinear: np.ndarray
     ) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray | float]]:
-        tanh = np.tanh(motion.velocity / nonlinear[0])
-        return (tanh,), OnDemand(lambda: ((1.0 - tanh * tanh) / nonlinear[0],))
+        sign, slope = smooth_sign(motion.velocity, nonlinear[0])
+        return (sign,), (slope,)
 
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
