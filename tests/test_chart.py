@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from plotly.graph_objects import Figure
 from test_report import joints_only_log
 
 from fbse_drake import Log
@@ -35,6 +36,8 @@ def test_a_chart_holds_its_lines():
     # One below the other, on one time axis.
     assert [own["yaxis"], other["yaxis"]] == ["y", "y2"]
     assert view["layout"]["yaxis"]["domain"][0] > view["layout"]["yaxis2"]["domain"][1]
+    # Plotly knows every option: another would raise.
+    assert len(Figure(view["data"], view["layout"]).data) == len(view["data"])
 
 
 def test_an_uneven_clock_is_kept():
