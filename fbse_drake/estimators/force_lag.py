@@ -28,8 +28,9 @@ _SMOOTHING, _SETTLED, _MEMORY, _NOISE_TIME = 0.005, 0.06, 1.0, 0.3
 _LEAST = 0.15
 # The shortest and the longest time constant that is told [s].
 _SHORTEST, _LONGEST = 3e-4, 3e-2
-# How many times as large as what noise adds the squares of the forces' rate must be.
-_CLEAR = 4.0
+# How many times as large as what noise adds the squares of the forces' rate must be: what is
+# taken off for it is known to some percent only.
+_CLEAR = 10.0
 # How much of the way in which accelerations change forces must explain to tell their lag.
 _EXPLAINED = 0.5
 # How much likelier one of two hypotheses must be to be the one that shows, as the logarithm of the
