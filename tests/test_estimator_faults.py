@@ -338,7 +338,7 @@ def recorded(
 # What of a posterior is compared, and how far it may be off [its unit] 35 ticks after the fault.
 REMAINS = {
     "friction": 0.3,
-    "residual": 1e-9,
+    "residual": 1e-4,
     "base_velocity": 3e-3,
     "rotation": 1e-3,
     "joint_acceleration": 0.15,

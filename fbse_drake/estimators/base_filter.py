@@ -408,7 +408,10 @@ def _estimate_base(
         relative = add(relative, cross(w, away))
         push = scale(1.0 / known.mass, force)
         # The gyro's own reading: a bias that is learned within a tick is no step of it.
-        cross_check(x.check, f_mean, relative, push, load_by_mass, rests, rolling, w_raw, elapsed)
+        late = round(x.force_delay.delay / known.period)
+        cross_check(
+            x.check, f_mean, relative, push, load_by_mass, rests, rolling, w_raw, late, elapsed
+        )
         if trust.max() == 0:
             shown = subtract(add(f_mean, relative), vector(x.accelerometer_bias_B))
             noise, period = sensors.acceleration_noise, known.period
@@ -701,7 +704,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         lost_since=(),
         lost_ago=(),
         **dict.fromkeys(("gyro", "accelerometer"), imu_noise_type()),
-        check=cross_check_type(feet),
+        check=cross_check_type(feet, clock),
         force_delay=force_delay_type(clock),
         force_lag=force_lag_type(clock),
         **dict.fromkeys(("pad_force", "pad_force_read"), (pads, 3)),

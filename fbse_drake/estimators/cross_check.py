@@ -5,7 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
+from fbse_drake.estimators.force_delay import room_for_delays
 from fbse_drake.estimators.records import record_type
+from fbse_drake.estimators.recursive import Clock
 from fbse_drake.estimators.spatial import (
     Vector,
     add,
@@ -38,10 +40,12 @@ _RATE_STEP, _RESTING, _PATIENCE = 0.05, 0.05, 2.0
 _LARGEST_ACCELERATION = 50.0
 
 
-def cross_check_type(feet: int) -> np.dtype:
+def cross_check_type(feet: int, clock: Clock) -> np.dtype:
     """What `cross_check` remembers: `doubt` (1 + feet,) of the IMU and of each foot, and more."""
     return record_type(
         doubt=(1 + feet,),
+        past=(room_for_delays(clock), 2, 3),
+        newest=(),
         mean=(2, 3, 3),
         load=(2, feet, 3),
         rolling=(3,),
@@ -76,6 +80,7 @@ def cross_check(
     rests: bool,
     rolling: Vector,
     rate: Vector,
+    late: int,
     elapsed: float,
 ) -> None:
     """Compares IMU, joints and foot forces, and says whom to doubt.
@@ -92,9 +97,19 @@ def cross_check(
         rests: is there a foot that stands firmly?
         rolling: its angular velocity, else zero [rad/s].
         rate: the gyro's reading [rad/s].
+        late: how many ticks ago the forces were what is read now.
     """
-    limit = _LARGEST_ACCELERATION
-    a, b, c = _clipped(f_raw, limit), _clipped(relative, limit), _clipped(push, limit)
+    limit, room = _LARGEST_ACCELERATION, len(x.past)
+    newest = (int(x.newest) + 1) % room
+    x.newest = newest
+    put(x.past[newest, 0], f_raw)
+    put(x.past[newest, 1], relative)
+    if x.age == 0.0:
+        for tick in range(room):
+            x.past[tick] = x.past[newest]
+    then = x.past[(newest - min(late, room - 1)) % room]
+    a, b = _clipped(vector(then[0]), limit), _clipped(vector(then[1]), limit)
+    c = _clipped(push, limit)
     if x.age == 0.0:
         for span in range(2):
             put(x.mean[span, 0], a)
