@@ -10,12 +10,14 @@ import pytest
 from conftest import scenario
 from rig import coverage, rms
 from scipy.stats import multivariate_normal
+from test_sampling_rates import decimated
 
 from fbse_drake import Log
 from fbse_drake.estimation import estimate
 from fbse_drake.estimators import force_balance
 from fbse_drake.estimators.force_balance import force_balance_type, watch_balance
 from fbse_drake.report.metrics import friction_error
+from fbse_drake.scenario import build_robot
 
 Run = Callable[..., Log]
 TICK, GAIN = 0.002, 0.05
@@ -162,6 +164,31 @@ def test_feet_that_read_right_are_not_blamed(run: Run, override: str):
     """Decoys: soft ground, wrong IMU, masses and encoders, and forces that are late."""
     log = run("paper_walk_fbse", "duration=3", override, "estimator=!NoEstimator {}")
     assert not told(estimate(scenario("paper_walk_fbse", "duration=3"), log).remarks)
+
+
+def test_a_robot_that_is_heavier_than_its_model_is_told(run: Run):
+    """By its thighs; nothing is said of one that is not."""
+    heavier = "robot.effects.thighs=!BodyMass {mass: {left_thigh: 1.2, right_thigh: 1.2}}"
+    walk = scenario("paper_walk_fbse", "duration=3")
+    (share,) = (
+        float(found[1])
+        for remark in estimate(walk, run("paper_walk_fbse", "duration=3", heavier)).remarks
+        if (found := re.match("The feet carry (.*) % more than the model weighs", remark))
+    )
+    plant = build_robot(walk.believed).plant
+    assert share == pytest.approx(240 / plant.CalcTotalMass(plant.CreateDefaultContext()), abs=0.3)
+    right = estimate(walk, run("paper_walk_fbse", "duration=3"))
+    assert not any("carry" in remark for remark in right.remarks)
+
+
+@pytest.mark.parametrize("every", [5, 20])
+def test_rare_readings_tell_it_as_well(run: Run, every: int):
+    """At 200 and 50 Hz."""
+    effect = "robot.effects.gain=!FootForceGain {gain: {left: -0.05}}"
+    log = decimated(run("paper_walk_fbse", "duration=3", effect), every)
+    ((foot, found),) = told(estimate(scenario("paper_walk_fbse", "duration=3"), log).remarks)
+    assert foot == "left"
+    assert found == pytest.approx(5.0, abs=0.5)
 
 
 def test_a_foot_of_four_that_reads_wrong(run: Run):

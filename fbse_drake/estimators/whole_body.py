@@ -74,8 +74,8 @@ from fbse_drake.sensors.foot_pads import FootPads, foot_wrenches
 from fbse_drake.wiring import weakly
 
 _NOT_FINITE = float(Status.NOT_FINITE)
-# A gain that is less wrong is not told of [1].
-_TOLD_GAIN = 0.005
+# A gain, or a mass, that is less wrong is not told of [1].
+_TOLD_GAIN, _TOLD_MASS = 0.005, 0.01
 # Of no delay it is known how long it has shown.
 _NO_DELAY = np.zeros(0)
 
@@ -626,12 +626,20 @@ class WholeBodyFilter(RecursiveEstimator):
 
     def findings(self, context: Context) -> tuple[str, ...]:
         x = as_record(context.get_discrete_state().value(0), self.posterior_type)
-        return tuple(
+        balance = x["force_balance"]
+        told = [
             f"Forces of the {foot} foot were found to be read {abs(100 * gain / (1 + gain)):.1f} % "
             f"too {'small' if gain > 0 else 'large'} (in a model: !FootForceGain)."
-            for foot, gain in zip(self._feet, x["force_balance"]["gains"], strict=True)
+            for foot, gain in zip(self._feet, balance["gains"], strict=True)
             if abs(gain) > _TOLD_GAIN
-        )
+        ]
+        mass = float(balance["mass"])
+        if abs(mass) > _TOLD_MASS:
+            told.append(
+                f"The feet carry {abs(100 * mass):.1f} % {'more' if mass > 0 else 'less'} than the "
+                "model weighs (in a model: !BodyMass; or !FootForceGain of all feet)."
+            )
+        return tuple(told)
 
     def _tick(
         self, context: Context, last: np.ndarray, elapsed: float, posterior: np.ndarray
