@@ -265,7 +265,9 @@ def test_friction_comes_with_torques(scenario: Scenario, log: Log) -> None:
     zeros = np.zeros_like(short["joint/position"])
     told = Log({**short.channels, "joint/torque_command": zeros}, short.meta)
     result = estimate(scenario, told)
-    assert len(result.remarks) == 1
+    # In the recording the feet do carry more than the model weighs, whatever its torques are.
+    _, carried = result.remarks
+    assert carried.startswith("The feet carry 2.")
     torque = result.log["estimate/joint/friction_torque"]
     assert torque.shape == (300, 26)
     assert np.isfinite(torque).all()
