@@ -8,6 +8,7 @@ import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.transmission import JointSpring
 
 
 @in_library
@@ -32,6 +33,7 @@ class Counterbalance(JointTorqueEffect):
         name: Parameter("Nm", linear=True, plausible=(-500.0, 500.0), bounds=(-np.inf, np.inf))
         for name in ("cosine", "sine")
     }
+    in_part: ClassVar[type[JointTorqueEffect] | None] = JointSpring
 
     cosine: dict[str, float] = field(default_factory=dict)
     sine: dict[str, float] = field(default_factory=dict)

@@ -106,6 +106,9 @@ class JointTorqueEffect(Effect):
     shows_at_rest: ClassVar[bool] = False
     # Simpler laws that it contains, the simplest first: a diagnosis names the smallest that holds.
     reductions: ClassVar[tuple[Reduction, ...]] = ()
+    # What a part of it looks like that is too small to show what it is, see `shows_within`; that is
+    # named in its place, and it is told that it may be this one.
+    in_part: ClassVar[type["JointTorqueEffect"] | None] = None
 
     @staticmethod
     @abstractmethod

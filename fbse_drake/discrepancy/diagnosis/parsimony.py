@@ -23,8 +23,9 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
-from fbse_drake.discrepancy.diagnosis.selection import is_significant
+from fbse_drake.discrepancy.diagnosis.selection import is_shown, is_significant
 from fbse_drake.discrepancy.diagnosis.spread import recordings
+from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -161,7 +162,7 @@ class Judge:
         if fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction:
             # Every joint has it: what identification begins with needs no proof against chance.
             again = fits.explain([*rest.candidates, member])
-            return is_significant(fits, rest, again, member)
+            return is_shown(fits, member) and is_significant(fits, rest, again, member)
         return self._are_proven(rest, whole, [member]) and self._is_sound(rest, whole, member)
 
     def pay_together(
@@ -211,8 +212,28 @@ class Judge:
             not worse[rows].any()
             and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
+            and self._is_all_of_it(rest, whole, member)
+            and is_shown(fits, member)
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
         )
+
+    def _is_all_of_it(self, rest: Explanation, whole: Explanation, member: Candidate) -> bool:
+        """Does a member that has no amount, which so claims how much there is, leave none of it?
+
+        Beside a model that is not exact any such law takes some of what is left, as a limit does
+        of a spike while the command is large. If the log asks for another multiple of the law, not
+        by chance, and that explains more than a small part of what the law does, it is not it.
+        """
+        multiple = with_amount(member)
+        if multiple is None:
+            return True
+        others = [c for c in whole.candidates if c is not member]
+        freed = self._fits.explain([*others, multiple])
+        by_law, by_multiple = (
+            float((a.held_out_sse - b.held_out_sse)[member.signature.rows].sum())
+            for a, b in ((rest, whole), (whole, freed))
+        )
+        return by_multiple < _LEAST_OF_REST * by_law or self.is_as_good(whole, freed)
 
     def _stands_out(
         self, rest: Explanation, whole: Explanation, rows: np.ndarray, share: float
@@ -313,6 +334,22 @@ def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]
     return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
 
 
+def with_amount(member: Candidate) -> Candidate | None:
+    """A joint torque law that has no amount with one, its last column; None for other members."""
+    if member.has_linear or not issubclass(member.effect, JointTorqueEffect):
+        return None
+
+    def scaled(law: Signature) -> Signature:
+        return replace(
+            law,
+            values=np.concatenate([law.values, np.asarray(law.offset)[..., None]], axis=2),
+            prior=np.append(law.prior, 0.0),
+            lowest=np.append(law.lowest, -np.inf),
+        )
+
+    return replace(member, signature=scaled(member.signature), source=lambda: scaled(member.raw))
+
+
 def _is_one_law(member: Candidate, other: Candidate) -> bool:
     """Are two members one law, in joints whose drives are of one kind?"""
     units = [{p.unit for p in c.parameters.values()} for c in (member, other)]
@@ -352,7 +389,8 @@ def _is_beyond_its_range(member: Candidate) -> bool:
 def _on_fewer_targets(
     proposals: Proposals, judge: Judge, explanation: Explanation
 ) -> Iterator[Explanation]:
-    """Without targets of a member whose held-out error the shared values raise."""
+    """Without targets of a member whose held-out error the shared values raise, or where it does
+    nothing at the values that were found."""
     for member in explanation.candidates:
         if len(member.targets) == 1 or not issubclass(member.effect, JointTorqueEffect):
             continue
@@ -360,9 +398,20 @@ def _on_fewer_targets(
         rest = proposals.fits.explain(others)
         gain = judge.gain_by_row(rest, explanation)
         rows_of = proposals.fits.dictionary.rows_of
-        kept = tuple(t for t in member.targets if gain[rows_of(member.effect, [t])].sum() > -MARGIN)
+        acting = member.signature.rows[_acts(member.signature)]
+        kept = tuple(
+            t
+            for t in member.targets
+            if gain[rows := rows_of(member.effect, [t])].sum() > -MARGIN
+            and np.isin(rows, acting).any()
+        )
         if kept and len(kept) < len(member.targets):
             yield proposals.beside(rest, member.effect, kept)
+
+
+def _acts(law: Signature) -> np.ndarray:
+    """In which of its rows a law does something, (r,)."""
+    return law.values.any(axis=(0, 2)) | np.any(law.offset, axis=0)
 
 
 def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:

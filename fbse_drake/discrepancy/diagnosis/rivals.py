@@ -16,7 +16,7 @@ from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
-from fbse_drake.discrepancy.diagnosis.selection import best_additions
+from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_shown
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
@@ -35,7 +35,8 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
     same on another body, which comes last; best first.
 
     One for each effect and targets that comes near the member; the best of them fitted by
-    themselves.
+    themselves. What the log shows a part of is among them: it cannot be named, and can be what is
+    there.
     """
     fits, result = proposals.fits, {}
     judge = Judge(fits, final)
@@ -49,7 +50,9 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
         near = max(alike, (1.0 - _NEAR) * (rest.deviance - final.deviance))
         additions = [
             e
-            for e in best_additions(proposals, rest, member.signature.rows, final.deviance + near)
+            for e in best_additions(
+                proposals, rest, member.signature.rows, final.deviance + near, in_part=True
+            )
             if rival_name(e.candidates[-1], member)
         ]
         found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]
@@ -97,6 +100,7 @@ def settled(
             for k, of_member in found.items()
             for e in of_member
             if e.deviance < final.deviance - MARGIN
+            and is_shown(fits, e.candidates[-1])
             and not _contains(e.candidates[-1].effect, final.candidates[k].effect)
             and fits.dictionary.predictor.can_have(e.effects)
         ]

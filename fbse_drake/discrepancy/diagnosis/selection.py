@@ -72,6 +72,8 @@ def best_additions(
     base: Explanation,
     rows: np.ndarray | None = None,
     most: float = np.inf,
+    *,
+    in_part: bool = False,
 ) -> list[Explanation]:
     """What one more candidate makes of an explanation, for every candidate that improves it
     significantly, best first.
@@ -82,6 +84,7 @@ def best_additions(
     Args:
         rows: only candidates that change one of these; by default all.
         most: only explanations with a smaller deviance.
+        in_part: also what the log shows a part of, too little to be named, see `shows_in_part`.
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most), []
@@ -102,7 +105,8 @@ def best_additions(
             for member in added
         )
         if all(
-            is_significant(fits, rest, wider, member)
+            (is_shown(fits, member) or (in_part and shows_in_part(proposals, rest, wider, member)))
+            and is_significant(fits, rest, wider, member)
             for rest, member in zip(without, added, strict=True)
         ):
             found.append(wider)
@@ -143,14 +147,49 @@ def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
     )
 
 
+def is_shown(fits: Fits, candidate: Candidate) -> bool:
+    """Does the log show what a candidate is, so that it can be named?"""
+    if not issubclass(candidate.effect, JointTorqueEffect):
+        return True
+    shown = candidate.effect.shows_within(_travel(fits, candidate), candidate.nonlinear)
+    return bool(np.any(shown))
+
+
+def shows_in_part(
+    proposals: Proposals, base: Explanation, wider: Explanation, added: Candidate
+) -> bool:
+    """Does the log show of a candidate at least that law which a small part of it looks like?
+
+    It does if that law's own reductions do not explain as much: nobody calls a constant torque a
+    piece of a wave.
+
+    Args:
+        base, wider: explanations without and with it.
+    """
+    fits, effect = proposals.fits, added.effect
+    if not issubclass(effect, JointTorqueEffect) or effect.in_part is None:
+        return False
+    if not _travel(fits, added).any():
+        return False
+    for reduction in effect.in_part.reductions:
+        simpler = base
+        for law in reduction.effects:
+            simpler = proposals.beside(simpler, law, added.targets)
+        more = len(wider.solved.parameters) - len(simpler.solved.parameters)
+        if simpler.deviance - wider.deviance < fits.threshold[min(12, max(1, more))]:
+            return False
+    return True
+
+
+def _travel(fits: Fits, candidate: Candidate) -> np.ndarray:
+    """Of the joints that a candidate acts in, (n,) [rad]."""
+    return fits.dictionary.travel[fits.dictionary.predictor.joints_of(candidate.signature.rows)]
+
+
 def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
     """Does a candidate bring more than chance to an explanation without it, with values that can
     be?"""
     rows = added.signature.rows
-    if issubclass(added.effect, JointTorqueEffect):
-        travel = fits.dictionary.travel[fits.dictionary.predictor.joints_of(rows)]
-        if not np.any(added.effect.shows_within(travel, added.nonlinear)):
-            return False
     if base.deviance - wider.deviance < fits.required(added):
         return False
     if fits.dictionary.per_step:
