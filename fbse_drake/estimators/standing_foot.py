@@ -51,7 +51,7 @@ FOOT_POSITION, FOOT_ORIENTATION, FOOT_VELOCITY, FOOT_RATE = cast(Sequence[int], 
 TOLD = 4
 # A foot does little in spite of all while the robot rests: this share of what it does from this
 # speed of the robot on [m/s].
-_AT_REST, _WALKING_SPEED = 0.1, 0.03
+_AT_REST, _WALKING_SPEED = 0.02, 0.03
 # How long it takes to learn what a standing foot does at present [s], by what it tells; how much of
 # that, and of larger innovations, one tick may tell; and the least that it is taken to do, as a
 # share of the variance believed.
