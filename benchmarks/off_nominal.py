@@ -5,9 +5,10 @@ are told the planned motion and nothing else: errors are put into the robot and 
 walk is simulated, and every estimator runs over the log with the scenario as it is without them.
 The momentum observer has the bandwidth that is best in each case, which nobody can know beforehand.
 
-Options: [--only CASE]... [--random N [--first NUMBER]] [--seeds N] [--duration SECONDS] [--default]
-[--jobs N] [--out DIR]. --random walks N walks instead that are drawn by their numbers: other steps,
-and a quarter of all that can be wrong with ground, robot, sensors and friction laws.
+Options: [--only CASE]... [--random N] [--trots N] [--first NUMBER] [--seeds N] [--duration SECONDS]
+[--default] [--jobs N] [--out DIR]. --random walks N walks instead that are drawn by their numbers:
+other steps, and a quarter of all that can be wrong with ground, robot, sensors and friction laws;
+--trots has a quadruped trot, likewise.
 Prints a table of means over the seeds, with the median and the worst of the NRMSE, and writes
 DIR/off_nominal.json. One process does it unless --jobs 2 says otherwise; a case takes about half a
 minute, or 10 s with --default, which leaves out the methods that the default is compared with.
@@ -28,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import off_nominal_walks
 from benchmarks.console import print_table
-from benchmarks.off_nominal_walks import CASES, PAPER_WALK, Case, case_of, random_name
+from benchmarks.off_nominal_walks import CASES, PAPER_WALK, Case, case_of, random_name, trot_name
 from benchmarks.store import Runs
 from fbse_drake import Log, load_scenario, simulate
 from fbse_drake.campaign.steps import Material
@@ -262,6 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [case.name for case in CASES]
     parser.add_argument("--only", action="append", choices=names, help="a case; may be repeated")
     parser.add_argument("--random", type=int, default=0, help="walks that are drawn at random")
+    parser.add_argument("--trots", type=int, default=0, help="trots that are drawn at random")
     parser.add_argument("--first", type=int, default=0, help="number of the first of them")
     parser.add_argument("--seeds", type=int, default=1, help="number of seeds (default 1)")
     parser.add_argument("--duration", type=float, default=4.3, help="of a walk [s] (default 4.3)")
@@ -271,8 +273,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/fbse"), help="default out/fbse")
     options = parser.parse_args(arguments)
     console = Console(width=190)
-    numbers = range(options.first, options.first + options.random)
-    wanted = [random_name(number) for number in numbers] or options.only or names
+    drawn = ((random_name, options.random), (trot_name, options.trots))
+    at_random = [name(options.first + k) for name, count in drawn for k in range(count)]
+    wanted = at_random or options.only or names
     values = [
         {"case": case, "duration": options.duration, "seed": seed, "alone": options.default}
         for case in wanted

@@ -6,8 +6,8 @@ from math import exp, log
 
 import numpy as np
 
-PAPER_WALK, HRP2_WALK = "paper_walk_fbse", "hrp2_walk_fbse"
-_RANDOM = "random"
+PAPER_WALK, HRP2_WALK, TROT = "paper_walk_fbse", "hrp2_walk_fbse", "quadruped_trot"
+_RANDOM, _RANDOM_TROT = "random", "trot"
 # So often each disturbance of a random walk is there.
 _CHANCE = 0.25
 
@@ -96,13 +96,65 @@ def random_name(number: int) -> str:
     return f"{_RANDOM} {number}"
 
 
+def trot_name(number: int) -> str:
+    """Name of a random trot of the quadruped."""
+    return f"{_RANDOM_TROT} {number}"
+
+
 def case_of(name: str) -> Case:
     """The walk of this name, chosen or random."""
     kind, _, number = name.partition(" ")
     if kind == _RANDOM:
         return _random_case(int(number))
+    if kind == _RANDOM_TROT:
+        return _random_trot(int(number))
     (case,) = (case for case in CASES if case.name == name)
     return case
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """Where a robot may differ from its model, and how far."""
+
+    # Bodies of another mass [kg] or centre of mass [m]; joints whose encoders are off; feet.
+    masses: tuple[str, ...]
+    centres: tuple[str, ...]
+    encoders: tuple[str, ...]
+    feet: tuple[str, ...]
+    mass: float
+    centre: float
+    # Coulomb friction by kind of joint [Nm], and the largest reflected inertia [kg m^2].
+    coulomb: dict[str, float]
+    rotors: float
+
+
+_BIPED = _Robot(
+    masses=("left_thigh", "right_thigh", "trunk"),
+    centres=("left_thigh", "right_shank", "trunk"),
+    encoders=("left_knee_pitch", "right_hip_roll"),
+    feet=("left", "right"),
+    mass=1.0,
+    centre=0.02,
+    coulomb={
+        "hip_yaw": 5,
+        "hip_roll": 5,
+        "hip_pitch": 6,
+        "knee_pitch": 5,
+        "ankle_pitch": 3,
+        "ankle_roll": 2,
+    },
+    rotors=0.1,
+)
+_QUADRUPED = _Robot(
+    masses=("front_left_thigh", "rear_right_shank", "trunk"),
+    centres=("front_left_thigh", "rear_right_shank", "trunk"),
+    encoders=("front_left_knee", "rear_right_hip_flexion"),
+    feet=("front_left", "front_right", "rear_left", "rear_right"),
+    mass=0.3,
+    centre=0.015,
+    coulomb={"hip_abduction": 0.8, "hip_flexion": 1.0, "knee": 1.2},
+    rotors=0.015,
+)
 
 
 def _random_case(number: int) -> Case:
@@ -111,8 +163,27 @@ def _random_case(number: int) -> Case:
     random = np.random.default_rng(number)
     is_paper = bool(random.random() < 0.7)
     told = _random_steps(random) if is_paper else ("compensation=!NoCompensation {}",)
-    untold = (text for text in _disturbances(random, is_paper) if random.random() < _CHANCE)
-    return Case(random_name(number), told, tuple(untold), PAPER_WALK if is_paper else HRP2_WALK)
+    untold = _drawn(random, _BIPED, other_friction=is_paper)
+    return Case(random_name(number), told, untold, PAPER_WALK if is_paper else HRP2_WALK)
+
+
+def _random_trot(number: int) -> Case:
+    """The trot of this number, likewise."""
+    random = np.random.default_rng(number)
+    ranges = {
+        "single_support": (0.15, 0.25),
+        "double_support": (0.12, 0.3),
+        "step_length": (-0.02, 0.04),
+        "step_height": (0.02, 0.04),
+    }
+    told = _uniform(random, ranges)
+    return Case(trot_name(number), told, _drawn(random, _QUADRUPED, other_friction=True), TROT)
+
+
+def _drawn(random: np.random.Generator, robot: _Robot, other_friction: bool) -> tuple[str, ...]:
+    """A share of all disturbances."""
+    every = _disturbances(random, robot, other_friction)
+    return tuple(text for text in every if random.random() < _CHANCE)
 
 
 def _random_steps(random: np.random.Generator) -> tuple[str, ...]:
@@ -123,10 +194,19 @@ def _random_steps(random: np.random.Generator) -> tuple[str, ...]:
         "step_length": (0.04, 0.13),
         "step_height": (0.02, 0.05),
     }
+    return _uniform(random, ranges)
+
+
+def _uniform(
+    random: np.random.Generator, ranges: dict[str, tuple[float, float]]
+) -> tuple[str, ...]:
+    """Values of the reference, as overrides."""
     return tuple(f"reference.{key}={random.uniform(*r):.3f}" for key, r in ranges.items())
 
 
-def _disturbances(random: np.random.Generator, is_paper: bool) -> Iterator[str]:
+def _disturbances(
+    random: np.random.Generator, robot: _Robot, other_friction: bool
+) -> Iterator[str]:
     """Every kind once, of a size that robots have."""
 
     def vector(size: float, axes: int = 3) -> str:
@@ -144,26 +224,24 @@ def _disturbances(random: np.random.Generator, is_paper: bool) -> Iterator[str]:
 
     yield f"ground.slope={vector(0.03, axes=2)}"
     yield f"ground.stiffness={between(8e4, 1e6):.3g}"
-    yield effect("BodyMass", mass=one("left_thigh", "right_thigh", "trunk", size=1.0))
-    yield effect("BodyCentreOfMass", x=one("left_thigh", "right_shank", "trunk", size=0.02))
+    yield effect("BodyMass", mass=one(*robot.masses, size=robot.mass))
+    yield effect("BodyCentreOfMass", x=one(*robot.centres, size=robot.centre))
     yield f"sensors.imu.acceleration_bias={vector(0.2)}"
     yield f"sensors.imu.angular_velocity_bias={vector(0.03)}"
     yield f"sensors.imu.misalignment={vector(0.01)}"
     yield effect("ImuPosition", **{axis: f"{random.uniform(-0.02, 0.02):.4f}" for axis in "xyz"})
     yield f"sensors.imu.acceleration_noise={between(0.01, 0.2):.3f}"
     yield f"sensors.encoders.velocity_noise={between(1e-4, 5e-3):.5f}"
-    yield effect("EncoderOffset", offset=one("left_knee_pitch", "right_hip_roll", size=0.005))
+    yield effect("EncoderOffset", offset=one(*robot.encoders, size=0.005))
     yield f"sensors.foot_force.noise={between(0.1, 3.0):.2f}"
     yield f"sensors.foot_force.delay={random.integers(1, 12) / 1000}"
-    yield effect("FootForceGain", gain=one("left", "right", size=0.05))
-    yield effect("ReflectedInertia", inertia=f"{{all: {random.uniform(0.0, 0.1):.3f}}}")
-    if is_paper:
+    yield effect("FootForceGain", gain=one(*robot.feet, size=0.05))
+    yield effect("ReflectedInertia", inertia=f"{{all: {random.uniform(0.0, robot.rotors):.3f}}}")
+    if other_friction:
         size = between(0.3, 3.0)
-        usual = {"hip_yaw": 5, "hip_roll": 5, "hip_pitch": 6, "knee_pitch": 5, "ankle_pitch": 3}
-        of_joints = ", ".join(f"{joint}: {size * coulomb:.2f}" for joint, coulomb in usual.items())
+        of_joints = ", ".join(f"{kind}: {size * nm:.2f}" for kind, nm in robot.coulomb.items())
         yield (
-            "robot.effects.joint_friction=!CoulombViscousFriction "
-            f"{{coulomb: {{{of_joints}, ankle_roll: {2 * size:.2f}}}, "
+            f"robot.effects.joint_friction=!CoulombViscousFriction {{coulomb: {{{of_joints}}}, "
             f"viscous: {{all: {random.uniform(0.0, 3.0):.2f}}}, "
             f"transition: {{all: {between(0.005, 0.05):.4f}}}}}"
         )

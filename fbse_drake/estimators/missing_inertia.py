@@ -44,10 +44,18 @@ def full_inertia(x: Record, inertia: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def make_inertia_possible(x: Record, known: Record) -> None:
-    """Projects on what can be: no robot's rotor has a negative inertia.
+    """Projects on what can be, along the covariance: no robot's rotor has a negative inertia.
+
+    A law that was learned beside an inertia that cannot be is wrong as well, and moves with it.
 
     Args:
         known: record with the model's own `rotor_inertia` (n,) [kg m^2].
     """
-    for joint in range(len(x.weights)):
-        x.weights[joint, -1] = max(x.weights[joint, -1], -known.rotor_inertia[joint])
+    P, (n, m) = x.covariance, x.weights.shape
+    for joint in range(n):
+        beyond = x.weights[joint, -1] + known.rotor_inertia[joint]
+        if beyond < 0.0:
+            first = len(P) + m * (joint - n)
+            last = first + m - 1
+            for k in range(m):
+                x.weights[joint, k] -= P[first + k, last] * beyond / P[last, last]
