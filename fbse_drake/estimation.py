@@ -42,7 +42,8 @@ class EstimationResult(RunResult):
     def _metrics(self) -> dict[str, Any]:
         from fbse_drake.report.metrics import run_metrics
 
-        return run_metrics(self.log, float(self.tick_time.sum()), self.tick_time)
+        metrics = run_metrics(self.log, float(self.tick_time.sum()), self.tick_time)
+        return metrics | {"remarks": list(self.remarks)}
 
 
 def estimate(

@@ -1,4 +1,5 @@
 import functools
+import html
 import json
 import os
 import re
@@ -397,7 +398,7 @@ def test_estimate_writes_everything_and_equals_the_live_estimates(
     before, after = (
         json.loads((folder / "metrics.json").read_text()) for folder in (walk, tmp_path / "out")
     )
-    assert set(after) == set(before)
+    assert set(after) == set(before) | {"remarks"}
     assert 0.01 < after["friction_nrmse"]["swing"]["right_knee_pitch"] < 0.5
     assert after["friction_nrmse"]["swing"]["left_knee_pitch"] is None
     for key in ("friction_rmse", "friction_nrmse"):
@@ -481,6 +482,10 @@ def test_estimate_without_torques_says_so_in_a_line(
     assert (
         sum(line.startswith("Noise believed in, per sample: joint angle") for line in printed) == 1
     )
+    remarks = json.loads((tmp_path / "out/metrics.json").read_text())["remarks"]
+    page = (tmp_path / "out/report.html").read_text()
+    assert remarks
+    assert all(remark in printed and html.escape(remark) in page for remark in remarks)
     log = Log.load(tmp_path / "out/log.npz")
     assert "estimate/base/velocity" in log
     assert "estimate/joint/friction_torque" not in log

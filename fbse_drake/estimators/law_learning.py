@@ -68,11 +68,11 @@ def forget_unproven(x: Record, T: float, known: Record) -> None:
         T: duration of the tick [s].
     """
     for joint in range(len(x.weights)):
-        if not _is_known(x, joint, _KNOWN, known):
-            x.proven[joint] = 0.0
-        elif not _says_otherwise(x, x, joint):
-            x.proven[joint] += T if x.rested[joint] == 0.0 else 0.0
-        elif x.proven[joint] < DOUBT_TIME:
+        is_known = _is_known(x, joint, _KNOWN, known)
+        if not _says_otherwise(x, x, joint):
+            moves = x.rested[joint] == 0.0
+            x.proven[joint] = x.proven[joint] + T * moves if is_known else 0.0
+        elif is_known and x.proven[joint] < DOUBT_TIME:
             x.proven[joint] -= T
             if x.proven[joint] < -AGREEMENT_TIME:
                 x.proven[joint] = 0.0

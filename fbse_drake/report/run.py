@@ -35,7 +35,7 @@ def write_run_report(
     """Writes the report of a run as one HTML file; it shows what the log has the channels for.
 
     Args:
-        metrics: contents of metrics.json, see `run_metrics`.
+        metrics: contents of metrics.json, see `run_metrics`; `remarks` of an estimate.
         name: what the scenario is called.
         folder: where log.npz and scenario.yaml lie, for the commands that the report proposes.
     """
@@ -62,7 +62,7 @@ def write_run_report(
             tables=_consistency_table(log),
             figures=figures["consistency"],
         ),
-        Section("Sensors", figures=figures["sensors"]),
+        Section("Sensors", tables=_remarks_table(metrics), figures=figures["sensors"]),
         Section(
             "Scenario",
             "The scenario as it was run, with all its defaults.",
@@ -190,6 +190,12 @@ def _friction_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
         ("Joint", "Stance, RMSE [Nm]", "Stance, NRMSE [1]", "Swing, RMSE [Nm]", "Swing, NRMSE [1]"),
         rows,
     )
+
+
+def _remarks_table(metrics: Mapping[str, Any]) -> tuple[Table, ...]:
+    """What an estimate believed of the sensors and found, sentence by sentence."""
+    rows = tuple((remark,) for remark in metrics.get("remarks", ()))
+    return (Table(("What was believed of them, and what was found",), rows),) if rows else ()
 
 
 def _consistency_table(log: Log) -> tuple[Table, ...]:
