@@ -408,31 +408,35 @@ def changed(log: Log, name: str, rows: slice, values: np.ndarray | float) -> Log
 def test_a_law_that_is_contradicted_before_it_has_proved_itself_begins_anew(
     held: float, contradicted: float, is_new: bool
 ):
-    """It has as long as it held, and 20 ms, if it did not hold for 0.1 s; another joint's law,
-    which nothing contradicts, stays."""
-    learned, start = np.array([[4.0, 9.0], [1.0, 2.0]]), np.array([[0.0, 0.5], [0.0, 0.5]])
-    rows = dict.fromkeys(("innovation", "unexplained", "agreement", "velocity"), np.zeros(5))
-    of_rows = dict.fromkeys(("innovation_variance", "unexplained_variance"), np.ones(5))
-    x = record(
-        weights=learned.copy(),
-        settled=learned.copy(),
-        regressor=np.ones((2, 2)),
-        covariance=1e-4 * (np.eye(14) + 0.5),
-        proven=np.zeros(2),
-        rested=np.zeros(2),
-        **{name: array.copy() for name, array in (rows | of_rows).items()},
-    )
+    """It has as long as it held, and 20 ms, if it did not hold for 0.1 s. Laws of other joints,
+    which nothing contradicts, stay; and so do all where many are contradicted."""
+    n, m = 4, 2
+    learned, start = np.full((n, m), 4.0), np.tile([0.0, 0.5], (n, 1))
+    rows = dict.fromkeys(("innovation", "unexplained", "agreement", "velocity"), np.zeros(3 + n))
+    of_rows = dict.fromkeys(("innovation_variance", "unexplained_variance"), np.ones(3 + n))
+    size = 2 * (3 + n) + n * m
     known = record(weights=start, weight_variance=np.array([4.0, 9.0]))
-    before = x["covariance"].copy()
-    for lasts, torque in ((held, 0.0), (contradicted, 10.0)):
-        x["unexplained"][3] = torque
-        for _ in range(round(lasts / TICK)):
-            forget_unproven(x[()], TICK, known[()])
-    np.testing.assert_array_equal(x["weights"], [start[0] if is_new else learned[0], learned[1]])
-    if is_new:
-        before[10:12], before[:, 10:12] = 0.0, 0.0
-        before[10:12, 10:12] = np.diag([4.0, 9.0])
-    np.testing.assert_array_equal(x["covariance"], before)
+    first = slice(size - n * m, size - n * m + m)
+    for many in (False, True):
+        x = record(
+            weights=learned.copy(),
+            settled=learned.copy(),
+            regressor=np.ones((n, m)),
+            covariance=1e-4 * (np.eye(size) + 0.5),
+            proven=np.zeros(n),
+            rested=np.zeros(n),
+            **{name: array.copy() for name, array in (rows | of_rows).items()},
+        )
+        weights, covariance = learned.copy(), x["covariance"].copy()
+        for lasts, torque in ((held, 0.0), (contradicted, 10.0)):
+            x["unexplained"][3 : (5 if many else 4)] = torque
+            for _ in range(round(lasts / TICK)):
+                forget_unproven(x[()], TICK, known[()])
+        if is_new and not many:
+            weights[0], covariance[first], covariance[:, first] = start[0], 0.0, 0.0
+            covariance[first, first] = np.diag([4.0, 9.0])
+        np.testing.assert_array_equal(x["weights"], weights)
+        np.testing.assert_array_equal(x["covariance"], covariance)
 
 
 @pytest.mark.parametrize("joint", ["right_knee_pitch", "left_ankle_roll"])

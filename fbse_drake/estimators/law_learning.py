@@ -60,19 +60,26 @@ def forget_unproven(x: Record, T: float, known: Record) -> None:
     """Laws that are contradicted before they have proved themselves begin anew.
 
     What a joint does first, a jerk as its foot leaves the ground, can teach a wrong law within some
-    ticks. Known by then, it would stay: what contradicts it teaches it no more.
+    ticks. Known by then, it would stay: what contradicts it teaches it no more. (What contradicts
+    many laws is no law.)
 
     Args:
-        x: record with the time `proven` (n,), for which laws have been known and held while joints
-            moved, less that for which they were contradicted [s]; goes on.
+        x: record with the time `proven` (n,), for which laws have been known and held since a joint
+            moved in a way for which its law was not, less that for which they were contradicted
+            [s]; goes on.
         T: duration of the tick [s].
     """
-    for joint in range(len(x.weights)):
+    n = len(x.weights)
+    contradicted = np.array([_says_otherwise(x, x, joint) for joint in range(n)])
+    many = contradicted.sum() > _MANY * n
+    for joint in range(n):
         is_known = _is_known(x, joint, _KNOWN, known)
-        if not _says_otherwise(x, x, joint):
-            moves = x.rested[joint] == 0.0
-            x.proven[joint] = x.proven[joint] + T * moves if is_known else 0.0
-        elif is_known and x.proven[joint] < DOUBT_TIME:
+        if not contradicted[joint]:
+            if is_known:
+                x.proven[joint] += T
+            elif x.rested[joint] == 0.0:
+                x.proven[joint] = 0.0
+        elif is_known and not many and x.proven[joint] < DOUBT_TIME:
             x.proven[joint] -= T
             if x.proven[joint] < -AGREEMENT_TIME:
                 x.proven[joint] = 0.0
