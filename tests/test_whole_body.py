@@ -20,7 +20,6 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.equation_of_motion import touching
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
-from fbse_drake.estimators.law_learning import forget_unproven
 from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import record
 from fbse_drake.estimators.whole_body import WholeBody
@@ -398,45 +397,6 @@ def changed(log: Log, name: str, rows: slice, values: np.ndarray | float) -> Log
     channel = log[name].copy()
     channel[rows] = values
     return dataclasses.replace(log, channels={**log.channels, name: channel})
-
-
-@pytest.mark.parametrize(
-    ("held", "contradicted", "is_new"),
-    [(0.0, 0.015, False), (0.0, 0.03, True), (0.05, 0.06, False), (0.05, 0.08, True)]
-    + [(0.2, 0.9, False)],
-)
-def test_a_law_that_is_contradicted_before_it_has_proved_itself_begins_anew(
-    held: float, contradicted: float, is_new: bool
-):
-    """It has as long as it held, and 20 ms, if it did not hold for 0.1 s. Laws of other joints,
-    which nothing contradicts, stay; and so do all where many are contradicted."""
-    n, m = 4, 2
-    learned, start = np.full((n, m), 4.0), np.tile([0.0, 0.5], (n, 1))
-    rows = dict.fromkeys(("innovation", "unexplained", "agreement", "velocity"), np.zeros(3 + n))
-    of_rows = dict.fromkeys(("innovation_variance", "unexplained_variance"), np.ones(3 + n))
-    size = 2 * (3 + n) + n * m
-    known = record(weights=start, weight_variance=np.array([4.0, 9.0]))
-    first = slice(size - n * m, size - n * m + m)
-    for many in (False, True):
-        x = record(
-            weights=learned.copy(),
-            settled=learned.copy(),
-            regressor=np.ones((n, m)),
-            covariance=1e-4 * (np.eye(size) + 0.5),
-            proven=np.zeros(n),
-            rested=np.zeros(n),
-            **{name: array.copy() for name, array in (rows | of_rows).items()},
-        )
-        weights, covariance = learned.copy(), x["covariance"].copy()
-        for lasts, torque in ((held, 0.0), (contradicted, 10.0)):
-            x["unexplained"][3 : (5 if many else 4)] = torque
-            for _ in range(round(lasts / TICK)):
-                forget_unproven(x[()], TICK, known[()])
-        if is_new and not many:
-            weights[0], covariance[first], covariance[:, first] = start[0], 0.0, 0.0
-            covariance[first, first] = np.diag([4.0, 9.0])
-        np.testing.assert_array_equal(x["weights"], weights)
-        np.testing.assert_array_equal(x["covariance"], covariance)
 
 
 @pytest.mark.parametrize("joint", ["right_knee_pitch", "left_ankle_roll"])
