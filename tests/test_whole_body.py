@@ -20,6 +20,7 @@ from fbse_drake.estimators.beliefs import USUAL_SENSORS
 from fbse_drake.estimators.equation_of_motion import touching
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.estimators.floating_base import ImuMount
+from fbse_drake.estimators.law_learning import forget_unproven
 from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.records import record
 from fbse_drake.estimators.whole_body import WholeBody
@@ -397,6 +398,42 @@ def changed(log: Log, name: str, rows: slice, values: np.ndarray | float) -> Log
     channel = log[name].copy()
     channel[rows] = values
     return dataclasses.replace(log, channels={**log.channels, name: channel})
+
+
+@pytest.mark.parametrize(
+    ("held", "contradicted", "is_new"),
+    [(0.0, 0.015, False), (0.0, 0.03, True), (0.05, 0.06, False), (0.05, 0.08, True)]
+    + [(0.2, 0.9, False)],
+)
+def test_a_law_that_is_contradicted_before_it_has_held_for_some_time_begins_anew(
+    held: float, contradicted: float, is_new: bool
+):
+    """It has as long as it held, and 20 ms, until it has held for 0.1 s; another joint's law, which
+    nothing contradicts, stays."""
+    n, m, size = 2, 2, 14
+    learned, start = np.full((n, m), 4.0), np.tile([0.0, 0.5], (n, 1))
+    of_rows = ("innovation", "unexplained", "agreement", "velocity")
+    variances = ("innovation_variance", "unexplained_variance")
+    x = record(
+        weights=learned.copy(),
+        settled=learned.copy(),
+        regressor=np.ones((n, m)),
+        covariance=1e-4 * (np.eye(size) + 0.5),
+        proven=np.zeros(n),
+        **{name: np.zeros(3 + n) for name in of_rows},
+        **{name: np.ones(3 + n) for name in variances},
+    )
+    known = record(weights=start, weight_variance=np.array([4.0, 9.0]))
+    covariance = x["covariance"].copy()
+    for lasts, torque in ((held, 0.0), (contradicted, 10.0)):
+        x["unexplained"][3] = torque
+        for _ in range(round(lasts / TICK)):
+            forget_unproven(x[()], TICK, known[()])
+    if is_new:
+        covariance[10:12], covariance[:, 10:12] = 0.0, 0.0
+        covariance[10:12, 10:12] = np.diag([4.0, 9.0])
+    np.testing.assert_array_equal(x["weights"], [start[0] if is_new else learned[0], learned[1]])
+    np.testing.assert_array_equal(x["covariance"], covariance)
 
 
 @pytest.mark.parametrize("joint", ["right_knee_pitch", "left_ankle_roll"])

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.records import Record
 from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, GATE, NOTICED, is_contradicted
 
@@ -10,6 +11,19 @@ from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, GATE, NOTICED, 
 _KNOWN, _WELL_KNOWN = 10.0, 30.0
 # What is contradicted in more than this share of the rows is no lack in one of them.
 _MANY = 0.3
+
+
+@njit(cache=True)
+def _is_contradicted(x: Record, judged: Record, joint: int) -> bool:
+    """Do this tick, or those before it, contradict what is known of a joint beyond chance?
+
+    Args:
+        x: record with the innovations of this tick; judged: with means of those before.
+    """
+    row = 3 + joint
+    no_noise = judged.agreement[row] > NOTICED**2
+    outlier = x.innovation[row] ** 2 > GATE**2 * x.innovation_variance[row]
+    return is_contradicted(judged, row) or no_noise or outlier
 
 
 @njit(cache=True)
@@ -32,16 +46,34 @@ def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
     for joint in range(n):
         row = 3 + joint
         rests = last.rested[joint] > DOUBT_TIME
-        no_noise = last.agreement[row] > NOTICED**2
-        outlier = x.innovation[row] ** 2 > GATE**2 * x.innovation_variance[row]
-        contradicted = is_contradicted(last, row) or no_noise or outlier
         if (
             rests
-            or (contradicted and _is_known(last, joint, _KNOWN, known))
+            or (_is_contradicted(x, last, joint) and _is_known(last, joint, _KNOWN, known))
             or (many and doubted[row] and _is_known(last, joint, _WELL_KNOWN, known))
         ):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
     return learning
+
+
+@njit(cache=True)
+def forget_unproven(x: Record, T: float, known: Record) -> None:
+    """Laws that are contradicted before they have held for some time begin anew.
+
+    What a joint does first, a jerk as its foot leaves the ground, can teach a wrong law within some
+    ticks. Known by then, it would stay: what contradicts it teaches it no more.
+
+    Args:
+        x: record with for how long each law has been known and held, less for how long it was
+            contradicted, until it has proved itself, `proven` (n,) [s]; goes on.
+        T: duration of the tick [s].
+    """
+    for joint in range(len(x.weights)):
+        if x.proven[joint] > DOUBT_TIME or not _is_known(x, joint, _KNOWN, known):
+            continue
+        x.proven[joint] += -T if _is_contradicted(x, x, joint) else T
+        if x.proven[joint] < -AGREEMENT_TIME:
+            x.proven[joint] = 0.0
+            forget_law(x, joint, known)
 
 
 @njit(cache=True)
@@ -88,11 +120,16 @@ def make_dissipative(x: Record, believed: Record) -> None:
 @njit(cache=True)
 def forget_laws(x: Record, known: Record) -> None:
     """The laws are those of the start."""
-    P, of_laws, (n, m) = x.covariance, 2 * len(x.velocity), x.weights.shape
-    x.weights[:], x.settled[:] = known.weights, known.weights
-    P[of_laws:] = 0.0
-    P[:, of_laws:] = 0.0
-    for joint in range(n):
-        for k in range(m):
-            at = of_laws + m * joint + k
-            P[at, at] = known.weight_variance[k]
+    for joint in range(len(x.weights)):
+        forget_law(x, joint, known)
+
+
+@njit(cache=True)
+def forget_law(x: Record, joint: int, known: Record) -> None:
+    """The law of a joint is that of the start."""
+    P, (n, m) = x.covariance, x.weights.shape
+    first = len(P) + m * (joint - n)
+    x.weights[joint], x.settled[joint] = known.weights[joint], known.weights[joint]
+    for at in range(first, first + m):
+        P[at], P[:, at] = 0.0, 0.0
+        P[at, at] = known.weight_variance[at - first]

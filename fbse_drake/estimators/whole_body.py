@@ -39,7 +39,12 @@ from fbse_drake.estimators.implicit_friction import (
 )
 from fbse_drake.estimators.imu_noise import imu_noise_type, watch_noise
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
-from fbse_drake.estimators.law_learning import forget_laws, learning_states, make_dissipative
+from fbse_drake.estimators.law_learning import (
+    forget_laws,
+    forget_unproven,
+    learning_states,
+    make_dissipative,
+)
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.missing_inertia import (
     full_inertia,
@@ -96,7 +101,8 @@ class WholeBody:
     Foot forces that come late belong to the tick in which they were: the filter is then so many
     ticks behind, and the law is asked for the velocity that is measured now. Where measurements
     keep contradicting the model, torque is lacking in the rows that their corrections point at, and
-    the laws of these joints, once known, are not learned; nor are those of joints that rest.
+    the laws of these joints, once known, are not learned; nor are those of joints that rest. A law
+    that is contradicted before it has held for some time begins anew.
 
     Feet whose forces are read wrong by a share of them are told by the robot's weight, as its load
     moves from foot to foot.
@@ -408,6 +414,7 @@ def _finish(
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
         make_dissipative(x, tick.believed)
         make_inertia_possible(x, known)
+        forget_unproven(x, tick.duration, known)
     if x.late == 0.0:
         velocity_now, law_now = tick.velocity, law
     linearise(x, velocity_now, law_now, shaped, x.now.believed)
@@ -531,6 +538,7 @@ class WholeBodyFilter(RecursiveEstimator):
                                          since then, or torque by which measurements contradict the
                                          model [Nm]
         rested                   (n,)    for how long a joint has not moved, beyond doubt [s]
+        proven                   (n,)    for how long its law has held, see `forget_unproven` [s]
         law_velocity, friction_there, slope, regressor   the law where it was linearised
         steepest                 (n,)    the largest slope of late [Nm s/rad]
         largest                  (n,)    the largest friction by the law so far [Nm]
@@ -562,7 +570,7 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["correction_variance", "unexplained", "unexplained_variance", "noise"]
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
-        per_joint += ["doubt", "rested", "law_velocity", "friction_there", "largest"]
+        per_joint += ["doubt", "rested", "proven", "law_velocity", "friction_there", "largest"]
         per_joint += ["slope", "steepest", "missing_inertia", "missing_inertia_std"]
         posterior_type = record_type(
             time=(),
