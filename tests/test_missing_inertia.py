@@ -99,11 +99,15 @@ def test_noise_of_a_velocity_is_no_acceleration():
         assert (x["regressor"][1, -1] != 0.0) == accelerates
 
 
-def test_a_model_lacks_no_less_than_minus_its_own_rotors_and_the_law_beside_it_knows():
+@pytest.mark.parametrize("is_doubt", [False, True])
+def test_a_model_lacks_no_less_than_minus_its_own_rotors_and_the_law_beside_it_knows(
+    is_doubt: bool,
+):
     """What is most likely among what can be: equality-constrained least squares, by its KKT
-    conditions."""
+    conditions. Within the doubt of the inertia, the law stays."""
     root = np.random.default_rng(1).standard_normal((2, 2, 2))
     of_joint = root @ root.transpose(0, 2, 1)
+    of_joint *= (0.2 / (2.0 if not is_doubt else 0.5)) ** 2 / of_joint[0, 1, 1]
     x = record(weights=np.array([[1.0, -0.3], [2.0, 0.4]]), covariance=block_diag(*of_joint))
     known = record(rotor_inertia=np.array([0.1, 0.0]))
     conditions = np.eye(3)
@@ -111,7 +115,9 @@ def test_a_model_lacks_no_less_than_minus_its_own_rotors_and_the_law_beside_it_k
     conditions[1, 2] = conditions[2, 1] = 1.0
     right = [*(conditions[:2, :2] @ [1.0, -0.3]), -0.1]
     make_inertia_possible(x[()], known[()])
-    np.testing.assert_allclose(x["weights"][0], np.linalg.solve(conditions, right)[:2])
+    expected = [1.0, -0.1] if is_doubt else np.linalg.solve(conditions, right)[:2]
+    np.testing.assert_allclose(x["weights"][0], expected)
     np.testing.assert_array_equal(x["weights"][1], [2.0, 0.4])
+    np.testing.assert_allclose(x["weights"][0, 1], -0.1)
     inertia = full_inertia(x[()], np.eye(5))
     np.testing.assert_allclose(inertia, np.diag([1.0, 1.0, 1.0, 0.9, 1.4]))

@@ -8,7 +8,6 @@ import numpy as np
 
 from fbse_drake.effects.effect import Parameter, in_library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
-from fbse_drake.effects.transmission import JointSpring
 
 
 @in_library
@@ -33,7 +32,6 @@ class Counterbalance(JointTorqueEffect):
         name: Parameter("Nm", linear=True, plausible=(-500.0, 500.0), bounds=(-np.inf, np.inf))
         for name in ("cosine", "sine")
     }
-    in_part: ClassVar[type[JointTorqueEffect] | None] = JointSpring
 
     cosine: dict[str, float] = field(default_factory=dict)
     sine: dict[str, float] = field(default_factory=dict)
@@ -50,3 +48,10 @@ class Counterbalance(JointTorqueEffect):
         """A quarter of a turn at least, over which its slope changes by all of itself: less of it
         is a spring."""
         return travel > 0.5 * np.pi
+
+    @staticmethod
+    def in_part() -> type[JointTorqueEffect]:
+        # Modules are imported in the order of the library, by which exercises are drawn.
+        from fbse_drake.effects.transmission import JointSpring
+
+        return JointSpring

@@ -106,9 +106,6 @@ class JointTorqueEffect(Effect):
     shows_at_rest: ClassVar[bool] = False
     # Simpler laws that it contains, the simplest first: a diagnosis names the smallest that holds.
     reductions: ClassVar[tuple[Reduction, ...]] = ()
-    # What a part of it looks like that is too small to show what it is, see `shows_within`; that is
-    # named in its place, and it is told that it may be this one.
-    in_part: ClassVar[type["JointTorqueEffect"] | None] = None
 
     @staticmethod
     @abstractmethod
@@ -183,6 +180,12 @@ class JointTorqueEffect(Effect):
             nonlinear: values of the nonlinear parameters, shape (m,) or (m, n).
         """
         return cls.shows_at_rest or travel > 0
+
+    @staticmethod
+    def in_part() -> "type[JointTorqueEffect] | None":
+        """What a part of it looks like that is too small to show what it is, see `shows_within`;
+        that is named in its place, and it is told that it may be this one."""
+        return None
 
     @classmethod
     def shows_under(cls, command: np.ndarray) -> bool:  # noqa: ARG003

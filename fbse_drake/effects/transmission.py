@@ -21,6 +21,47 @@ from fbse_drake.effects.joint_torque import (
 
 @in_library
 @dataclass(frozen=True)
+class TorqueRipple(JointTorqueEffect):
+    """Torque that repeats with the joint's angle: u = sine sin(cycles q) + cosine cos(cycles q)."""
+
+    description: ClassVar[str] = (
+        "Torque that repeats with the angle of the joint, from gear teeth or motor poles."
+    )
+    signature: ClassVar[str] = "A wave over the joint angle, the same in both directions of motion."
+    experiment: ClassVar[str] = "Move each joint slowly through a large angle."
+    needs_motor: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "sine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
+        "cosine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
+        # Over 1 rad of motion, a factor of 1.02 near the upper end is a quarter of a wave off.
+        "cycles": Parameter(
+            "1/revolution", linear=False, plausible=(6.0, 400.0), grid=200, closed=True
+        ),
+    }
+
+    sine: dict[str, float] = field(default_factory=dict)
+    cosine: dict[str, float] = field(default_factory=dict)
+    cycles: dict[str, float] = field(default_factory=lambda: {"all": 50.0})
+
+    @staticmethod
+    def basis(
+        motion: JointMotion, nonlinear: np.ndarray
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        angle = nonlinear[0] * motion.position
+        return (np.sin(angle), np.cos(angle)), (0.0, 0.0)
+
+    @classmethod
+    def shows_within(cls, travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
+        """Half a wave at least: less of it is a spring."""
+        return nonlinear[0] * travel > np.pi
+
+    @staticmethod
+    def in_part() -> type[JointTorqueEffect]:
+        return JointSpring
+
+
+@in_library
+@dataclass(frozen=True)
 class JointSpring(JointTorqueEffect):
     """A spring beside the motor, as of cables and hoses over the joint: u = stiffness
     q + preload."""
@@ -44,44 +85,6 @@ class JointSpring(JointTorqueEffect):
         nonlinear: np.ndarray,  # noqa: ARG004
     ) -> tuple[Sequence[np.ndarray | float], Sequence[float]]:
         return (motion.position, 1.0), (0.0, 0.0)
-
-
-@in_library
-@dataclass(frozen=True)
-class TorqueRipple(JointTorqueEffect):
-    """Torque that repeats with the joint's angle: u = sine sin(cycles q) + cosine cos(cycles q)."""
-
-    description: ClassVar[str] = (
-        "Torque that repeats with the angle of the joint, from gear teeth or motor poles."
-    )
-    signature: ClassVar[str] = "A wave over the joint angle, the same in both directions of motion."
-    experiment: ClassVar[str] = "Move each joint slowly through a large angle."
-    needs_motor: ClassVar[bool] = True
-    parameters: ClassVar[dict[str, Parameter]] = {
-        "sine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
-        "cosine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),
-        # Over 1 rad of motion, a factor of 1.02 near the upper end is a quarter of a wave off.
-        "cycles": Parameter(
-            "1/revolution", linear=False, plausible=(6.0, 400.0), grid=200, closed=True
-        ),
-    }
-    in_part: ClassVar[type[JointTorqueEffect] | None] = JointSpring
-
-    sine: dict[str, float] = field(default_factory=dict)
-    cosine: dict[str, float] = field(default_factory=dict)
-    cycles: dict[str, float] = field(default_factory=lambda: {"all": 50.0})
-
-    @staticmethod
-    def basis(
-        motion: JointMotion, nonlinear: np.ndarray
-    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
-        angle = nonlinear[0] * motion.position
-        return (np.sin(angle), np.cos(angle)), (0.0, 0.0)
-
-    @classmethod
-    def shows_within(cls, travel: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:
-        """Half a wave at least: less of it is a spring."""
-        return nonlinear[0] * travel > np.pi
 
 
 @in_library

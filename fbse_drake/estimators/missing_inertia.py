@@ -44,9 +44,10 @@ def full_inertia(x: Record, inertia: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def make_inertia_possible(x: Record, known: Record) -> None:
-    """Projects on what can be, along the covariance: no robot's rotor has a negative inertia.
+    """Projects on what can be: no robot's rotor has a negative inertia.
 
-    A law that was learned beside an inertia that cannot be is wrong as well, and moves with it.
+    Beyond its doubt, a law that was learned beside it is wrong as well, and moves with it along the
+    covariance. (Within it, only one side of what is noise would move the law, tick by tick.)
 
     Args:
         known: record with the model's own `rotor_inertia` (n,) [kg m^2].
@@ -57,5 +58,7 @@ def make_inertia_possible(x: Record, known: Record) -> None:
         if beyond < 0.0:
             first = len(P) + m * (joint - n)
             last = first + m - 1
-            for k in range(m):
-                x.weights[joint, k] -= P[first + k, last] * beyond / P[last, last]
+            if beyond**2 > P[last, last]:
+                for k in range(m - 1):
+                    x.weights[joint, k] -= P[first + k, last] * beyond / P[last, last]
+            x.weights[joint, -1] = -known.rotor_inertia[joint]

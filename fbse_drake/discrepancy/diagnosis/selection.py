@@ -167,11 +167,12 @@ def shows_in_part(
         base, wider: explanations without and with it.
     """
     fits, effect = proposals.fits, added.effect
-    if not issubclass(effect, JointTorqueEffect) or effect.in_part is None:
+    part = effect.in_part() if issubclass(effect, JointTorqueEffect) else None
+    if part is None:
         return False
     if not _travel(fits, added).any():
         return False
-    for reduction in effect.in_part.reductions:
+    for reduction in part.reductions:
         simpler = base
         for law in reduction.effects:
             simpler = proposals.beside(simpler, law, added.targets)
