@@ -14,7 +14,7 @@ _MANY = 0.3
 
 
 @njit(cache=True)
-def _is_contradicted(x: Record, judged: Record, joint: int) -> bool:
+def _is_law_contradicted(x: Record, judged: Record, joint: int) -> bool:
     """Do this tick, or those before it, contradict what is known of a joint beyond chance?
 
     Args:
@@ -48,7 +48,7 @@ def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
         rests = last.rested[joint] > DOUBT_TIME
         if (
             rests
-            or (_is_contradicted(x, last, joint) and _is_known(last, joint, _KNOWN, known))
+            or (_is_law_contradicted(x, last, joint) and _is_known(last, joint, _KNOWN, known))
             or (many and doubted[row] and _is_known(last, joint, _WELL_KNOWN, known))
         ):
             learning[2 * r + m * joint : 2 * r + m * (joint + 1)] = 0.0
@@ -70,10 +70,10 @@ def forget_unproven(x: Record, T: float, known: Record) -> None:
     for joint in range(len(x.weights)):
         if x.proven[joint] > DOUBT_TIME or not _is_known(x, joint, _KNOWN, known):
             continue
-        x.proven[joint] += -T if _is_contradicted(x, x, joint) else T
+        x.proven[joint] += -T if _is_law_contradicted(x, x, joint) else T
         if x.proven[joint] < -AGREEMENT_TIME:
             x.proven[joint] = 0.0
-            forget_law(x, joint, known)
+            _forget_law(x, joint, known)
 
 
 @njit(cache=True)
@@ -121,11 +121,11 @@ def make_dissipative(x: Record, believed: Record) -> None:
 def forget_laws(x: Record, known: Record) -> None:
     """The laws are those of the start."""
     for joint in range(len(x.weights)):
-        forget_law(x, joint, known)
+        _forget_law(x, joint, known)
 
 
 @njit(cache=True)
-def forget_law(x: Record, joint: int, known: Record) -> None:
+def _forget_law(x: Record, joint: int, known: Record) -> None:
     """The law of a joint is that of the start."""
     P, (n, m) = x.covariance, x.weights.shape
     first = len(P) + m * (joint - n)

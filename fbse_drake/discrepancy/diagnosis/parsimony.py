@@ -224,7 +224,7 @@ class Judge:
         of a spike while the command is large. If the log asks for another multiple of the law, not
         by chance, and that explains more than a small part of what the law does, it is not it.
         """
-        multiple = with_amount(member)
+        multiple = _with_amount(member)
         if multiple is None:
             return True
         others = [c for c in whole.candidates if c is not member]
@@ -334,7 +334,7 @@ def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]
     return square > len(values) * fisher.ppf(_CONFIDENCE, len(values), freedom.min())
 
 
-def with_amount(member: Candidate) -> Candidate | None:
+def _with_amount(member: Candidate) -> Candidate | None:
     """A joint torque law that has no amount with one, its last column; None for other members."""
     if member.has_linear or not issubclass(member.effect, JointTorqueEffect):
         return None
