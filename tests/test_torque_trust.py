@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded_arm import ARM, PENDULUM, Course, Machine
+from recorded_arm import ARM, PENDULUM, Course, Machine, inverse_dynamics
+from scipy.integrate import solve_ivp
 
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
@@ -17,6 +18,7 @@ from fbse_drake.discrepancy.residual.evidence import HygieneFinding
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
+from fbse_drake.report.sentences import diagnosis_outcome
 
 AXIS = 1
 TORQUE_KINDS = {
@@ -251,3 +253,87 @@ def test_a_pendulum_that_is_held_still_is_not_stuck(pendulum: Course) -> None:
     changed = replace(log, channels=log.channels | {"joint/position": stuck})
     found = inspect(PENDULUM.predictor(changed).motion).findings
     assert "stuck" in {finding.kind for finding in found}
+
+
+CHAIN = Machine(
+    "double_pendulum",
+    posture=(0.0, 0.0),
+    amplitude=(1.2, 1.5),
+    rotor_inertia=(0.003, 0.003),
+    torque_noise=(0.02, 0.02),
+)
+RELEASED = 4.0
+
+
+def let_go(machine: Machine, course: Course) -> Course:
+    """The same until its drives are switched off; then it swings with friction of its own."""
+    robot, rubs = machine.robot(machine.by_joint(machine.rotor_inertia)), 0.05 * np.ones(2)
+    n, free = len(rubs), course.time >= RELEASED
+
+    def torque_needed(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return inverse_dynamics(robot, q[None], v[None], a[None])[0]
+
+    def rate(_: float, state: np.ndarray) -> np.ndarray:
+        q, v = state[:n], state[n:]
+        without = torque_needed(q, v, np.zeros(n))
+        mass = np.stack([torque_needed(q, v, unit) - without for unit in np.eye(n)], axis=1)
+        return np.concatenate([v, np.linalg.solve(mass, -rubs * np.tanh(v / 0.05) - without)])
+
+    start = np.flatnonzero(free)[0]
+    state = np.concatenate([course.position[start], course.velocity[start]])
+    times = course.time[free]
+    swing = solve_ivp(rate, (times[0], times[-1]), state, t_eval=times, rtol=1e-8, atol=1e-8).y
+    position, velocity, torque = (
+        array.copy() for array in (course.position, course.velocity, course.torque)
+    )
+    position[free], velocity[free], torque[free] = swing[:n].T, swing[n:].T, 0.0
+    return replace(course, position=position, velocity=velocity, torque=torque)
+
+
+def when_free(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Reads exactly zero from when the drives are off."""
+    return lambda measured: np.where((values >= RELEASED)[:, None], 0.0, measured)
+
+
+def test_drives_that_are_switched_off_are_not_stuck() -> None:
+    """A machine that swings out loses energy. One that goes on as before, or is let down, is
+    driven: that its torque is zero is what its sensor says."""
+    driven = CHAIN.course(2)
+    read = when_free(driven.time)
+    after = driven.time[driven.time >= RELEASED] - RELEASED
+    down = {name: getattr(driven, name).copy() for name in ("position", "velocity")}
+    free = driven.time >= RELEASED
+    down["position"][free] = 1.4 * np.array([[1.0, 0.2]]) * np.exp(-after / 2.0)[:, None]
+    down["velocity"][free] = -down["position"][free] / 2.0
+    for course, is_stuck in (
+        (let_go(CHAIN, driven), False),
+        (driven, True),
+        (replace(driven, **down), True),
+    ):
+        findings = inspect(CHAIN.predictor(CHAIN.log(course, read=read)).motion).findings
+        stuck = [f for f in findings if f.kind == "stuck" and f.channel == "joint/torque_command"]
+        assert bool(stuck) == is_stuck, [finding.text for finding in findings]
+
+
+@pytest.mark.parametrize(
+    ("hidden", "block", "verdict"),
+    [
+        (0.04, 0.2, "not_visible"),
+        (0.04, 0.05, "unknown_effect"),
+        (0.0, 0.2, "nothing_missing"),
+    ],
+)
+def test_forty_averages_do_not_say_that_what_is_left_is_noise(
+    pendulum: Course, hidden: float, block: float, verdict: str
+) -> None:
+    """A torque that comes and goes with time is no law of the library: 8 s show it in averages of
+    0.05 s, and not in averages of 0.2 s, which are too few to tell it from noise."""
+    torque = pendulum.torque + hidden * np.sin(7.0 * pendulum.time)[:, None]
+    scenario = replace(
+        PENDULUM.scenario, recording=replace(PENDULUM.scenario.recording, block=block)
+    )
+    log = PENDULUM.log(pendulum, torque)
+    diagnosis = diagnose(Predictor(scenario, log), [CoulombFriction, ViscousFriction])
+    assert (diagnosis.verdict, diagnosis.chosen) == (verdict, [])
+    assert bool(diagnosis.untested) == (verdict == "not_visible")
+    assert ("too short to tell" in diagnosis_outcome(diagnosis)) == (verdict == "not_visible")

@@ -238,6 +238,13 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"Nothing is missing: what the model leaves over is the sensors' noise ({left} times "
             f"it){unseen}."
         )
+    if diagnosis.verdict == "not_visible" and diagnosis.untested:
+        rows = _enumerated([words(row) for row in diagnosis.untested])
+        return (
+            "This log is too short to tell whether something is missing: the model leaves over "
+            f"{number(diagnosis.held_out_before)} times the sensors' noise, and whether that is "
+            f"noise as well does not show in so few averages of {rows}."
+        )
     if diagnosis.verdict == "not_visible":
         return (
             f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} "
@@ -390,6 +397,8 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[St
     if doubtful:
         steps += _experiments("To tell them apart:", doubtful)
     if diagnosis.partial is None and diagnosis.verdict == "not_visible":
+        if diagnosis.untested:
+            steps.append(Step("Record for longer, or average over less (recording.block)."))
         hidden = {
             name: status for name, status in statuses.items() if status.verdict == "not_visible"
         }

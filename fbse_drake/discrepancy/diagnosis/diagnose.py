@@ -30,7 +30,11 @@ from fbse_drake.discrepancy.diagnosis.spread import Spread, spreads, spreads_jso
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.identification.structure import Structure, leftover_structure
+from fbse_drake.discrepancy.identification.structure import (
+    Structure,
+    leftover_structure,
+    untested_rows,
+)
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -143,6 +147,8 @@ class Diagnosis:
     set_aside: Mapping[str, Validation] = field(default_factory=dict)
     # In which something acted that no law explains; they were left out.
     disturbances: tuple[Disturbance, ...] = ()
+    # Rows in which more than noise is left, in too few averages to tell whether it is noise as well.
+    untested: tuple[str, ...] = ()
     # What explains the log and raises the error of data that was set aside: it is not named.
     refuted: tuple[Finding, ...] = ()
 
@@ -231,7 +237,7 @@ def diagnose(
         inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
-    elif partial is not None or hidden > 0.5 * len(statuses):
+    elif partial is not None or hidden > 0.5 * len(statuses) or search.untested:
         verdict = "not_visible"
     else:
         verdict = "nothing_missing"
@@ -250,6 +256,7 @@ def diagnose(
         averaging,
         partial,
         disturbances=disturbed,
+        untested=search.untested,
     )
 
 
@@ -269,6 +276,8 @@ class _Search:
     # out.
     unexplained: list[Structure]
     disturbances: tuple[Disturbance, ...]
+    # Rows of which a log as short as this cannot tell.
+    untested: tuple[str, ...]
     partial: str | None
 
 
@@ -300,7 +309,17 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         if not significance.left_share(structure, remaining) < tolerance
     ]
     disturbed = disturbances(remaining, left, [structure.index for structure in unexplained])
-    return _Search(proposals, path, alternatives, before, inertia, unexplained, disturbed, partial)
+    return _Search(
+        proposals,
+        path,
+        alternatives,
+        before,
+        inertia,
+        unexplained,
+        disturbed,
+        untested_rows(remaining, left),
+        partial,
+    )
 
 
 def _with_trust(
@@ -612,6 +631,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for name, s in diagnosis.effects.items()
         },
+        "untested": list(diagnosis.untested),
         "refuted": [{"effect": f.effect, "joints": list(f.targets)} for f in diagnosis.refuted],
         "left_out": [
             {"start": d.start, "end": d.end, "rows": list(d.rows)} for d in diagnosis.disturbances

@@ -32,6 +32,10 @@ _SETTLING = 0.1
 _FAR, _VELOCITY_OFFSET = 0.02, 0.02
 # White noise stays within so many of its standard deviations.
 _NOISE_WIDTH = 10.0
+_TORQUE = "joint/torque_command"
+# Of a joint whose drive is off the model needs less than this share of the torque that it needs
+# else, and of its power so much is taken from the motion.
+_SMALL_FORCE, _BRAKES = 0.5, 0.5
 # Shortest run at its largest value of a channel that is clipped [samples], and the share of the log
 # that such runs need.
 _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
@@ -128,13 +132,15 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
                 for (a, b), least in zip(runs, far, strict=True)
                 if (np.ptp(travel[a + late : b + 1], axis=0) > least).any()
             ]
-            if name == "joint/torque_command":
+            if name == _TORQUE:
                 # A drive may be off, or at its limit, which is another finding.
                 column = values[:, k]
                 runs = [
                     (a, b)
                     for a, b in runs
-                    if enabled[a : b + 1, k].any() and column.min() < column[a] < column.max()
+                    if enabled[a : b + 1, k].any()
+                    and column.min() < column[a] < column.max()
+                    and not (column[a] == 0.0 and _is_off(evidence, a, b, k))
                 ]
             if name.startswith("foot/"):
                 # In the air a foot may well read nothing at all.
@@ -146,6 +152,31 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
             "time is the sensor's doing"
         )
         yield from remarks("stuck", "untrustworthy", name, found, "s", text)
+
+
+def _is_off(evidence: Evidence, first: int, last: int, joint: int) -> bool:
+    """Is a drive off whose torque is 0 from one row of the log to another? Then the joint's motion
+    takes no energy from it: what the model needs there brakes it, as friction does, and is small.
+
+    Drives that are off at the same time are looked at together.
+    """
+    motion = evidence.motion
+    given = evidence.log[_TORQUE][first : last + 1]
+    off = ~given.any(axis=0)
+    off[joint] = True
+    half = 0.5 * motion.length * motion.period
+    within = (motion.time - half > evidence.log.time[first]) & (
+        motion.time + half < evidence.log.time[last]
+    )
+    known = evidence.known[:, : len(off)] & off
+    needed, velocity = evidence.link_torque, motion.blocks.joint_velocity
+    inside, outside = known & within[:, None], known & ~within[:, None]
+    if not (inside.any() and outside.any()):
+        return False
+    power = (needed * velocity)[inside]
+    usual = np.sqrt((needed[outside] ** 2).mean())
+    small = np.sqrt((needed[inside] ** 2).mean()) < _SMALL_FORCE * usual
+    return bool(small and -power.sum() > _BRAKES * np.abs(power).sum())
 
 
 def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:

@@ -9,6 +9,8 @@ from scipy.stats import chi2
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.residual import RecordedMotion
 
+# Averages of a row from which on it is told whether what is left is noise.
+_FEWEST = 50
 # Pieces of a piecewise linear function of one variable.
 _PIECES = 8
 # A row whose held-out residual exceeds the sensors' noise by more than this factor has something
@@ -63,7 +65,7 @@ def leftover_structure(
     if motion.robot.has_floating_base:
         left = _without_impacts(left, white.residual.known)
     for k, row in enumerate(white.residual.rows):
-        if white.count[k] < 50:
+        if white.count[k] < _FEWEST:
             continue
         ratio = float(size[k])
         usual = np.sqrt((left[:, k] ** 2).sum() / white.count[k])
@@ -73,8 +75,7 @@ def leftover_structure(
                 continue
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
-            tolerated = np.sqrt(EXCESS**2 + _DOUBT * white.doubt[k] / white.count[k])
-            is_noise = usual < tolerated or _is_white(left[:, k], int(white.count[k]))
+            is_noise = usual < _tolerated(white, k) or _is_white(left[:, k], int(white.count[k]))
             if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
@@ -84,6 +85,29 @@ def leftover_structure(
         best = max(shares, key=lambda name: shares[name])
         result.append(Structure(row.name, k, ratio, best, float(np.clip(shares[best], 0.0, 1.0))))
     return result
+
+
+def untested_rows(white: WhitenedResidual, left: np.ndarray) -> tuple[str, ...]:
+    """Rows in which more is left than noise, but in too few averages to tell it from noise.
+
+    Soles are not asked: feet stand for a short time.
+
+    Args:
+        white, left: see `leftover_structure`.
+    """
+    size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
+    return tuple(
+        row.name
+        for k, row in enumerate(white.residual.rows)
+        if row.kind != "kinematic"
+        and 0 < white.count[k] < _FEWEST
+        and size[k] > _tolerated(white, k)
+    )
+
+
+def _tolerated(white: WhitenedResidual, row: int) -> float:
+    """Root mean square of what may be left in a row, in multiples of the sensors' noise."""
+    return float(np.sqrt(EXCESS**2 + _DOUBT * white.doubt[row] / white.count[row]))
 
 
 def _without_impacts(left: np.ndarray, known: np.ndarray) -> np.ndarray:
