@@ -195,6 +195,18 @@ def test_gap_is_crossed_with_the_rotor_s_acceleration():
     assert np.all(torque[87:] == 0)
 
 
+@pytest.mark.parametrize(("swings", "shows"), [(0.5, False), (1, False), (2, True)])
+def test_time_is_told_from_place_where_a_motion_is_repeated(swings: float, shows: bool) -> None:
+    """Of k equal swings 1 - 1 / k^2 of the scatter of time lies between them: none of it in one
+    way there and back, however long the joint rests before and after."""
+    swing = np.linspace(0.0, 2 * np.pi * swings, 4000)
+    resting = np.zeros(3000)
+    position = np.concatenate([resting, 1.0 - np.cos(swing), resting + 1.0 - np.cos(swing[-1])])
+    velocity = np.gradient(position, H) + 1e-4 * np.random.default_rng(0).normal(size=10_000)
+    motion = JointMotion(velocity, position, time=np.arange(10_000) * H, time_step=H)
+    assert ThermalDrift.shows_in(motion) == shows
+
+
 def sample(effect: type[JointTorqueEffect], joints: dict[str, float]) -> JointTorqueEffect:
     """An effect with plausible values, different for each joint; `joints` gives a factor near 1."""
     middle = {}

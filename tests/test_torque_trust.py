@@ -337,3 +337,27 @@ def test_forty_averages_do_not_say_that_what_is_left_is_noise(
     assert (diagnosis.verdict, diagnosis.chosen) == (verdict, [])
     assert bool(diagnosis.untested) == (verdict == "not_visible")
     assert ("too short to tell" in diagnosis_outcome(diagnosis)) == (verdict == "not_visible")
+
+
+def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:
+    """One way up and down: friction that grows with the load does so with time. Where the motion is
+    repeated a drift is named."""
+    drifting = 0.1 * (1.0 - np.exp(-pendulum.time / 20.0))
+    once = 0.5 * np.pi * np.sin(np.pi * pendulum.time / pendulum.time[-1]) ** 2
+    rate = np.gradient(once, pendulum.period)
+    motion = [values[:, None] for values in (once, rate, np.gradient(rate, pendulum.period))]
+    up_and_down = Course(
+        pendulum.time,
+        *motion,
+        inverse_dynamics(PENDULUM.robot(PENDULUM.by_joint(PENDULUM.rotor_inertia)), *motion),
+    )
+    loaded = 0.2 * np.abs(up_and_down.torque[:, 0])
+    for course, friction, named in (
+        (up_and_down, loaded, False),
+        (up_and_down, drifting, False),
+        (pendulum, drifting, True),
+    ):
+        torque = course.torque + friction[:, None] * np.tanh(course.velocity / 0.01)
+        diagnosis = diagnose(PENDULUM.predictor(PENDULUM.log(course, torque)))
+        assert ("ThermalDrift" in {finding.effect for finding in diagnosis.chosen}) == named
+        assert (diagnosis.effects["ThermalDrift"].verdict == "not_visible") != named

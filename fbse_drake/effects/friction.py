@@ -19,6 +19,9 @@ _COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
 _VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
 # Velocity at which the smoothed sign has grown to tanh(1) = 0.76.
 _TRANSITION = Parameter("rad/s", linear=False, plausible=(1e-3, 5e-2), bounds=(1e-9, np.inf))
+# Where time is told from place: by so many ranges of the angle and both directions, of which at
+# least this share of the scatter of time does not follow.
+_PLACES, _REPEATED = 8, 0.5
 
 
 def _sharp() -> dict[str, float]:
@@ -391,6 +394,23 @@ class ThermalDrift(JointTorqueEffect):
         warmth = -np.expm1(-motion.time / warm_up)
         sign, slope = smooth_sign(motion.velocity, transition)
         return (warmth * sign,), (warmth * slope,)
+
+    @classmethod
+    def shows_in(cls, motion: JointMotion) -> bool:
+        """Where the joint does again what it did before: of one way there and back nobody can say
+        whether time has changed the friction or the angle has."""
+        sign, _ = smooth_sign(motion.velocity, _sharp()["all"])
+        time, position = (np.broadcast_to(x, sign.shape) for x in (motion.time, motion.position))
+        edges = np.quantile(position, np.linspace(0.0, 1.0, _PLACES + 1)[1:-1])
+        place = np.searchsorted(edges, position)
+        left, whole = 0.0, 0.0
+        for forward in (True, False):
+            weight = np.where((sign > 0) == forward, sign**2, 0.0)
+            at = np.bincount(place, weight, _PLACES)
+            mean = np.bincount(place, weight * time, _PLACES) / np.maximum(at, 1e-12)
+            left += float(weight @ (time - mean[place]) ** 2)
+            whole += float(weight @ (time - weight @ time / max(weight.sum(), 1e-12)) ** 2)
+        return left > _REPEATED * whole
 
     @staticmethod
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004

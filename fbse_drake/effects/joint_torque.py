@@ -43,6 +43,16 @@ class JointMotion(NamedTuple):
     # Torque that passes the gear: the command less what was lost just before [Nm].
     load: np.ndarray | float = 0.0
 
+    def of_joint(self, place: int) -> "JointMotion":
+        """Of one joint, (...,)."""
+        velocity, position, command, time, load = (
+            values[..., place]
+            for values in np.broadcast_arrays(
+                self.velocity, self.position, self.command, self.time, self.load
+            )
+        )
+        return JointMotion(velocity, position, command, time, self.time_step, load=load)
+
 
 class Rise(NamedTuple):
     """How a torque loss of n joints rises with their velocities."""
@@ -188,8 +198,8 @@ class JointTorqueEffect(Effect):
         return None
 
     @classmethod
-    def shows_under(cls, command: np.ndarray) -> bool:  # noqa: ARG003
-        """Do the commands of a joint, (N,) [Nm], show what the effect is?"""
+    def shows_in(cls, motion: JointMotion) -> bool:  # noqa: ARG003
+        """Does what a joint did in N steps, (N,) each, show what the effect is?"""
         return True
 
     @staticmethod

@@ -193,10 +193,10 @@ class Backlash(JointTorqueEffect):
         return (share * motion.command,), (0.0,)
 
     @classmethod
-    def shows_under(cls, command: np.ndarray) -> bool:
+    def shows_in(cls, motion: JointMotion) -> bool:
         """Where the torque never changes sign the motor stays on one side, as with another zero of
         its encoder."""
-        return bool(command.min() < 0 < command.max())
+        return bool(np.min(motion.command) < 0 < np.max(motion.command))
 
     @staticmethod
     def deflection(memory: np.ndarray, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004

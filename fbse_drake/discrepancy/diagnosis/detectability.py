@@ -71,8 +71,7 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
         needed = fits.needed(len(effect.parameters)) + fits.systematic(rows)
         grams = {at: beside.moments_of_grid(grid.sets[at])[0] for at in rows.tolist()}
         power = sum(gram[:, 0, 0] / beside.scale[at] for at, gram in grams.items())
-        command = fits.dictionary.predictor.motion.signals.torque_command[:, row]
-        if not effect.shows_under(command) or not np.all(
+        if not fits.dictionary.is_shown(effect, joint) or not np.all(
             effect.shows_within(
                 fits.dictionary.travel[row], fits.dictionary.usual_at(effect, joint)
             )

@@ -147,7 +147,7 @@ class Diagnosis:
     set_aside: Mapping[str, Validation] = field(default_factory=dict)
     # In which something acted that no law explains; they were left out.
     disturbances: tuple[Disturbance, ...] = ()
-    # Rows in which more than noise is left, in too few averages to tell whether it is noise as well.
+    # Rows in which more than noise is left, but in too few averages to say that it is none.
     untested: tuple[str, ...] = ()
     # What explains the log and raises the error of data that was set aside: it is not named.
     refuted: tuple[Finding, ...] = ()

@@ -78,6 +78,7 @@ class Dictionary:
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
             self._look_at(self.inertia)
         self._grids: dict[tuple[type[JointTorqueEffect], int], np.ndarray] = {}
+        self._shown: dict[tuple[type[JointTorqueEffect], str], bool] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
         self._fixed_beside: Callable[[], list[list[FixedColumns]]] | None = None
 
@@ -139,17 +140,20 @@ class Dictionary:
         """Those of the groups all of whose joints can have an effect; of several joints, if the log
         shows in all what it is."""
         allowed = set(self._targets(effect))
-        command = self.predictor.motion.signals.torque_command
-        shown = {
-            joint
-            for joint, of_joint in zip(self.joints, command.T, strict=True)
-            if effect.shows_under(of_joint)
-        }
+        shown = {joint for joint in self.joints if self.is_shown(effect, joint)}
         return [
             group
             for group in self.groups
             if allowed.issuperset(group) and (len(group) == 1 or shown.issuperset(group))
         ]
+
+    def is_shown(self, effect: type[JointTorqueEffect], joint: str) -> bool:
+        """Does what a joint did in the log show what an effect is?"""
+        key = effect, joint
+        if key not in self._shown:
+            motion, place = self.predictor.joint_motion, self.joints.index(joint)
+            self._shown[key] = effect.shows_in(motion.of_joint(place))
+        return self._shown[key]
 
     def serves(self, predictor: Predictor, effects: Collection[type[Effect]]) -> bool:
         """Is it of these effects, and of another predictor's model over the same log?"""

@@ -149,10 +149,13 @@ def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
 
 def is_shown(fits: Fits, candidate: Candidate) -> bool:
     """Does the log show what a candidate is, so that it can be named?"""
-    if not issubclass(candidate.effect, JointTorqueEffect):
+    effect, dictionary = candidate.effect, fits.dictionary
+    if not issubclass(effect, JointTorqueEffect):
         return True
-    shown = candidate.effect.shows_within(_travel(fits, candidate), candidate.nonlinear)
-    return bool(np.any(shown))
+    within = effect.shows_within(_travel(fits, candidate), candidate.nonlinear)
+    return bool(np.any(within)) and any(
+        dictionary.is_shown(effect, joint) for joint in candidate.targets
+    )
 
 
 def shows_in_part(

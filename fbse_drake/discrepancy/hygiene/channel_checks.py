@@ -140,7 +140,7 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
                     for a, b in runs
                     if enabled[a : b + 1, k].any()
                     and column.min() < column[a] < column.max()
-                    and not (column[a] == 0.0 and _is_off(evidence, a, b, k))
+                    and not (column[a] == 0.0 and _is_off(evidence, a, b))
                 ]
             if name.startswith("foot/"):
                 # In the air a foot may well read nothing at all.
@@ -154,7 +154,7 @@ def check_stuck(evidence: Evidence) -> Iterable[HygieneFinding]:
         yield from remarks("stuck", "untrustworthy", name, found, "s", text)
 
 
-def _is_off(evidence: Evidence, first: int, last: int, joint: int) -> bool:
+def _is_off(evidence: Evidence, first: int, last: int) -> bool:
     """Is a drive off whose torque is 0 from one row of the log to another? Then the joint's motion
     takes no energy from it: what the model needs there brakes it, as friction does, and is small.
 
@@ -162,8 +162,7 @@ def _is_off(evidence: Evidence, first: int, last: int, joint: int) -> bool:
     """
     motion = evidence.motion
     given = evidence.log[_TORQUE][first : last + 1]
-    off = ~given.any(axis=0)
-    off[joint] = True
+    off = np.atleast_1d((given == 0.0).all(axis=0))
     half = 0.5 * motion.length * motion.period
     within = (motion.time - half > evidence.log.time[first]) & (
         motion.time + half < evidence.log.time[last]
