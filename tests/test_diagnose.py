@@ -21,7 +21,11 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable
-from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_significant
+from fbse_drake.discrepancy.diagnosis.selection import (
+    best_additions,
+    is_disbelieved,
+    is_significant,
+)
 from fbse_drake.discrepancy.diagnosis.study import study, study_json
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
@@ -652,3 +656,27 @@ def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
         for d in (1e4, 1e2)
     )
     assert is_significant(fits, base, wider, candidate) is can_be
+
+
+def test_what_is_believed_of_a_vector_holds_in_all_axes() -> None:
+    """With a belief of 1 nothing longer than 3 is believed, whichever axes it is measured in."""
+    generator = np.random.default_rng(4)
+    sure = np.zeros(3)
+    for length, is_long in ((2.9, False), (3.1, True)):
+        for direction in generator.normal(size=(20, 3)):
+            vector = length * direction / np.linalg.norm(direction)
+            interval = np.stack([vector, vector], axis=1)
+            assert is_disbelieved(vector, np.ones(3), sure, interval) == is_long
+            # Of a number of which nothing is believed nothing is disbelieved.
+            values, beliefs = np.append(vector, 1e6), np.array([1.0, 1.0, 1.0, np.inf])
+            intervals = np.append(interval, [[1e6, 1e6]], axis=0)
+            assert is_disbelieved(values, beliefs, np.append(sure, 1.0), intervals) == is_long
+
+
+def test_what_the_log_does_not_tell_from_nothing_does_not_make_a_vector_long() -> None:
+    """A component of 5 +- 4 with a belief of 1 is 5 / 17 beside that belief; one of 5 +- 1 is 5,
+    for the log tells it from nothing."""
+    for deviation, is_long in ((4.0, False), (1.0, True)):
+        values, half = np.array([0.1, 5.0]), 2.0 * deviation
+        intervals = np.array([[0.09, 0.11], [5.0 - half, 5.0 + half]])
+        assert is_disbelieved(values, np.ones(2), np.array([0.01, deviation]), intervals) == is_long

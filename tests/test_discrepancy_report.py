@@ -19,6 +19,7 @@ from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy_tables import findings_table
+from fbse_drake.report.sentences import diagnosis_outcome, steps_after_diagnosis
 
 INPUTS = reports.Inputs("a_walk", "paper_walk", ("walk.npz",), "out/a_walk")
 KNEES = ("left_knee_pitch", "right_knee_pitch")
@@ -637,3 +638,28 @@ def test_many_targets_are_called_what_they_are():
 )
 def test_targets_in_words(targets: tuple[str, ...], text: str):
     assert figures.targets_text(targets) == text
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        (["left_foot"], "body mass on left foot"),
+        (["left_foot", "pelvis"], "body mass on left foot or body mass on pelvis"),
+        (["left_foot", "right_foot", "pelvis"], "body mass on another body"),
+    ],
+)
+def test_a_mass_that_may_be_on_other_bodies_says_so_and_what_would_tell(
+    others: list[str], said: str
+) -> None:
+    rivals = tuple(f"BodyMass on {body}" for body in others)
+    mass = dataclasses.replace(MASS, confusable_with=(*rivals, "TorqueBias"))
+    moves = EffectStatus("present", "mass", "kg", {"trunk": 0.1}, "Move all joints.")
+    diagnosis = made_diagnosis(ranking=(mass,), effects=STATUSES | {"BodyMass": moves})
+    outcome = diagnosis_outcome(diagnosis)
+    assert f"this log cannot tell that from {said} or torque bias." in outcome
+    steps = steps_after_diagnosis(diagnosis, INPUTS)
+    asked = [step.text for step in steps if step.text.startswith("To tell them apart")]
+    assert asked == [
+        "To tell them apart: Hold each joint still. It shows torque bias.",
+        "To tell them apart: Move all joints. It shows body mass.",
+    ]

@@ -271,3 +271,20 @@ def test_friction_comes_with_torques(scenario: Scenario, log: Log) -> None:
     torque = result.log["estimate/joint/friction_torque"]
     assert torque.shape == (300, 26)
     assert np.isfinite(torque).all()
+
+
+@pytest.mark.parametrize("quarter", [1, 3])
+def test_a_quarter_of_the_record_tells_what_all_of_it_does(
+    scenario: Scenario, log: Log, quarter: int
+) -> None:
+    """With the whole library. How a foot's sensor is turned about its vertical hardly shows in a
+    third of a minute; no more does a payload far from the robot, in its place."""
+    length = len(log.time) // 4
+    part = log.part(slice(quarter * length, (quarter + 1) * length))
+    diagnosis = diagnose(Predictor(scenario, part))
+    found = {(f.effect, *f.targets): f for f in diagnosis.chosen}
+    assert {"Payload"}.isdisjoint(effect for effect, *_ in found)
+    for side in ("left", "right"):
+        estimate = found["FootForceMisalignment", side].parameters["y"]
+        assert 0.06 < estimate.value < 0.13
+        assert estimate.interval[0] > 0

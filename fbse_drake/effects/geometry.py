@@ -116,7 +116,9 @@ class ImuPosition(GeometryEffect):
     experiment: ClassVar[str] = "Sway and turn the trunk fast, to and fro, about all axes."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("m", linear=True, plausible=(-0.1, 0.1), bounds=(-np.inf, np.inf))
+        axis: Parameter(
+            "m", linear=True, plausible=(-0.1, 0.1), bounds=(-np.inf, np.inf), belief=0.1
+        )
         for axis in "xyz"
     }
     # Links stay where they are.

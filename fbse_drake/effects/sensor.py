@@ -245,7 +245,8 @@ class FootForceBias(SensorEffect):
     experiment: ClassVar[str] = "Lift each foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("N", linear=True, plausible=(-20.0, 20.0), bounds=_ANY) for axis in "xyz"
+        axis: Parameter("N", linear=True, plausible=(-20.0, 20.0), bounds=_ANY, belief=20.0)
+        for axis in "xyz"
     }
 
     x: dict[str, float] = field(default_factory=dict)
@@ -283,7 +284,8 @@ class FootMomentBias(SensorEffect):
     experiment: ClassVar[str] = "Lift each foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=_ANY) for axis in "xyz"
+        axis: Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=_ANY, belief=5.0)
+        for axis in "xyz"
     }
 
     x: dict[str, float] = field(default_factory=dict)
@@ -317,7 +319,9 @@ class FootForceMisalignment(SensorEffect):
     experiment: ClassVar[str] = "Stand still on level ground, on one foot and then on the other."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi))
+        axis: Parameter(
+            "rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi), belief=0.1
+        )
         for axis in "xyz"
     }
 
@@ -483,7 +487,8 @@ class AccelerometerBias(SensorEffect):
     experiment: ClassVar[str] = "Stand still on level ground, then with the trunk turned or tilted."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("m/s^2", linear=True, plausible=(-0.5, 0.5), bounds=_ANY) for axis in "xyz"
+        axis: Parameter("m/s^2", linear=True, plausible=(-0.5, 0.5), bounds=_ANY, belief=0.5)
+        for axis in "xyz"
     }
 
     x: float = 0.0
@@ -510,7 +515,7 @@ class GyroscopeBias(SensorEffect):
     experiment: ClassVar[str] = "Stand still."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad/s", linear=True, plausible=(-0.05, 0.05), bounds=_ANY)
+        axis: Parameter("rad/s", linear=True, plausible=(-0.05, 0.05), bounds=_ANY, belief=0.05)
         for axis in "xyz"
     }
 
@@ -546,7 +551,9 @@ class ImuMisalignment(SensorEffect):
     )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.05, 0.05), bounds=(-np.pi, np.pi))
+        axis: Parameter(
+            "rad", linear=True, plausible=(-0.05, 0.05), bounds=(-np.pi, np.pi), belief=0.05
+        )
         for axis in "xyz"
     }
 

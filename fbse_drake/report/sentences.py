@@ -1,6 +1,7 @@
 """What was found, in sentences: for the terminal, for notebooks and at the head of reports."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.compare import Comparison, words
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, Estimate, Finding
 from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance
+from fbse_drake.discrepancy.diagnosis.rivals import ELSEWHERE
 from fbse_drake.discrepancy.diagnosis.study import Study
 from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene
@@ -20,8 +22,8 @@ from fbse_drake.report.discrepancy_figures import (
 )
 from fbse_drake.report.html import Step, number
 
-# So many rows of a disturbance are named.
-_DISTURBED = 3
+# So many rows of a disturbance are named, and bodies that one effect may be on.
+_DISTURBED, _MOST_PLACES = 3, 2
 # What is left follows a variable that explains more than this share of it.
 _FOLLOWS = 0.1
 
@@ -383,7 +385,8 @@ def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
 def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[Step]:
     """What to look at and which experiments to make."""
     statuses = applicable(diagnosis.effects)
-    doubtful = {name: statuses[name] for finding in found for name in finding.confusable_with}
+    rivals = {_effect_of(name) for finding in found for name in finding.confusable_with}
+    doubtful = {name: status for name, status in statuses.items() if name in rivals}
     steps = []
     if diagnosis.partial is not None:
         steps.append(Step("Let it look for longer: the same command with more time."))
@@ -452,13 +455,27 @@ def _effects_in(effects: Sequence[str], targets: Sequence[str]) -> str:
 
 def _inside(effect: str) -> str:
     """An effect's name inside a sentence."""
-    name = spaced(effect)
+    name = words(spaced(effect))
     return name if name.startswith(_NAMES) else name[0].lower() + name[1:]
 
 
-def either_effect(effects: Iterable[str]) -> str:
-    """Effects for reading, as `Coulomb friction or torque bias`."""
-    return " or ".join(_inside(effect) for effect in effects)
+def either_effect(effects: Collection[str]) -> str:
+    """Effects for reading, as `Coulomb friction or torque bias`; of one on several other bodies
+    no more is said than that."""
+    places = Counter(map(_effect_of, effects))
+    names = (
+        f"{_effect_of(name)}{ELSEWHERE}another body"
+        if places[_effect_of(name)] > _MOST_PLACES
+        else name
+        for name in effects
+    )
+    return " or ".join(dict.fromkeys(map(_inside, names)))
+
+
+def _effect_of(rival: str) -> str:
+    """The effect's name in that of a rival, which may be the same effect on another body, as
+    `BodyMass on trunk`."""
+    return rival.split(ELSEWHERE)[0]
 
 
 def what_else(found: Sequence[Finding], *, partial: bool) -> str:

@@ -21,6 +21,8 @@ from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
 
+# Between an effect and a body in the name of a rival that is the same effect elsewhere.
+ELSEWHERE = " on "
 # A rival takes off the deviance at least this share of what the member takes.
 _NEAR = 0.25
 # So many rivals of each member are fitted by themselves, and so often at most.
@@ -66,7 +68,7 @@ def rival_name(rival: Candidate, member: Candidate) -> str:
     if rival.effect is not member.effect:
         return rival.name
     on_bodies = rival.effect.acts_on == "body" and rival.targets != member.targets
-    return f"{rival.name} on {rival.targets[0]}" if on_bodies else ""
+    return f"{rival.name}{ELSEWHERE}{rival.targets[0]}" if on_bodies else ""
 
 
 def indistinguishable(

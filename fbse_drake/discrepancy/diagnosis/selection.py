@@ -209,16 +209,21 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
     part = slice(start, start + len(names))
     values = wider.solved.parameters[part] + offsets
-    for k, (name, value) in enumerate(zip(names, values, strict=True)):
+    deviations, intervals = wider.solved.deviation[part], wider.solved.interval()[part]
+    beliefs = np.array([added.parameters[name].belief for name in names])
+    if is_disbelieved(values, beliefs, deviations, intervals):
+        return False
+    for name, value, deviation, (least, most) in zip(
+        names, values, deviations, intervals, strict=True
+    ):
+        belief = added.parameters[name].belief
+        if least <= 0 <= most and np.isfinite(belief):
+            # One of several components, which the log hardly shows.
+            continue
         low, high = added.parameters[name].bounds
-        plausible = added.parameters[name].plausible
-        widest = max(abs(bound) for bound in plausible)
+        widest = max(abs(bound) for bound in added.parameters[name].plausible)
         if low <= value <= high and abs(value) <= widest:
             continue
-        # What is believed beforehand to be this small is not so large, however sure a fit is.
-        if abs(value) > max(widest, _DISBELIEVED * added.parameters[name].belief):
-            return False
-        deviation, (least, most) = wider.solved.deviation[part][k], wider.solved.interval()[part][k]
         allowed = 3 * deviation
         if not issubclass(added.effect, JointTorqueEffect):
             # Masses, places and offsets have sizes that a bad fit does not widen.
@@ -233,6 +238,29 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         if abs(value) > widest and least <= 0 <= most:
             return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
+
+
+def is_disbelieved(
+    values: np.ndarray, beliefs: np.ndarray, deviations: np.ndarray, intervals: np.ndarray
+) -> bool:
+    """Are values larger than what is believed of them beforehand allows, however sure a fit is?
+
+    Components with the same belief are a vector, which may be so long whatever its axes are. Of one
+    that the log does not tell from nothing counts what is left of it beside the belief.
+
+    Args:
+        values, beliefs, deviations: (p,); beliefs are standard deviations about 0, infinite where
+            nothing is believed.
+        intervals: (p, 2).
+    """
+    counted, unsure = values.copy(), (intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)
+    for belief in np.unique(beliefs[np.isfinite(beliefs)]):
+        vector = beliefs == belief
+        hardly = vector & unsure
+        counted[hardly] *= belief**2 / (belief**2 + deviations[hardly] ** 2)
+        if np.linalg.norm(counted[vector]) > _DISBELIEVED * belief:
+            return True
+    return False
 
 
 def _pruned(fits: Fits, explanation: Explanation) -> Explanation:
