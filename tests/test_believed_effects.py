@@ -35,7 +35,7 @@ from fbse_drake.robot.plant import make_robot
 from fbse_drake.scenario import RobotConfig
 
 TICK = 1e-3
-# Small ones in the sensors; each would by itself spoil the friction.
+# Each would by itself spoil the friction.
 IN_SENSORS: dict[str, Effect] = {
     "gain": FootForceGain({"left": -0.05, "right": 0.03}),
     "lag": FootForceLag({"left": 0.004, "right": 0.002}),
@@ -129,10 +129,19 @@ def test_a_log_without_torques_is_corrected_too():
     assert tilted(with_effects(WALK, effects, "model")) < 0.3 * tilted(WALK)
 
 
-def test_corrections_undo_effects_tick_by_tick():
+# Sensors that are put in wrong by a sixth of a turn, or read half as much again.
+GROSSLY: dict[str, Effect] = IN_SENSORS | {
+    "gain": FootForceGain({"left": -0.4, "right": 0.5}),
+    "askew": FootForceMisalignment(x={"left": 0.4}, y={"left": -0.3}),
+    "imu": ImuMisalignment(0.2, -0.6, 0.1),
+}
+
+
+@pytest.mark.parametrize("effects_by_name", [IN_SENSORS, GROSSLY], ids=["slightly", "grossly"])
+def test_corrections_undo_effects_tick_by_tick(effects_by_name: Mapping[str, Effect]) -> None:
     """Whatever the sensors read, also with what effects remember."""
     robot, _ = make_robot("biped")
-    effects = [e.resolve(robot.description) for e in IN_SENSORS.values()]
+    effects = [e.resolve(robot.description) for e in effects_by_name.values()]
     there, back = (kind(effects, robot, TICK) for kind in (SensorEffects, SensorCorrections))
     contexts = {system: system.CreateDefaultContext() for system in (there, back)}
     random, cuts = np.random.default_rng(1), np.cumsum(list(there.sizes.values()))[:-1]
@@ -148,8 +157,7 @@ def test_corrections_undo_effects_tick_by_tick():
         true, command = sizes * random.normal(size=len(sizes)), 50.0 * random.normal(size=12)
         read = passed(there, true)
         assert np.abs(read - true).max() > 1.0
-        # What turns axes is undone in three steps, each of which leaves a share of its angle.
-        np.testing.assert_allclose(passed(back, read), true, rtol=2e-5, atol=1e-4)
+        np.testing.assert_allclose(passed(back, read), true, rtol=1e-6, atol=1e-5)
         for system, context in contexts.items():
             system.GetInputPort("torque_command").FixValue(context, command)
             system.ExecuteForcedEvents(context)

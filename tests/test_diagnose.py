@@ -32,6 +32,7 @@ from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.sensor import FootForceGain, FootForceMisalignment
 from fbse_drake.effects.transmission import JointSpring
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
@@ -680,3 +681,28 @@ def test_what_the_log_does_not_tell_from_nothing_does_not_make_a_vector_long() -
         values, half = np.array([0.1, 5.0]), 2.0 * deviation
         intervals = np.array([[0.09, 0.11], [5.0 - half, 5.0 + half]])
         assert is_disbelieved(values, np.ones(2), np.array([0.01, deviation]), intervals) == is_long
+
+
+def test_what_two_effects_add_together_is_no_third_one() -> None:
+    """A foot's sensor that is turned by a quarter of a rad and reads a fifth too much: both bring
+    140 times the sensors' noise, and together by a fifth of it more than each by itself."""
+    effects = {
+        "turned": FootForceMisalignment(x={"right": 0.15}, y={"right": 0.2}),
+        "gain": FootForceGain({"right": 0.2}),
+    }
+    given = load_scenario("paper_walk", overrides=["duration=3"])
+    robot = replace(given.robot, effects=given.robot.effects | effects)
+    log = simulate(replace(given, robot=robot)).log
+    diagnosis = diagnose(
+        Predictor(replace(given, model=given.robot), log), [FootForceGain, FootForceMisalignment]
+    )
+    assert diagnosis.verdict == "effect_found"
+    assert diagnosis.held_out_after < 1.1
+    found = {f.effect: f.parameters for f in diagnosis.chosen}
+    assert found.keys() == {"FootForceGain", "FootForceMisalignment"}
+    for effect, values in (
+        ("FootForceMisalignment", {"x": 0.15, "y": 0.2, "z": 0.0}),
+        ("FootForceGain", {"gain": 0.2}),
+    ):
+        for name, value in values.items():
+            assert found[effect][name].value == pytest.approx(value, abs=1e-3)

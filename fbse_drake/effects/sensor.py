@@ -17,8 +17,9 @@ from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 
 _ANY = (-np.inf, np.inf)
-# How often the effect of a sensor is taken off its signals.
-_UNDOING = 3
+# The effect of a sensor is taken off its signals until it would read what was read but for this
+# share of the largest reading, and so often at most.
+_UNDONE, _MOST_UNDOINGS = 1e-9, 50
 
 
 @dataclass(frozen=True)
@@ -119,16 +120,18 @@ class SensorEffect(Effect):
             memory: what is remembered at each tick; see `memory_over_time`.
         """
         signals = measured
-        for _ in range(_UNDOING):
-            read = cls.reading(signals, memory, values, robot)
-            signals = SensorSignals(
-                **{
-                    # What it does not distort is what was measured.
-                    name: getattr(measured, name)
-                    if getattr(read, name) is signal
-                    else signal + getattr(measured, name) - getattr(read, name)
-                    for name, signal in vars(signals).items()
-                }
+        for _ in range(_MOST_UNDOINGS):
+            read = vars(cls.reading(signals, memory, values, robot))
+            # What it does not distort is what was measured.
+            off = {
+                name: getattr(measured, name) - read[name]
+                for name, signal in vars(signals).items()
+                if read[name] is not signal
+            }
+            if not any(_is_off(off[name], getattr(measured, name)) for name in off):
+                break
+            signals = replace(
+                signals, **{name: getattr(signals, name) + more for name, more in off.items()}
             )
         return signals
 
@@ -719,3 +722,10 @@ class TransmissionElasticity(SensorEffect):
         for joint, share in enumerate(stays):
             memory[0, 1:, joint] = lfilter([1.0 - share], [1.0, -share], command[:-1, joint])
         return memory
+
+
+def _is_off(difference: np.ndarray, measured: np.ndarray) -> bool:
+    """Is a reading another one than what was measured, beyond rounding? What is not a number is
+    left as it is."""
+    largest = np.fmax.reduce(np.abs(measured), axis=None, initial=0.0)
+    return bool((np.abs(difference) > _UNDONE * largest).any())
