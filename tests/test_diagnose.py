@@ -230,7 +230,8 @@ def injected(log: Log, effect: Effect) -> Log:
     commanded more."""
     names = Predictor(scenario(), log)
     resolved = effect.resolve(names.robot.description)
-    torque, _ = resolved.torque_and_slope(JointMotion(log["truth/joint/velocity"][1:]))
+    velocity, position = (log[f"truth/joint/{name}"] for name in ("velocity", "position"))
+    torque, _ = resolved.torque_and_slope(JointMotion(velocity[1:], position[:-1]))
     command = log["joint/torque_command"].copy()
     command[:-1] += torque
     return replace(log, channels=log.channels | {"joint/torque_command": command})
@@ -249,6 +250,21 @@ def test_smallest_detectable_size_is_right_within_a_factor_of_two(joint: str) ->
     assert not found[0.5]
     assert found[2.0]
     assert all(finding.targets == (joint,) for finding in found[2.0])
+
+
+def test_a_spring_is_seen_from_the_stated_size_on_wherever_it_is_slack() -> None:
+    """Also where it is slack in the mean of the joint's angles, so that least of it shows."""
+    joint, spring, log = "left_knee_pitch", library()["JointSpring"], log_with("")
+    tried = [*effects(), spring]
+    exact = replace(scenario(), identify=IdentifyConfig(tolerance=0.0))
+    stated = diagnose(Predictor(exact, log), tried).effects["JointSpring"].smallest_detectable
+    angle = log["truth/joint/position"][:, log.joints.index(joint)]
+    for factor, is_seen in ((0.5, False), (2.0, True)):
+        stiffness = factor * stated[joint]
+        preload = -stiffness * angle.mean()
+        hidden = spring.from_values([joint], {"stiffness": [stiffness], "preload": [preload]})
+        found = diagnose(Predictor(exact, injected(log, hidden)), tried).chosen
+        assert [(f.effect, f.targets) for f in found] == [("JointSpring", (joint,))] * is_seen
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)

@@ -360,4 +360,5 @@ def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:
         torque = course.torque + friction[:, None] * np.tanh(course.velocity / 0.01)
         diagnosis = diagnose(PENDULUM.predictor(PENDULUM.log(course, torque)))
         assert ("ThermalDrift" in {finding.effect for finding in diagnosis.chosen}) == named
-        assert (diagnosis.effects["ThermalDrift"].verdict == "not_visible") != named
+        allowed = {"present"} if named else {"confusable", "not_visible"}
+        assert diagnosis.effects["ThermalDrift"].verdict in allowed

@@ -9,6 +9,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.proposals import grid_gain
+from fbse_drake.discrepancy.identification.regression import bounded_least_squares
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -21,7 +22,8 @@ def smallest_detectable(fits: Fits, base: Explanation, effect: type[Effect]) -> 
     target; infinite where none would. Where the explanation has the effect itself: beside the rest
     of it.
 
-    The size at which the effect's sum of squares reaches what its parameters must bring and cost.
+    The size at which the effect's sum of squares reaches what its parameters must bring and cost,
+    in a joint whatever its others are: a spring may be slack where the joint is.
     """
     sizes = _sizes_that_reach(fits, base, effect)
     for found in (c for c in base.candidates if c.effect is effect):
@@ -70,7 +72,7 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
         rows = fits.dictionary.rows_of(effect, [joint])
         needed = fits.needed(len(effect.parameters)) + fits.systematic(rows)
         grams = {at: beside.moments_of_grid(grid.sets[at])[0] for at in rows.tolist()}
-        power = sum(gram[:, 0, 0] / beside.scale[at] for at, gram in grams.items())
+        whole = sum(gram / beside.scale[at] for at, gram in grams.items())
         if not fits.dictionary.is_shown(effect, joint) or not np.all(
             effect.shows_within(
                 fits.dictionary.travel[row], fits.dictionary.usual_at(effect, joint)
@@ -78,9 +80,12 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
         ):
             result[joint] = np.inf
         elif has_linear:
-            result[joint] = float(np.sqrt(needed / max(power[usual], 1e-30)))
+            bounds = [p.bounds[0] for p in effect.parameters.values() if p.linear]
+            power = least_power(whole[usual], np.array(bounds[1:]))
+            result[joint] = float(np.sqrt(needed / max(power, 1e-30)))
         else:
             # Sizes in the order of the grid, from weak to strong.
+            power = whole[:, 0, 0]
             strong = power > needed
             order = np.argsort(power)
             enough = np.flatnonzero(strong[order])
@@ -88,6 +93,17 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
                 _crossing(here[0][order], power[order], needed) if len(enough) else np.inf
             )
     return result
+
+
+def least_power(gram: np.ndarray, lowest: np.ndarray) -> float:
+    """Sum of squares of a column and the least favourable amounts of others.
+
+    Args:
+        gram: inner products of the column and the others, (p, p).
+        lowest: amounts of the others, (p - 1,).
+    """
+    others = bounded_least_squares(gram[1:, 1:], -gram[1:, 0], lowest)
+    return float(gram[0, 0] + 2 * gram[0, 1:] @ others + others @ gram[1:, 1:] @ others)
 
 
 def separation(

@@ -84,7 +84,7 @@ def best_additions(
     Args:
         rows: only candidates that change one of these; by default all.
         most: only explanations with a smaller deviance.
-        in_part: also what the log shows a part of, too little to be named, see `shows_in_part`.
+        in_part: also what the log shows too little of to be named, see `could_be`.
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most), []
@@ -105,7 +105,7 @@ def best_additions(
             for member in added
         )
         if all(
-            (is_shown(fits, member) or (in_part and shows_in_part(proposals, rest, wider, member)))
+            (is_shown(fits, member) or (in_part and could_be(proposals, rest, wider, member)))
             and is_significant(fits, rest, wider, member)
             for rest, member in zip(without, added, strict=True)
         ):
@@ -152,13 +152,30 @@ def is_shown(fits: Fits, candidate: Candidate) -> bool:
     effect, dictionary = candidate.effect, fits.dictionary
     if not issubclass(effect, JointTorqueEffect):
         return True
-    within = effect.shows_within(_travel(fits, candidate), candidate.nonlinear)
-    return bool(np.any(within)) and any(
+    return _shows_within(fits, candidate) and any(
         dictionary.is_shown(effect, joint) for joint in candidate.targets
     )
 
 
-def shows_in_part(
+def _shows_within(fits: Fits, candidate: Candidate) -> bool:
+    """Does it act where the joints were? That others could have done the same is another
+    question."""
+    effect = candidate.effect
+    if not issubclass(effect, JointTorqueEffect):
+        return True
+    return bool(np.any(effect.shows_within(_travel(fits, candidate), candidate.nonlinear)))
+
+
+def could_be(proposals: Proposals, base: Explanation, wider: Explanation, added: Candidate) -> bool:
+    """May a candidate be what is there, though the log does not show enough of it for a name?
+
+    Args:
+        base, wider: explanations without and with it.
+    """
+    return _shows_within(proposals.fits, added) or _shows_in_part(proposals, base, wider, added)
+
+
+def _shows_in_part(
     proposals: Proposals, base: Explanation, wider: Explanation, added: Candidate
 ) -> bool:
     """Does the log show of a candidate at least that law which a small part of it looks like?
