@@ -362,3 +362,15 @@ def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:
         assert ("ThermalDrift" in {finding.effect for finding in diagnosis.chosen}) == named
         allowed = {"present"} if named else {"confusable", "not_visible"}
         assert diagnosis.effects["ThermalDrift"].verdict in allowed
+
+
+def test_a_low_pass_beyond_half_the_rate_leaves_all(pendulum: Course) -> None:
+    """A scenario for a log of 250 Hz reads every tenth row of it as well."""
+    recording = replace(PENDULUM.scenario.recording, cutoff=40.0, block=0.2)
+    scenario, rare = replace(PENDULUM.scenario, recording=recording), slice(None, None, 10)
+    log = PENDULUM.log(pendulum).part(rare)
+    motion = Predictor(scenario, log).motion
+    torque = motion.signals.torque_command
+    assert np.array_equal(motion.low_passed(torque, 12.5), torque)
+    assert not np.allclose(motion.low_passed(torque, 12.0), torque, atol=1e-6)
+    assert diagnose(Predictor(scenario, log), [CoulombFriction]).verdict == "nothing_missing"

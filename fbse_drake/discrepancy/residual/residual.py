@@ -224,8 +224,8 @@ def _low_passed(
     values: np.ndarray, cutoff: float, period: float, stretches: list[slice]
 ) -> np.ndarray:
     """Values (N, ...) through a low-pass without delay, stretch by stretch; as they are for a
-    corner of 0."""
-    if cutoff == 0:
+    corner of 0, or of half the rate of samples, beyond which they hold nothing."""
+    if cutoff == 0 or 2 * cutoff * period >= 1:
         return values
     result = values.copy()
     filter_ = _butterworth(cutoff, period)
