@@ -12,6 +12,7 @@ import pytest
 import yaml
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
+from recorded_arm import PENDULUM
 from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake import InputError, Log, Scenario, load_scenario
@@ -29,6 +30,7 @@ from fbse_drake.discrepancy.identification.inertial import (
 )
 from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants
 from fbse_drake.effects.effect import library
+from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.effects.inertia import (
     InertialParameters,
     equal_point_masses,
@@ -549,3 +551,14 @@ def test_a_walking_robot_can_doubt_a_body(run: Callable[..., Log]) -> None:
     mass = PARAMETERS.index("mass")
     assert result.inertia.uncertainty[0, mass] < 0.1
     assert abs(result.inertia.change[0, mass]) < result.inertia.half_width[0, mass] + 0.05
+
+
+def test_where_nothing_of_the_inertia_shows_there_is_nothing_to_identify() -> None:
+    """Torques that are known to 1000 Nm of a pendulum that weighs some newtons."""
+    machine = dataclasses.replace(PENDULUM, torque_noise=(1e3,), duration=2.0)
+    scenario = dataclasses.replace(machine.scenario, identify=IdentifyConfig(inertia=["all"]))
+    log = machine.log(machine.course())
+    with pytest.raises(InputError, match="shows nothing of the inertia of these bodies"):
+        identify(scenario, log)
+    diagnosis = diagnose(Predictor(scenario, log), [CoulombFriction])
+    assert (diagnosis.verdict, diagnosis.ranking) == ("not_visible", ())

@@ -70,13 +70,14 @@ class Dictionary:
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
         self._untrusted = set(untrusted)
         # Inertial parameters that are not trusted are fitted in every explanation, in directions
-        # that the log shows.
-        self.inertia = untrusted_inertia(predictor.motion, untrusted) if untrusted else None
+        # that the log shows; if it shows none, nothing can be said against the model's.
+        self.inertia: UntrustedInertia | None = None
+        if untrusted:
+            self._look_at(untrusted_inertia(predictor.motion, untrusted))
         if self.inertia is not None:
             # Friction is tried as a whole: as long as half of it is missing, inertia is fitted to
             # that half.
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
-            self._look_at(self.inertia)
         self._grids: dict[tuple[type[JointTorqueEffect], int], np.ndarray] = {}
         self._shown: dict[tuple[type[JointTorqueEffect], str], bool] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
@@ -84,8 +85,8 @@ class Dictionary:
 
     def _look_at(self, inertia: UntrustedInertia) -> None:
         """Finds the directions of inertia that the log shows."""
-        self.inertia = inertia
         self.directions = inertia.visible_directions(WhitenedResidual(self.predictor.residual))
+        self.inertia = inertia if self.directions.size else None
         self.inertia_signature = inertia.signature(self.directions)
 
     def with_inertia(self, inertia: UntrustedInertia) -> "Dictionary":

@@ -63,7 +63,8 @@ def identify(
         progress: is told what is being done.
 
     Raises:
-        InputError: a log that does not fit the scenario, or a scenario that trusts all inertia.
+        InputError: a log that does not fit the scenario, or shows nothing of the inertia; or a
+            scenario that trusts all of it.
     """
     if not scenario.identify.inertia:
         raise InputError(
@@ -72,7 +73,13 @@ def identify(
         )
     progress("predicting what each parameter would do")
     predictor = Predictor(scenario, log)
-    fits = remeasured(Fits(Dictionary(predictor, [], progress)))
+    dictionary = Dictionary(predictor, [], progress)
+    if dictionary.inertia is None:
+        raise InputError(
+            "identify.inertia: this log shows nothing of the inertia of these bodies, beside the "
+            "noise that is believed of its sensors"
+        )
+    fits = remeasured(Fits(dictionary))
     raw, alone = fits.white.sse, fits.explain([])
     progress("fitting plain friction")
     fitted, inertia = consistent(fits, Proposals(fits).plain_friction())
