@@ -223,7 +223,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
         doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
         if is_refuted(diagnosis.set_aside):
             return f"{_suggested(found)}{doubt}."
-        return f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}"
+        return f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}{_open(diagnosis)}"
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
@@ -257,6 +257,14 @@ def _verdict(diagnosis: Diagnosis) -> str:
         refuted = is_refuted(diagnosis.set_aside)
         known = f" {_suggested(found)}." if refuted else f" The model also lacks {found}."
     return f"{_unexplained(diagnosis)}{known}"
+
+
+def _open(diagnosis: Diagnosis) -> str:
+    """Says that more may be missing than was found, in a log too short to tell."""
+    if not diagnosis.untested:
+        return ""
+    rows = _enumerated([words(row) for row in diagnosis.untested])
+    return f" Whether what is left in {rows} is noise does not show in so few averages."
 
 
 def _suggested(found: str) -> str:

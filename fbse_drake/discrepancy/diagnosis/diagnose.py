@@ -303,9 +303,10 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
     final, inertia = consistent(proposals.fits, path[-1])
     path[-1], remaining, left = added(proposals.fits, final)
     significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    structures = leftover_structure(predictor.motion, remaining, left)
     unexplained = [
         structure
-        for structure in leftover_structure(predictor.motion, remaining, left)
+        for structure in structures
         if not significance.left_share(structure, remaining) < tolerance
     ]
     disturbed = disturbances(remaining, left, [structure.index for structure in unexplained])
@@ -317,7 +318,7 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         inertia,
         unexplained,
         disturbed,
-        untested_rows(remaining, left),
+        untested_rows(predictor.motion, remaining, left, structures),
         partial,
     )
 
