@@ -32,7 +32,7 @@ arm:
     encoders: {resolution: 1.0e-4}
     more: {winding: !JointTemperature {}}
   control: {kp: {all: 100}, kd: {all: 1}, torque_limit: {all: 50}}
-  recording: {block: 0.01, torque_noise: {all: 0.01}}
+  recording: {block: 0.01, cutoff: 60, torque_noise: {all: 0.01}}
   log: {period: 0.001}
   identify: {inertia: [all]}
 """
@@ -171,9 +171,11 @@ def _yaml(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def _npz(content: bytes, random: np.random.Generator) -> bytes:
-    if random.integers(5) == 0:
+    kind = random.integers(5)
+    if kind == 0:
         return mutations.damaged(content, random)
-    return mutations.changed_npz(content, random)
+    change = mutations.read_otherwise if kind == 1 else mutations.changed_npz
+    return change(content, random)
 
 
 def _sealed(content: bytes, random: np.random.Generator) -> bytes:

@@ -253,6 +253,35 @@ def changed_npz(content: bytes, random: np.random.Generator) -> bytes:
     return _lying(stream.getvalue(), random)
 
 
+def read_otherwise(content: bytes, random: np.random.Generator) -> bytes:
+    """A log that is whole, of a recorder that was slower, stopped earlier or missed rows; or of a
+    channel that is held or nothing but noise."""
+    with np.load(io.BytesIO(content)) as file:
+        arrays = {name: file[name] for name in file.files}
+    rows = len(arrays["time"])
+    channels = [name for name, array in arrays.items() if array.ndim and len(array) == rows]
+    kind, name = random.integers(5), channels[random.integers(len(channels))]
+    if kind < 3:
+        missed = random.random(rows) < random.choice([0.02, 0.2])
+        start, stop = np.sort(random.integers(rows + 1, size=2))
+        step = int(random.choice([2, 10, 50]))
+        taken = (
+            np.arange(0, rows, step),
+            np.arange(start, stop),
+            np.flatnonzero(~missed),
+        )[kind]
+        arrays |= {name: arrays[name][taken] for name in channels}
+        if kind == 0:
+            meta = json.loads(str(arrays["meta"]))
+            arrays["meta"] = np.array(json.dumps(meta | {"period": step * meta["period"]}))
+    else:
+        noise = random.normal(size=arrays[name].shape)
+        arrays[name] = noise if kind == 3 else np.repeat(arrays[name][:1], rows, axis=0)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
 def _changed_array(array: np.ndarray, random: np.random.Generator) -> np.ndarray:
     kind = random.integers(6)
     if kind == 0:
