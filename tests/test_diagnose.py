@@ -678,30 +678,41 @@ def test_an_implausible_offset_is_no_finding_however_badly_it_is_known(
 def test_what_is_believed_of_a_vector_holds_in_all_axes() -> None:
     """With a belief of 1 nothing longer than 3 is believed, whichever axes it is measured in."""
     generator = np.random.default_rng(4)
-    sure = np.zeros(3)
+    sure, one = np.zeros(3), np.ones(3)
     for length, is_long in ((2.9, False), (3.1, True)):
         for direction in generator.normal(size=(20, 3)):
             vector = length * direction / np.linalg.norm(direction)
             interval = np.stack([vector, vector], axis=1)
-            assert is_disbelieved(vector, np.ones(3), sure, interval) == is_long
+            assert is_disbelieved(vector, one, one, sure, interval) == is_long
+            # What is plausible is believed.
+            assert not is_disbelieved(vector, one, 4.0 * one, sure, interval)
             # Of a number of which nothing is believed nothing is disbelieved.
-            values, beliefs = np.append(vector, 1e6), np.array([1.0, 1.0, 1.0, np.inf])
-            intervals = np.append(interval, [[1e6, 1e6]], axis=0)
-            assert is_disbelieved(values, beliefs, np.append(sure, 1.0), intervals) == is_long
+            arguments = [
+                np.append(of_vector, [more], axis=0)
+                for of_vector, more in (
+                    (vector, 1e6),
+                    (one, np.inf),
+                    (one, 1.0),
+                    (sure, 1.0),
+                    (interval, [1e6, 1e6]),
+                )
+            ]
+            assert is_disbelieved(*arguments) == is_long
 
 
 def test_what_the_log_does_not_tell_from_nothing_does_not_make_a_vector_long() -> None:
     """A component of 5 +- 4 with a belief of 1 is 5 / 17 beside that belief; one of 5 +- 1 is 5,
     for the log tells it from nothing."""
     for deviation, is_long in ((4.0, False), (1.0, True)):
-        values, half = np.array([0.1, 5.0]), 2.0 * deviation
+        values, half, one = np.array([0.1, 5.0]), 2.0 * deviation, np.ones(2)
         intervals = np.array([[0.09, 0.11], [5.0 - half, 5.0 + half]])
-        assert is_disbelieved(values, np.ones(2), np.array([0.01, deviation]), intervals) == is_long
+        deviations = np.array([0.01, deviation])
+        assert is_disbelieved(values, one, one, deviations, intervals) == is_long
 
 
 def test_what_two_effects_add_together_is_no_third_one() -> None:
-    """A foot's sensor that is turned by a quarter of a rad and reads a fifth too much: both bring
-    140 times the sensors' noise, and together by a fifth of it more than each by itself."""
+    """A foot's sensor that is turned by a quarter of a rad and reads a fifth too much: more than a
+    hundred times the sensors' noise."""
     effects = {
         "turned": FootForceMisalignment(x={"right": 0.15}, y={"right": 0.2}),
         "gain": FootForceGain({"right": 0.2}),
@@ -713,6 +724,7 @@ def test_what_two_effects_add_together_is_no_third_one() -> None:
         Predictor(replace(given, model=given.robot), log), [FootForceGain, FootForceMisalignment]
     )
     assert diagnosis.verdict == "effect_found"
+    assert diagnosis.held_out_before > 100
     assert diagnosis.held_out_after < 1.1
     found = {f.effect: f.parameters for f in diagnosis.chosen}
     assert found.keys() == {"FootForceGain", "FootForceMisalignment"}

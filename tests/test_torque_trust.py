@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recorded_arm import ARM, PENDULUM, Course, Machine, inverse_dynamics
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
@@ -337,6 +338,20 @@ def test_forty_averages_do_not_say_that_what_is_left_is_noise(
     assert (diagnosis.verdict, diagnosis.chosen) == (verdict, [])
     assert bool(diagnosis.untested) == (verdict == "not_visible")
     assert ("too short to tell" in diagnosis_outcome(diagnosis)) == (verdict == "not_visible")
+
+
+def test_a_test_that_sees_little_acquits_nothing(pendulum: Course) -> None:
+    """What lasts for a quarter of a second and comes by chance: in 80 averages it is seen or it is
+    not; that it is noise is never said. In 8 logs either happens."""
+    recording = replace(PENDULUM.scenario.recording, block=0.1)
+    scenario, verdicts = replace(PENDULUM.scenario, recording=recording), set()
+    for seed in range(8):
+        white = np.random.default_rng([seed, 3]).normal(size=pendulum.torque.shape)
+        lasting = lfilter([1.0], [1.0, -np.exp(-pendulum.period / 0.12)], white, axis=0)
+        torque = pendulum.torque + 0.01 * lasting / lasting.std()
+        log = PENDULUM.log(pendulum, torque, seed)
+        verdicts.add(diagnose(Predictor(scenario, log), [CoulombFriction]).verdict)
+    assert verdicts == {"not_visible", "unknown_effect"}
 
 
 def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:

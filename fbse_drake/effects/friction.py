@@ -399,8 +399,8 @@ class ThermalDrift(JointTorqueEffect):
     def shows_in(cls, motion: JointMotion) -> bool:
         """Where the joint does again what it did before: of one way there and back nobody can say
         whether time has changed the friction or the angle has."""
-        sign, _ = smooth_sign(motion.velocity, _sharp()["all"])
-        time, position = (np.broadcast_to(x, sign.shape) for x in (motion.time, motion.position))
+        sign = smooth_sign(motion.velocity, _sharp()["all"])[0].ravel()
+        time, position = np.ravel(motion.time), np.ravel(motion.position)
         edges = np.quantile(position, np.linspace(0.0, 1.0, _PLACES + 1)[1:-1])
         place = np.searchsorted(edges, position)
         left, whole = 0.0, 0.0

@@ -43,15 +43,10 @@ class JointMotion(NamedTuple):
     # Torque that passes the gear: the command less what was lost just before [Nm].
     load: np.ndarray | float = 0.0
 
-    def of_joint(self, place: int) -> "JointMotion":
-        """Of one joint, (...,)."""
-        velocity, position, command, time, load = (
-            values[..., place]
-            for values in np.broadcast_arrays(
-                self.velocity, self.position, self.command, self.time, self.load
-            )
-        )
-        return JointMotion(velocity, position, command, time, self.time_step, load=load)
+    def of_joints(self, joints: np.ndarray) -> "JointMotion":
+        """Of some joints, of a motion of several that was measured: (N, n) each, time (N, 1)."""
+        names = ("velocity", "position", "command", "load")
+        return self._replace(**{name: getattr(self, name)[:, joints] for name in names})
 
 
 class Rise(NamedTuple):
@@ -199,7 +194,7 @@ class JointTorqueEffect(Effect):
 
     @classmethod
     def shows_in(cls, motion: JointMotion) -> bool:  # noqa: ARG003
-        """Does what a joint did in N steps, (N,) each, show what the effect is?"""
+        """Does what a joint did in N steps, (N, 1) each, show what the effect is?"""
         return True
 
     @staticmethod

@@ -17,9 +17,11 @@ from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 
 _ANY = (-np.inf, np.inf)
-# The effect of a sensor is taken off its signals until it would read what was read but for this
-# share of the largest reading, and so often at most.
+# An effect that has no opposite is taken off the signals until they would be read as they were but
+# for this share of the largest reading, and so often at most.
 _UNDONE, _MOST_UNDOINGS = 1e-9, 50
+# Of what is measured a sensor reads this share at least, or it is not to be had from the readings.
+_LEAST_READ = 1e-3
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,12 @@ class SensorEffect(Effect):
                 memory[:, k + 1] = cls.remembered(tick, memory[:, k], values, robot, period)
         return memory
 
+    @staticmethod
+    def opposite(linear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
+        """Linear parameters with which the effect undoes itself with these, (p, targets); None
+        where there are none."""
+        return None
+
     @classmethod
     def undone(
         cls,
@@ -112,13 +120,16 @@ class SensorEffect(Effect):
     ) -> SensorSignals:
         """What the sensors ought to read over a whole log if this is what they read.
 
-        By taking off, again and again, what the effect adds: it is small, and each time leaves a
-        share of its own size.
+        By the effect's opposite; without one by taking off, again and again, what the effect adds:
+        it is small, and each time leaves a share of its own size.
 
         Args:
             measured: with the ticks as the leading axis.
             memory: what is remembered at each tick; see `memory_over_time`.
         """
+        opposite = cls.opposite(values.linear)
+        if opposite is not None:
+            return cls.reading(measured, memory, replace(values, linear=opposite), robot)
         signals = measured
         for _ in range(_MOST_UNDOINGS):
             read = vars(cls.reading(signals, memory, values, robot))
@@ -128,7 +139,7 @@ class SensorEffect(Effect):
                 for name, signal in vars(signals).items()
                 if read[name] is not signal
             }
-            if not any(_is_off(off[name], getattr(measured, name)) for name in off):
+            if not any(_differs(off[name], getattr(measured, name)) for name in off):
                 break
             signals = replace(
                 signals, **{name: getattr(signals, name) + more for name, more in off.items()}
@@ -206,9 +217,25 @@ def _pads_of(values: np.ndarray, robot: Robot) -> np.ndarray:
     return np.repeat(values, [leg.points for leg in robot.description.legs.values()], axis=-1)
 
 
+class ShiftOrTurn(SensorEffect):
+    """Base of effects that add to readings or turn their axes."""
+
+    @staticmethod
+    def opposite(linear: np.ndarray) -> np.ndarray:
+        return -linear
+
+
+class Gain(SensorEffect):
+    """Base of effects by which a sensor reads (1 + gain) times what it measures."""
+
+    @staticmethod
+    def opposite(linear: np.ndarray) -> np.ndarray:
+        return 1.0 / np.maximum(1.0 + linear, _LEAST_READ) - 1.0
+
+
 @in_library
 @dataclass(frozen=True)
-class FootForceGain(SensorEffect):
+class FootForceGain(Gain):
     """The force sensors of a foot read (1 + gain) times the force."""
 
     description: ClassVar[str] = (
@@ -239,7 +266,7 @@ class FootForceGain(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class FootForceBias(SensorEffect):
+class FootForceBias(ShiftOrTurn):
     """Each pad of a foot, or its six-axis sensor, reads this force too much, in the axes of the
     sole."""
 
@@ -278,7 +305,7 @@ class FootForceBias(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class FootMomentBias(SensorEffect):
+class FootMomentBias(ShiftOrTurn):
     """The force sensors of a foot together read this moment too much, about the origin of the sole
     and in its axes."""
 
@@ -309,7 +336,7 @@ class FootMomentBias(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class FootForceMisalignment(SensorEffect):
+class FootForceMisalignment(ShiftOrTurn):
     """The force sensors of a foot are turned against the sole by this rotation vector, about its
     origin; force and moment are read in the turned axes. As a rotation it is linear for small
     angles only.
@@ -451,7 +478,7 @@ def _what_stays(time_constant: np.ndarray, period: float) -> np.ndarray:
 
 @in_library
 @dataclass(frozen=True)
-class AccelerometerGain(SensorEffect):
+class AccelerometerGain(Gain):
     """The accelerometer reads (1 + gain) times the specific force."""
 
     description: ClassVar[str] = (
@@ -480,7 +507,7 @@ class AccelerometerGain(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class AccelerometerBias(SensorEffect):
+class AccelerometerBias(ShiftOrTurn):
     """The accelerometer reads this specific force too much, in the IMU frame."""
 
     description: ClassVar[str] = "The accelerometer reads a constant too much."
@@ -510,7 +537,7 @@ class AccelerometerBias(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class GyroscopeBias(SensorEffect):
+class GyroscopeBias(ShiftOrTurn):
     """The gyroscope reads this rate too much, in the IMU frame."""
 
     description: ClassVar[str] = "The gyroscope reads a constant rate too much."
@@ -538,7 +565,7 @@ class GyroscopeBias(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class ImuMisalignment(SensorEffect):
+class ImuMisalignment(ShiftOrTurn):
     """The IMU's axes are turned against the IMU frame by this rotation vector; both of its sensors
     read in the turned axes.
 
@@ -582,7 +609,7 @@ class ImuMisalignment(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class EncoderOffset(SensorEffect):
+class EncoderOffset(ShiftOrTurn):
     """The encoder of a joint reads this angle too much."""
 
     description: ClassVar[str] = "The zero of a joint's encoder is off."
@@ -609,7 +636,7 @@ class EncoderOffset(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class MotorEncoderOffset(SensorEffect):
+class MotorEncoderOffset(ShiftOrTurn):
     """The second encoder of a joint, on the motor's side, reads this angle too much."""
 
     description: ClassVar[str] = (
@@ -640,7 +667,7 @@ class MotorEncoderOffset(SensorEffect):
 
 @in_library
 @dataclass(frozen=True)
-class TransmissionElasticity(SensorEffect):
+class TransmissionElasticity(ShiftOrTurn):
     """A massless damped spring between motor and joint, with the encoder on the motor's side: it
     reads q + d, where
 
@@ -724,7 +751,7 @@ class TransmissionElasticity(SensorEffect):
         return memory
 
 
-def _is_off(difference: np.ndarray, measured: np.ndarray) -> bool:
+def _differs(difference: np.ndarray, measured: np.ndarray) -> bool:
     """Is a reading another one than what was measured, beyond rounding? What is not a number is
     left as it is."""
     largest = np.fmax.reduce(np.abs(measured), axis=None, initial=0.0)

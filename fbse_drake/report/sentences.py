@@ -165,7 +165,7 @@ def is_refuted(set_aside: Mapping[str, Validation]) -> bool:
 
 def _disturbed(disturbance: Disturbance) -> str:
     """As `Something acted on left knee pitch from 3.21 to 3.43 s, once; that was left out.`"""
-    rows = _enumerated([words(row) for row in disturbance.rows[:_DISTURBED]])
+    rows = _rows(disturbance.rows[:_DISTURBED])
     more = len(disturbance.rows) - _DISTURBED
     return (
         f"Something acted on {rows}{f' and {more} more rows' if more > 0 else ''} "
@@ -241,11 +241,10 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"it){unseen}."
         )
     if diagnosis.verdict == "not_visible" and diagnosis.untested:
-        rows = _enumerated([words(row) for row in diagnosis.untested])
         return (
             "This log is too short to tell whether something is missing: the model leaves over "
             f"{number(diagnosis.held_out_before)} times the sensors' noise, and whether that is "
-            f"noise as well does not show in so few averages of {rows}."
+            f"noise as well does not show in so few averages of {_rows(diagnosis.untested)}."
         )
     if diagnosis.verdict == "not_visible":
         return (
@@ -263,7 +262,7 @@ def _open(diagnosis: Diagnosis) -> str:
     """Says that more may be missing than was found, in a log too short to tell."""
     if not diagnosis.untested:
         return ""
-    rows = _enumerated([words(row) for row in diagnosis.untested])
+    rows = _rows(diagnosis.untested)
     return f" Whether what is left in {rows} is noise does not show in so few averages."
 
 
@@ -452,6 +451,11 @@ def listed_effects(findings: Sequence[Finding]) -> str:
 
 def _enumerated(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
+
+
+def _rows(names: Sequence[str]) -> str:
+    """Rows of the residual for reading."""
+    return _enumerated([words(name) for name in names])
 
 
 def _effects_in(effects: Sequence[str], targets: Sequence[str]) -> str:

@@ -152,8 +152,8 @@ class Dictionary:
         """Does what a joint did in the log show what an effect is?"""
         key = effect, joint
         if key not in self._shown:
-            motion, place = self.predictor.joint_motion, self.joints.index(joint)
-            self._shown[key] = effect.shows_in(motion.of_joint(place))
+            place = np.array([self.joints.index(joint)])
+            self._shown[key] = effect.shows_in(self.predictor.joint_motion.of_joints(place))
         return self._shown[key]
 
     def serves(self, predictor: Predictor, effects: Collection[type[Effect]]) -> bool:

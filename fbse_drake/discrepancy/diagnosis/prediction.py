@@ -335,10 +335,10 @@ class Predictor:
         """What effects on some joints depend on, averaged over so many steps."""
         whole = (self._noisier_joint_motions if noisier else self._joint_motions)(step)
         if len(joints) > 1:
-            return _columns(whole, joints)
+            return whole.of_joints(joints)
         key = (int(joints[0]), step, noisier)
         if key not in self._motions_of_joint:
-            self._motions_of_joint[key] = _columns(whole, joints)
+            self._motions_of_joint[key] = whole.of_joints(joints)
         return self._motions_of_joint[key]
 
     def _torques(
@@ -798,12 +798,6 @@ class Predictor:
         creep, (B, R)."""
         sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
-
-
-def _columns(motion: JointMotion, joints: np.ndarray) -> JointMotion:
-    """Of some joints."""
-    names = ("velocity", "position", "command", "load")
-    return motion._replace(**{name: getattr(motion, name)[:, joints] for name in names})
 
 
 def _joined(motion: JointMotion, steps: int) -> JointMotion:

@@ -227,18 +227,18 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     part = slice(start, start + len(names))
     values = wider.solved.parameters[part] + offsets
     deviations, intervals = wider.solved.deviation[part], wider.solved.interval()[part]
-    beliefs = np.array([added.parameters[name].belief for name in names])
-    if is_disbelieved(values, beliefs, deviations, intervals):
+    parameters = [added.parameters[name] for name in names]
+    beliefs = np.array([parameter.belief for parameter in parameters])
+    largest = np.array([max(map(abs, parameter.plausible)) for parameter in parameters])
+    if is_disbelieved(values, beliefs, largest, deviations, intervals):
         return False
-    for name, value, deviation, (least, most) in zip(
-        names, values, deviations, intervals, strict=True
+    for parameter, value, widest, deviation, (least, most) in zip(
+        parameters, values, largest, deviations, intervals, strict=True
     ):
-        belief = added.parameters[name].belief
-        if least <= 0 <= most and np.isfinite(belief):
+        if least <= 0 <= most and np.isfinite(parameter.belief):
             # One of several components, which the log hardly shows.
             continue
-        low, high = added.parameters[name].bounds
-        widest = max(abs(bound) for bound in added.parameters[name].plausible)
+        low, high = parameter.bounds
         if low <= value <= high and abs(value) <= widest:
             continue
         allowed = 3 * deviation
@@ -258,7 +258,11 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
 
 
 def is_disbelieved(
-    values: np.ndarray, beliefs: np.ndarray, deviations: np.ndarray, intervals: np.ndarray
+    values: np.ndarray,
+    beliefs: np.ndarray,
+    plausible: np.ndarray,
+    deviations: np.ndarray,
+    intervals: np.ndarray,
 ) -> bool:
     """Are values larger than what is believed of them beforehand allows, however sure a fit is?
 
@@ -266,8 +270,9 @@ def is_disbelieved(
     that the log does not tell from nothing counts what is left of it beside the belief.
 
     Args:
-        values, beliefs, deviations: (p,); beliefs are standard deviations about 0, infinite where
-            nothing is believed.
+        values, deviations: (p,).
+        beliefs: standard deviations about 0, infinite where nothing is believed, (p,).
+        plausible: the largest values that are plausible, and so are never too large, (p,).
         intervals: (p, 2).
     """
     counted, unsure = values.copy(), (intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)
@@ -275,7 +280,8 @@ def is_disbelieved(
         vector = beliefs == belief
         hardly = vector & unsure
         counted[hardly] *= belief**2 / (belief**2 + deviations[hardly] ** 2)
-        if np.linalg.norm(counted[vector]) > _DISBELIEVED * belief:
+        longest = max(_DISBELIEVED * belief, plausible[vector].max())
+        if np.linalg.norm(counted[vector]) > longest:
             return True
     return False
 
