@@ -172,6 +172,28 @@ def anywhere(generator: np.random.Generator, size: float = 1.0) -> np.ndarray:
     return x
 
 
+def test_what_level_ground_tells_grows_with_the_logarithm_of_time_only():
+    """It is as wrong under a foot as it was when that landed. Nothing else tells of the tilt here:
+    against the integral of what two feet tell."""
+    level, lasts, seconds = 0.01, 0.05, 2.0
+    config = dataclasses.replace(
+        SILENT, level_ground=level, foot_time=lasts, foot_turning=0.0, foot_creep=0.0
+    )
+    sensors = dataclasses.replace(
+        USUAL_SENSORS,
+        angular_velocity_bias=0.0,
+        angular_velocity_noise=1e-9,
+        acceleration_bias=1e3,
+    )
+    rig = Filter(config, sensors)
+    begin = rig.tick()["attitude_std"][:2].copy()
+    time = TICK * np.arange(1, round(seconds / TICK) + 1)
+    found = np.array([rig.tick()["attitude_std"][:2] for _ in time])
+    told = 2.0 * np.where(time < lasts, time / lasts, 1.0 + np.log(np.maximum(time / lasts, 1.0)))
+    expected = 1.0 / np.sqrt(1.0 / begin**2 + told[:, None] / (2.0 * level**2))
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
 def test_transition_is_that_of_the_groups_motion():
     """The error's Jacobian is found by moving truth and estimate apart from each other."""
     generator, rig = np.random.default_rng(0), Filter()

@@ -2,6 +2,7 @@
 soles say something."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,12 @@ def yaw(orientation: Rotation) -> np.ndarray:
     return np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
 
 
+def tilt_between(one: Rotation, other: Rotation) -> np.ndarray:
+    """Angle between the verticals of two attitudes, (N,) [rad]."""
+    up, other_up = (rotation.inv().apply([0, 0, 1]) for rotation in (one, other))
+    return np.arccos(np.clip((up * other_up).sum(axis=1), -1, 1))
+
+
 def test_base_pose_is_the_recordings_own(estimated: EstimationResult) -> None:
     """The own pose is off by 0.9 deg from the robot's own attitude sensor; while it stands by 0.4
     to 1.1 deg from the accelerometer. So nobody can be much nearer to it."""
@@ -212,14 +219,31 @@ def test_base_pose_is_the_recordings_own(estimated: EstimationResult) -> None:
         Rotation.from_quat(log[f"{source}/base/orientation"], scalar_first=True)
         for source in ("estimate", "recorded")
     )
-    up, own_up = (rotation.inv().apply([0, 0, 1]) for rotation in (found, own))
-    tilt = np.rad2deg(np.arccos(np.clip((up * own_up).sum(axis=1), -1, 1)))
-    fresh = own_pose_is_fresh(log)
+    tilt, fresh = np.rad2deg(tilt_between(found, own)), own_pose_is_fresh(log)
     assert fresh.mean() > 0.95
-    assert np.sqrt(np.mean(tilt[fresh] ** 2)) < 0.8
+    assert np.sqrt(np.mean(tilt[fresh] ** 2)) < 0.7
     # Yaw is that of the start.
     drift = np.rad2deg(yaw(found) - yaw(own))
-    assert np.abs(drift - drift[:100].mean())[fresh].max() < 3.2
+    assert np.abs(drift - drift[:100].mean())[fresh].max() < 3.0
+
+
+@pytest.mark.parametrize("start", [1300, 2300, 4300, 6300])
+def test_an_estimate_may_begin_in_mid_walk(
+    scenario: Scenario, log: Log, estimated: EstimationResult, start: int
+) -> None:
+    """It agrees with the one that began at rest, within what both state, and within 0.3 deg after
+    ten seconds: what a foot that gives does in one stance is not taken for the gyro's bias."""
+    rows = slice(start, start + 1200)
+    part = estimate(scenario, log.part(rows)).log
+    names = "estimate/base/orientation", "estimate/base/attitude_std"
+    (own, own_std), (whole, whole_std) = (
+        [found[name] for name in names]
+        for found in (part, {name: estimated.log[name][rows] for name in names})
+    )
+    tilt = tilt_between(*(Rotation.from_quat(x, scalar_first=True) for x in (own, whole)))
+    stated = np.hypot(own_std[:, :2].max(axis=1), whole_std[:, :2].max(axis=1))
+    assert np.mean(tilt < 2.0 * stated) > 0.98
+    assert np.rad2deg(tilt[-200:].max()) < 0.3
 
 
 def test_at_rest_the_tilt_is_that_of_the_accelerometer(estimated: EstimationResult) -> None:
@@ -237,8 +261,8 @@ def test_at_rest_the_tilt_is_that_of_the_accelerometer(estimated: EstimationResu
         up = R_BI.apply(log["imu/linear_acceleration"][rows].mean(axis=0))
         up /= np.linalg.norm(up)
         expected, own_up = (poses[rows].apply(up).mean(axis=0) for poses in (found, own))
-        # Measured, 0.2 deg: the accelerometer's bias.
-        assert np.rad2deg(np.hypot(*expected[:2])) < 0.35
+        # What is left is believed to be the accelerometer's bias.
+        assert np.rad2deg(np.hypot(*expected[:2])) < 0.5
         own_error.append(np.rad2deg(np.hypot(*own_up[:2])))
     # The recording's own pose is no better a truth than this.
     assert np.sqrt(np.mean(np.square(own_error))) > 0.6
@@ -263,11 +287,13 @@ def test_friction_is_not_known_without_torques(estimated: EstimationResult) -> N
 def test_friction_comes_with_torques(scenario: Scenario, log: Log) -> None:
     short = log.part(slice(0, 300))
     zeros = np.zeros_like(short["joint/position"])
-    told = Log({**short.channels, "joint/torque_command": zeros}, short.meta)
-    result = estimate(scenario, told)
+    with_torques = Log({**short.channels, "joint/torque_command": zeros}, short.meta)
+    result = estimate(scenario, with_torques)
     # In the recording the feet do carry more than the model weighs, whatever its torques are.
     _, carried = result.remarks
-    assert carried.startswith("The feet carry 2.")
+    told = re.match(r"The feet carry (.*) % more than the model weighs", carried)
+    assert told
+    assert 1.0 < float(told[1]) < 3.5
     torque = result.log["estimate/joint/friction_torque"]
     assert torque.shape == (300, 26)
     assert np.isfinite(torque).all()

@@ -153,7 +153,8 @@ class InvariantFilter:
     force_error: float = 0.05
     force_gain_error: float = 0.05
     force_time: float = 0.3
-    # How level the ground is under standing soles [rad]; 0 says nothing of it.
+    # How level the ground is under standing soles [rad], an error that lasts as long as a foot
+    # stands; 0 says nothing of it.
     level_ground: float = 0.0
     # Random walks of the biases of gyro [rad/s/sqrt(s)] and accelerometer [m/s^2/sqrt(s)].
     gyro_walk: float = 1.0e-5
@@ -564,6 +565,7 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        variance
         force_habit            (3,)    the same of the forces' error
         foot_age, force_age    (feet,), ()  for how long each has been listened to [s]
+        foot_stood             (feet,)     for how long of that, since it landed [s]
         gyro, accelerometer    by how much each is noisier than believed, see `imu_noise_type`
         check                  what `cross_check` remembers: `doubt` (1 + feet,), positive for the
                                IMU and the feet that contradict the rest; `mean` (2, 3, 3) and
@@ -692,6 +694,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         foot_restlessness=(feet, TOLD, 3),
         foot_habit=(feet, TOLD, 3),
         foot_age=(feet,),
+        foot_stood=(feet,),
         foot_innovation=(feet, TOLD, 3),
         foot_innovation_variance=(feet, TOLD, 3),
         error_covariance=(n, n),

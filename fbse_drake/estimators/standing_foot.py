@@ -119,6 +119,7 @@ def land(
     q_BF = quaternion_of(rotation(model.foot_rotation[foot]))
     put(x.foot_orientation[foot], quaternion_product(quaternion(x.orientation), q_BF))
     x.foot_agreement[foot] = 0.0
+    x.foot_stood[foot] = 0.0
     for part, source in ((0, POSITION), (3, ATTITUDE)):
         start = FEET + 6 * foot + part
         for i in range(3):
@@ -192,6 +193,7 @@ def listen_to_foot(
     opposite = scaled(-1.0, R_FW)
     is_flat = known.is_flat[foot] > 0
     x.foot_age[foot] += elapsed
+    x.foot_stood[foot] += elapsed
 
     own, sensed = light * config.foot_position**2, moving * angle
     z = rotate(R_FW, subtract(rotate(R, p_IF), subtract(vector(x.foot_position[foot]), p)))
@@ -253,7 +255,8 @@ def listen_to_foot(
     if is_flat and config.level_ground > 0.0:
         # The turn that makes the sole's normal vertical; of a turn about it nothing is said.
         n = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), (0.0, 0.0, 1.0))
-        noise = isotropic(config.level_ground**2 * lasting * light)
+        lasts = max(config.foot_time, x.foot_stood[foot])
+        noise = isotropic(config.level_ground**2 * max(1.0, 2.0 * lasts / elapsed) * light)
         noise[2, 2] += 1e6
         spare = np.zeros(3)
         z = cross(n, (0.0, 0.0, 1.0))
