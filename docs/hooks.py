@@ -40,6 +40,10 @@ effect adds to the [residual](../missing_physics.md) of a walk of 3.5 s, in its 
 rows, as multiples of the sensors' noise there. Linear parameters are a tenth of the largest
 plausible ones, others as usual. The pictures are drawn by the effects' own code when these pages
 are built.
+
+What is plausible is so on robots of up to 100 kg. Of heavier ones it grows as torques, inertias and
+compliances do between robots of one shape; and a rotor may be felt as much as all that its joint
+moves.
 """
 
 

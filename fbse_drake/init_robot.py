@@ -174,7 +174,7 @@ def _gain(robot: Robot, arm: float) -> float:
     Args:
         arm: how far the robot's weight reaches [m].
     """
-    mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+    mass = robot.total_mass
     gravity = float(np.linalg.norm(robot.plant.gravity_field().gravity_vector()))
     return float(f"{_STIFFNESS * mass * gravity * arm:.1e}")
 

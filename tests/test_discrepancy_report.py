@@ -49,10 +49,21 @@ MASS = Finding(
 )
 STATUSES = {
     "CoulombFriction": EffectStatus(
-        "present", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move each joint to and fro."
+        "present",
+        "coulomb",
+        "Nm",
+        dict.fromkeys(KNEES, 0.1),
+        "Move each joint to and fro.",
+        largest_plausible=dict.fromkeys(KNEES, 50.0),
     ),
     "PreslidingHysteresis": EffectStatus(
-        "confusable", "coulomb", "Nm", dict.fromkeys(KNEES, 0.1), "Move by small amounts.", "squat"
+        "confusable",
+        "coulomb",
+        "Nm",
+        dict.fromkeys(KNEES, 0.1),
+        "Move by small amounts.",
+        "squat",
+        dict.fromkeys(KNEES, 50.0),
     ),
     "TorqueBias": EffectStatus(
         "absent",
@@ -60,9 +71,15 @@ STATUSES = {
         "Nm",
         {"left_knee_pitch": 0.02, "right_knee_pitch": 1e9},
         "Hold each joint still.",
+        largest_plausible=dict.fromkeys(KNEES, 20.0),
     ),
     "ThermalDrift": EffectStatus(
-        "not_visible", "change", "Nm", dict.fromkeys(KNEES, np.inf), "Repeat one motion."
+        "not_visible",
+        "change",
+        "Nm",
+        dict.fromkeys(KNEES, np.inf),
+        "Repeat one motion.",
+        largest_plausible=dict.fromkeys(KNEES, 20.0),
     ),
 }
 
@@ -653,7 +670,9 @@ def test_a_mass_that_may_be_on_other_bodies_says_so_and_what_would_tell(
 ) -> None:
     rivals = tuple(f"BodyMass on {body}" for body in others)
     mass = dataclasses.replace(MASS, confusable_with=(*rivals, "TorqueBias"))
-    moves = EffectStatus("present", "mass", "kg", {"trunk": 0.1}, "Move all joints.")
+    moves = EffectStatus(
+        "present", "mass", "kg", {"trunk": 0.1}, "Move all joints.", None, {"trunk": 10.0}
+    )
     diagnosis = made_diagnosis(ranking=(mass,), effects=STATUSES | {"BodyMass": moves})
     outcome = diagnosis_outcome(diagnosis)
     assert f"this log cannot tell that from {said} or torque bias." in outcome

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 from conftest import swinging_legs
+from recorded_arm import ARM
 from scipy.optimize import minimize
 
 from fbse_drake import Log, Scenario, load_scenario
@@ -157,6 +158,22 @@ def test_coulomb_and_viscous_friction_is_not_called_stribeck(swing: tuple[Scenar
     values = {f.effect: next(iter(f.parameters.values())) for f in diagnosis.chosen}
     assert values["CoulombFriction"].value == pytest.approx(1.5, rel=0.03)
     assert values["ViscousFriction"].value == pytest.approx(1.2, rel=0.03)
+
+
+def test_friction_of_a_recorded_arm_is_the_smallest_law_that_holds():
+    """Coulomb friction alone levels off at ten times the velocity at which it does beside viscous
+    friction: from there a few steps do not lead to where both fit."""
+    course = ARM.course()
+    velocity = course.velocity[:, 2]
+    friction = np.zeros_like(course.torque)
+    friction[:, 2] = 4.0 * np.tanh(velocity / 0.01) + 5.0 * velocity
+    for hump in (0.0, 3.0):
+        hidden = friction.copy()
+        hidden[:, 2] += hump * (np.tanh(velocity / 0.02) - np.tanh(velocity / 0.2))
+        found = diagnose(ARM.predictor(ARM.log(course, course.torque + hidden))).chosen
+        expected = {"StribeckFriction"} if hump else {"CoulombFriction", "ViscousFriction"}
+        assert {finding.effect for finding in found} == expected
+        assert all(finding.targets == ("axis_3",) for finding in found)
 
 
 def test_a_law_with_a_hump_is_called_stribeck(swing: tuple[Scenario, Log]):

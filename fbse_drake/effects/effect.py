@@ -45,6 +45,26 @@ _AT_PRISMATIC_JOINT = {
     "kg m^2": ("kg", -2),
 }
 
+# Robots up to this mass are usual [kg]. One that is k times as heavy is taken for one of the same
+# shape and density: what is plausible of it grows, by unit, with these powers of k.
+_USUAL_MASS = 100.0
+_WITH_MASS = {
+    "kg": 1.0,
+    "N": 1.0,
+    "m": 1 / 3,
+    "kg m": 4 / 3,
+    "kg m^2": 5 / 3,
+    "Nm": 4 / 3,
+    "Nm/rad": 4 / 3,
+    "Nm s/rad": 4 / 3,
+    "Nm s^2/rad^2": 4 / 3,
+    "N/m": 2 / 3,
+    "N s/m": 2 / 3,
+    "N s^2/m^2": 1 / 3,
+    "rad/Nm": -4 / 3,
+    "m/N": -2 / 3,
+}
+
 E = TypeVar("E", bound="Effect")
 
 
@@ -61,7 +81,7 @@ class Parameter:
     unit: str
     # Does what the effect adds depend on it linearly?
     linear: bool
-    # What it plausibly is on a legged robot.
+    # What it plausibly is on a robot of up to 100 kg, see `factor_with`.
     plausible: tuple[float, float]
     # What it can be at all.
     bounds: tuple[float, float] = (0.0, np.inf)
@@ -88,10 +108,16 @@ class Parameter:
         """The same for a prismatic joint, with m and N in the place of rad and Nm; its bounds,
         which are of no size, stay."""
         unit, _ = _AT_PRISMATIC_JOINT.get(self.unit, (self.unit, 0))
+        return replace(self.enlarged(self.lever_factor), unit=unit)
+
+    def factor_with(self, mass: float) -> float:
+        """What plausible values are multiplied with for a robot of this mass [kg]."""
+        return max(1.0, mass / _USUAL_MASS) ** _WITH_MASS.get(self.unit, 0.0)
+
+    def enlarged(self, factor: float) -> "Parameter":
+        """The same with plausible values that are so many times as large."""
         low, high = self.plausible
-        return replace(
-            self, unit=unit, plausible=(self.lever_factor * low, self.lever_factor * high)
-        )
+        return replace(self, plausible=(factor * low, factor * high))
 
 
 @dataclass(frozen=True)
@@ -143,10 +169,15 @@ class Effect(ABC):
         )
 
     @classmethod
-    def largest_plausible(cls, unit: str = "Nm") -> float:
-        """Largest plausible size of its first parameter, which says how strong it is; at a joint
-        whose torque has this unit."""
-        return max(abs(bound) for bound in next(iter(cls.parameters_at(unit).values())).plausible)
+    def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
+        """Its parameters on a target of a robot: in the units of that target, and as large as is
+        plausible of such a robot."""
+        names = robot.joint_names
+        unit = robot.torque_units[names.index(target)] if target in names else "Nm"
+        return {
+            name: parameter.enlarged(parameter.factor_with(robot.total_mass))
+            for name, parameter in cls.parameters_at(unit).items()
+        }
 
     @classmethod
     def linear_beliefs(cls) -> np.ndarray:

@@ -5,7 +5,7 @@ the diagnosis tries out.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -32,7 +32,7 @@ class InertiaEffect(Effect):
     @staticmethod
     def suspected_bodies(robot: Robot) -> list[str]:
         """Bodies that the diagnosis tries it on: those that weigh something."""
-        total = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+        total = robot.total_mass
         return [
             name
             for name in robot.body_names
@@ -109,6 +109,14 @@ class ReflectedInertia(InertiaEffect):
     }
 
     inertia: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
+        """A rotor behind a gear is often felt as much as all that the joint moves."""
+        parameters = super().parameters_on(robot, target)
+        low, high = parameters["inertia"].plausible
+        moved = float(robot.joint_inertia[robot.joint_names.index(target)])
+        return {"inertia": replace(parameters["inertia"], plausible=(low, max(high, moved)))}
 
     @classmethod
     def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:

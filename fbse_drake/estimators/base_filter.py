@@ -621,7 +621,7 @@ class InvariantBaseFilter(RecursiveEstimator):
             ).reshape(-1, 2, 2),
             is_flat=np.array([float(not leg.is_point) for leg in robot.description.legs.values()]),
             force_variance=required(sensors.force_noise, "force_noise") ** 2 * len(pads.foot),
-            mass=plant.CalcTotalMass(plant.CreateDefaultContext()),
+            mass=robot.total_mass,
             gravity=plant.gravity_field().gravity_vector(),
             start=record(**_START),
             origin=np.array([*origin, 0.0]),

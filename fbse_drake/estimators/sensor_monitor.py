@@ -496,7 +496,7 @@ class SensorMonitor(RecursiveEstimator):
             self._doubt = self.DeclareVectorInputPort("doubt", 1 + len(legs))
         self._declare_posterior()
         checks_load = bool(legs) and robot.has_floating_base
-        mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+        mass = robot.total_mass
         measured, weight = support.trigger, 9.81 * mass
         self._known = record(
             limits=config,

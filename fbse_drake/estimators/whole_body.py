@@ -607,7 +607,7 @@ class WholeBodyFilter(RecursiveEstimator):
             weight_variance=self._weight_deviations() ** 2,
             weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
-            weight=9.81 * robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext()),
+            weight=9.81 * robot.total_mass,
             rotor_inertia=np.array([robot.rotor_inertia(joint) for joint in robot.joint_names]),
         )
         self._measurements = self._declare_record_input("measurements", measurements)

@@ -426,7 +426,7 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
     known = library()
     rows = []
     for name, status in statuses.items():
-        reach = f"{words(status.parameter)} {reach_text(status, name)}"
+        reach = f"{words(status.parameter)} {reach_text(status)}"
         does = known[name].description if name in known else ""
         show = Step(status.experiment, status.command or "")
         rows.append((spaced(name), words(status.verdict), reach, does, show))

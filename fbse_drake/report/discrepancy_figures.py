@@ -593,21 +593,13 @@ def targets_text(targets: Sequence[str], effect: str = "") -> str:
 def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
     """Smallest size of every effect that the data would have shown, on each target, over the
     largest plausible size."""
-    known = library()
-    names = [name for name in statuses if name in known]
-    figure = Figure(figsize=(WIDTH, 1.1 + 0.27 * len(names)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.1 + 0.27 * len(statuses)), layout="constrained")
     axes = figure.subplots()
     decorate(axes)
-    sizes = {}
-    for name in names:
-        plausible = max(
-            abs(bound) for bound in known[name].parameters[statuses[name].parameter].plausible
-        )
-        sizes[name] = np.array(list(statuses[name].smallest_detectable.values())) / plausible
     highest = 30.0
-    for place, name in enumerate(names):
-        shown = np.clip(np.nan_to_num(sizes[name], posinf=highest), None, highest)
-        status = statuses[name]
+    for place, status in enumerate(statuses.values()):
+        shares = np.array(list(status.over_plausible.values()))
+        shown = np.clip(np.nan_to_num(shares, posinf=highest), None, highest)
         color = VERDICT_COLORS[status.verdict]
         if len(shown):
             axes.plot(
@@ -631,8 +623,8 @@ def detectability(statuses: Mapping[str, EffectStatus]) -> Figure:
         linewidth=0,
         label="larger than plausible: could not be seen",
     )
-    axes.set_yticks(range(len(names)), [spaced(name) for name in names], fontsize=9)
-    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_yticks(range(len(statuses)), [spaced(name) for name in statuses], fontsize=9)
+    axes.set_ylim(len(statuses) - 0.4, -0.6)
     axes.set_xscale("log")
     axes.set_xlim(right=1.3 * highest)
     axes.set_xlabel(

@@ -266,17 +266,11 @@ def _short(value: float) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def reach_text(status: EffectStatus, effect: str) -> str:
+def reach_text(status: EffectStatus) -> str:
     """Smallest sizes that the data would have shown, and where it would have shown none that is
     plausible."""
-    known = library().get(effect)
-    largest = (
-        np.inf
-        if known is None
-        else max(abs(bound) for bound in known.parameters[status.parameter].plausible)
-    )
-    sizes = [size for size in status.smallest_detectable.values() if size <= largest]
-    hidden = [target for target, size in status.smallest_detectable.items() if not size <= largest]
+    hidden = [target for target, share in status.over_plausible.items() if not share <= 1.0]
+    sizes = [size for target, size in status.smallest_detectable.items() if target not in hidden]
     low, high = (f"{bound:.2g}" for bound in (min(sizes, default=0), max(sizes, default=0)))
     unit = "" if status.unit == "1" else f" {status.unit}"
     shown = [f"{low if low == high else f'{low} to {high}'}{unit}"] if sizes else []

@@ -81,7 +81,7 @@ def _biased(scenario: Scenario) -> Scenario:
 
 def _pushed(scenario: Scenario) -> Scenario:
     robot, _ = make_robot(scenario.robot.description)
-    mass = robot.plant.CalcTotalMass(robot.plant.CreateDefaultContext())
+    mass = robot.total_mass
     force = [0.0, mass * _PUSH / _PUSH_TIME, 0.0]
     push = Push(robot.base.name(), force, scenario.duration / 2, _PUSH_TIME)
     return replace(scenario, robot=replace(scenario.robot, pushes={"push": push}))

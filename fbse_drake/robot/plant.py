@@ -141,6 +141,18 @@ class Robot:
         return self.plant.GetFrameByName(moved if self.plant.HasFrameNamed(moved) else name)
 
     @cached_property
+    def total_mass(self) -> float:
+        """[kg]."""
+        return self.plant.CalcTotalMass(self.plant.CreateDefaultContext())
+
+    @cached_property
+    def joint_inertia(self) -> np.ndarray:
+        """What each joint moves in the default posture, rotors included: the mass matrix's
+        diagonal, (n,) [kg m^2, or kg of a prismatic joint]."""
+        M = self.plant.CalcMassMatrix(self.plant.CreateDefaultContext())
+        return M.diagonal()[self.velocity_index]
+
+    @cached_property
     def torque_units(self) -> list[str]:
         """Unit of each joint's torque, or of the force of a prismatic joint."""
         return [

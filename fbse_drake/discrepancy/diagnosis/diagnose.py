@@ -97,6 +97,15 @@ class EffectStatus:
     # What would show it; a scenario that would, where one is known.
     experiment: str
     scenario: str | None = None
+    # The largest value that is plausible, by target.
+    largest_plausible: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def over_plausible(self) -> dict[str, float]:
+        """The smallest value that would have been shown, over the largest plausible one, by
+        target."""
+        largest = self.largest_plausible
+        return {target: size / largest[target] for target, size in self.smallest_detectable.items()}
 
     @property
     def command(self) -> str | None:
@@ -555,8 +564,8 @@ def _status(
     experiments: Experiments,
 ) -> EffectStatus:
     parameter = next(iter(effect.parameters))
-    smallest = smallest_detectable(fits, final, effect)
-    scenario = None
+    smallest, scenario = smallest_detectable(fits, final, effect), None
+    largest = {target: fits.dictionary.largest_plausible(effect, target) for target in smallest}
     mistaken_for = [
         final.candidates[k]
         for k, of_member in equal.items()
@@ -570,10 +579,7 @@ def _status(
         scenario = experiments.that_separates(
             member.effect, member.targets, final.values(member)[0], effect
         )
-    elif all(
-        size > fits.dictionary.largest_plausible(effect, target)
-        for target, size in smallest.items()
-    ):
+    elif all(size > largest[target] for target, size in smallest.items()):
         verdict = "not_visible"
         scenario = experiments.that_shows(effect)
     else:
@@ -581,9 +587,8 @@ def _status(
     units = dict.fromkeys(
         fits.dictionary.parameters(effect, target)[parameter].unit for target in smallest
     ) or [effect.parameters[parameter].unit]
-    return EffectStatus(
-        verdict, parameter, " or ".join(units), smallest, effect.experiment, scenario
-    )
+    unit = " or ".join(units)
+    return EffectStatus(verdict, parameter, unit, smallest, effect.experiment, scenario, largest)
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:

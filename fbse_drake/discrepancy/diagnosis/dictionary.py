@@ -80,6 +80,7 @@ class Dictionary:
             self.effects += [effect for effect in effects if effect is CoulombViscousFriction]
         self._grids: dict[tuple[type[JointTorqueEffect], int], np.ndarray] = {}
         self._shown: dict[tuple[type[JointTorqueEffect], str], bool] = {}
+        self._on_target: dict[tuple[type[Effect], str], dict[str, Parameter]] = {}
         self._columns: Memory[np.ndarray] = Memory(_MOST_NUMBERS, np.size)
         self._fixed_beside: Callable[[], list[list[FixedColumns]]] | None = None
 
@@ -98,7 +99,7 @@ class Dictionary:
     def parameters(self, effect: type[Effect], *targets: str) -> Mapping[str, Parameter]:
         """An effect's parameters in the units of targets that share values. Of what the model has
         already they may take away."""
-        parameters = effect.parameters_at(self.unit.get(targets[0], "Nm"))
+        parameters = self._parameters_on(effect, targets[0])
         if not issubclass(effect, JointTorqueEffect):
             return parameters
         believed = {
@@ -113,8 +114,17 @@ class Dictionary:
         }
 
     def largest_plausible(self, effect: type[Effect], target: str) -> float:
-        """See `Effect.largest_plausible`; in the unit of a target."""
-        return effect.largest_plausible(self.unit.get(target, "Nm"))
+        """Largest plausible size of an effect's first parameter, which says how strong it is, on a
+        target."""
+        first = next(iter(self._parameters_on(effect, target).values()))
+        return max(abs(bound) for bound in first.plausible)
+
+    def _parameters_on(self, effect: type[Effect], target: str) -> dict[str, Parameter]:
+        """See `Effect.parameters_on`."""
+        key = effect, target
+        if key not in self._on_target:
+            self._on_target[key] = effect.parameters_on(self.predictor.robot, target)
+        return self._on_target[key]
 
     @cached_property
     def joint_effects(self) -> list[type[JointTorqueEffect]]:
@@ -280,12 +290,13 @@ class Dictionary:
         return len({effect for effect, _ in self._grids}) / max(1, len(self.joint_effects))
 
     def _factors(self, effect: type[Effect], target: str) -> np.ndarray:
-        """What values of the nonlinear parameters at a revolute joint are multiplied with for a
-        target, shape (m,)."""
-        prismatic = self.unit.get(target) == "N"
+        """What values of the nonlinear parameters at a revolute joint of a usual robot are
+        multiplied with for a target, shape (m,)."""
+        prismatic, mass = self.unit.get(target) == "N", self.predictor.robot.total_mass
         return np.array(
             [
-                p.lever_factor if prismatic else 1.0
+                (p.lever_factor if prismatic else 1.0)
+                * (p.at_prismatic_joint if prismatic else p).factor_with(mass)
                 for p in effect.parameters.values()
                 if not p.linear
             ]

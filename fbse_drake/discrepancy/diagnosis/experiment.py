@@ -213,9 +213,11 @@ class Experiments:
         sizes = {}
         for name, fits in self._fits(effect).items():
             found = smallest_detectable(fits, fits.noise_alone, effect)
-            sizes[name] = min(found.values(), default=np.inf)
+            largest = fits.dictionary.largest_plausible
+            shown = [size for target, size in found.items() if size < largest(effect, target)]
+            sizes[name] = min(shown, default=np.inf)
         best = min(sizes, key=lambda name: sizes[name], default=None)
-        return best if best is not None and sizes[best] < effect.largest_plausible() else None
+        return best if best is not None and sizes[best] < np.inf else None
 
     def that_separates(
         self,

@@ -26,6 +26,8 @@ from fbse_drake.errors import InputError
 
 # How often nonlinear values are moved to where they fit, in turn, where inertia is fitted along.
 _POLISHINGS = 3
+# How often at most, where they may be far from there, and what deviance is worth no further time.
+_MOST_POLISHINGS, _NEGLIGIBLE = 10, 1.0
 # Nonlinear values of what shows in a transmission are looked for within such a factor, and with
 # such a relative tolerance.
 _NEAR, _TOLERANCE = 1.6, 0.01
@@ -48,6 +50,17 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
         for k, candidate in zip(group, better, strict=True):
             moved[k] = candidate
     return fits.explain(moved)
+
+
+def settled(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation that is polished as long as that brings something: of a law that was fitted in
+    another's place the values may be far from where they fit."""
+    for _ in range(_MOST_POLISHINGS):
+        better = polished(fits, explanation)
+        if better.deviance > explanation.deviance - _NEGLIGIBLE:
+            return min(better, explanation, key=lambda e: e.deviance)
+        explanation = better
+    return explanation
 
 
 def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
