@@ -25,7 +25,6 @@ from fbse_drake.discrepancy.diagnosis.rivals import (
     settled,
 )
 from fbse_drake.discrepancy.diagnosis.selection import select, single_guesses
-from fbse_drake.discrepancy.diagnosis.significance import Significance
 from fbse_drake.discrepancy.diagnosis.spread import Spread, spreads, spreads_json
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
@@ -219,7 +218,7 @@ def diagnose(
     before, inertia, unexplained = search.before, search.inertia, search.unexplained
     partial, final, fits = search.partial, path[-1], proposals.fits
     white, dictionary = fits.white, fits.dictionary
-    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    significance, tolerance = dictionary.significance, predictor.scenario.identify.tolerance
     shares = {c: significance.share(final, c) for c in final.candidates}
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
@@ -311,7 +310,8 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         partial = str(stop)
     final, inertia = consistent(proposals.fits, path[-1])
     path[-1], remaining, left = added(proposals.fits, final)
-    significance, tolerance = Significance(predictor), predictor.scenario.identify.tolerance
+    significance = proposals.fits.dictionary.significance
+    tolerance = predictor.scenario.identify.tolerance
     structures = leftover_structure(predictor.motion, remaining, left)
     unexplained = [
         structure

@@ -10,6 +10,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.significance import Significance
 from fbse_drake.discrepancy.identification.inertial import (
     UntrustedInertia,
     untrusted_bodies,
@@ -22,6 +23,7 @@ from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
+from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress, silent
 
@@ -216,9 +218,17 @@ class Dictionary:
             prior=effect.linear_beliefs() ** -2,
         )
         noise = None
-        if issubclass(effect, InertiaEffect) and len(raw.rows):
-            noise = self.predictor.noise_in(effect, target, raw)
+        is_noisy = follows_torque(effect) and self._is_torque_noisy
+        if len(raw.rows) and (issubclass(effect, InertiaEffect) or is_noisy):
+            noise = self.predictor.noise_in(effect, target, nonlinear, raw)
         return FixedColumns(target, nonlinear, raw, noise)
+
+    @cached_property
+    def _is_torque_noisy(self) -> bool:
+        """Commands of steps are known exactly, unless noise is believed to be in them."""
+        motion = self.predictor.motion
+        noise = motion.torque_variance(motion.signals.torque_command)
+        return not self.per_step or bool(noise.any())
 
     def is_deflection(self, signature: Signature) -> bool:
         """Does an effect show in a transmission alone? Elsewhere the data hardly tell nonlinear
@@ -344,6 +354,11 @@ class Dictionary:
         # From (r, G, p, B).
         return np.transpose(np.array(found), (3, 0, 2, 1))
 
+    @cached_property
+    def significance(self) -> Significance:
+        """Sizes of effects as shares of what the log's rows are made of."""
+        return Significance(self.predictor)
+
     def takes_torque(self, effect: type[Effect]) -> bool:
         # The load of inertia that is not trusted is taken from the measured torque.
         return takes_command(effect, load_too=self.inertia is not None)
@@ -369,6 +384,12 @@ def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
     )
     usual, changed = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
     return not np.array_equal(usual, changed)
+
+
+def follows_torque(effect: type[Effect]) -> bool:
+    """Does a joint's reading follow its torque? The torque's noise is in it, and so is what makes
+    the torque step, as friction does."""
+    return issubclass(effect, SensorEffect) and effect.memory_size > 0 and effect.acts_on == "joint"
 
 
 def usual_values(effect: type[Effect]) -> np.ndarray:

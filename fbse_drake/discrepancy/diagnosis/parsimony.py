@@ -101,6 +101,8 @@ def _smaller(
     for member in (c for c in by_gain if not pays(c)):
         alike = [c for c in by_gain if _is_one_law(c, member) and not pays(c)]
         if len(alike) < 2 or not judge.pay_together(explanation, alike, without):
+            # A law may be none that can be, and a simpler one that it contains be there.
+            yield from _simpler(proposals, judge, explanation, member)
             yield without[member]
     explained = judge.explained(explanation)
     for member in by_gain:
@@ -417,26 +419,30 @@ def _acts(law: Signature) -> np.ndarray:
 def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With simpler laws in the place of one that contains them, wherever it is: it is one law for
     all joints unless none of them needs it."""
-    tried = set(proposals.fits.dictionary.effects)
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
-        if not issubclass(effect, JointTorqueEffect):
-            continue
-        members = [c for c in explanation.candidates if c.effect is effect]
-        simpler = [r.effects for r in effect.reductions if tried.issuperset(r.effects)]
-        smaller: Explanation | None = explanation if simpler else None
-        for targets in (member.targets for member in members):
+        smaller: Explanation | None = explanation
+        for key in [c.key for c in explanation.candidates if c.effect is effect]:
             if smaller is None:
                 break
-            larger = smaller
             # Others may have been moved to where they fit.
-            member = next(
-                c for c in larger.candidates if (c.effect, c.targets) == (effect, targets)
-            )
-            options = (_with_laws(proposals, larger, member, laws) for laws in simpler)
-            good = (e for e in options if e is not None and judge.is_as_good(e, larger))
-            smaller = next(good, None)
+            member = next(c for c in smaller.candidates if c.key == key)
+            smaller = next(_simpler(proposals, judge, smaller, member), None)
         if smaller is not None:
             yield smaller
+
+
+def _simpler(
+    proposals: Proposals, judge: Judge, explanation: Explanation, member: Candidate
+) -> Iterator[Explanation]:
+    """With the simplest laws in the place of a member that contains them and is no better."""
+    if not issubclass(member.effect, JointTorqueEffect):
+        return
+    tried = set(proposals.fits.dictionary.effects)
+    for reduction in member.effect.reductions:
+        if tried.issuperset(reduction.effects):
+            smaller = _with_laws(proposals, explanation, member, reduction.effects)
+            if smaller is not None and judge.is_as_good(smaller, explanation):
+                yield smaller
 
 
 def _with_laws(

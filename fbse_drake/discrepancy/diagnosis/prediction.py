@@ -405,14 +405,21 @@ class Predictor:
                 values, offset = self._slopes(effect, target, point, nonlinear)
                 rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
                 return Signature(rows, values[:, rows], offset[:, rows])
-            names = [name for name, parameter in effect.parameters.items() if parameter.linear]
-            units = np.diag([_probe(effect, name) for name in names])
-            columns = [
-                self._addition(effect, target, unit, nonlinear) / unit.sum() for unit in units
-            ]
-            values = _without_rounding(np.stack(columns, axis=2))
+            values = _without_rounding(self._per_unit(effect, target, nonlinear))
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
+
+    def _per_unit(
+        self, effect: type[Effect], target: str, nonlinear: np.ndarray, *, noisier: bool = False
+    ) -> np.ndarray:
+        """What an effect adds per unit of each linear parameter, (B, R, p)."""
+        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
+        units = np.diag([_probe(effect, name) for name in names])
+        columns = [
+            self._addition(effect, target, unit, nonlinear, noisier=noisier) / unit.sum()
+            for unit in units
+        ]
+        return np.stack(columns, axis=2)
 
     @cached_property
     def _smooth_blocks(self) -> Instants:
@@ -503,21 +510,25 @@ class Predictor:
             return None
         return effect.expansion_point(self.robot.body(target))
 
-    def noise_in(self, effect: type[InertiaEffect], target: str, clean: Signature) -> Signature:
-        """What that noise adds to the signature of an inertia effect: regressors are measured
-        too."""
+    @cached_property
+    def _noisier_residual_at_blocks(self) -> np.ndarray:
+        return self.motion.equation.residual(self._smoothed(self._noisier_blocks))
+
+    def noise_in(
+        self,
+        effect: type[Effect],
+        target: str,
+        nonlinear: np.ndarray,
+        clean: Signature,
+    ) -> Signature:
+        """What that noise adds to the signature of an inertia effect, or of one in a sensor:
+        regressors are measured too."""
         point = self._expansion_point(effect, target)
         if point is not None:
-            values, _ = self._slopes(effect, target, point, np.zeros(0), noisier=True)
+            values, _ = self._slopes(effect, target, point, nonlinear, noisier=True)
             return replace(clean, values=values[:, clean.rows] - clean.values, offset=0.0)
-        columns = np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
-        for k, name in enumerate(effect.parameters):
-            unit = _probe(effect, name)
-            columns[:, :, k] = (
-                self._inertia_addition(effect.from_values([target], {name: [unit]}), noisier=True)
-                / unit
-            )
-        return replace(clean, values=columns[:, clean.rows] - clean.values)
+        values = self._per_unit(effect, target, nonlinear, noisier=True)
+        return replace(clean, values=values[:, clean.rows] - clean.values)
 
     def is_possible(self, effect: type[Effect], target: str, linear: np.ndarray) -> bool:
         """Can a robot have an effect with these values? Not every inertia is that of a body."""
@@ -609,8 +620,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """What one of these effects with these values adds to the residual, (B, R); an inertia
-        effect also if the sensors' noise were in its regressors once more."""
+        """What one of these effects with these values adds to the residual, (B, R); one of inertia,
+        or in a sensor, also if the sensors' noise were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -631,9 +642,15 @@ class Predictor:
             return self._residual_but_for_noise - self._with(changed).residual(blocks)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
-        signals = self.reading.undone(resolved, self._memory(effect, resolved))
+        if noisier:
+            read, before = self._noisier_signals, self._noisier_residual_at_blocks
+            memory = self.reading.remembered(resolved, read)
+        else:
+            read, before = motion.signals, self._residual_at_blocks
+            memory = self._memory(effect, resolved)
+        signals = self.reading.undone(resolved, memory, read)
         blocks = averaged(motion.steps_of(signals), motion.length)
-        return self._residual_at_blocks - motion.equation.residual(self._smoothed(blocks))
+        return before - motion.equation.residual(self._smoothed(blocks))
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone,

@@ -58,24 +58,30 @@ class Reading:
         """Would another scenario read the log alike?"""
         return self._read_by == _reader(scenario)
 
-    def undone(self, effect: ResolvedSensorEffect, memory: np.ndarray) -> SensorSignals:
-        """Signals that a sensor effect turns into those of the log.
+    def undone(
+        self,
+        effect: ResolvedSensorEffect,
+        memory: np.ndarray,
+        signals: SensorSignals | None = None,
+    ) -> SensorSignals:
+        """Signals that a sensor effect turns into those of the log, or into others.
 
         Args:
             memory: see `remembered`.
         """
-        return effect.effect.undone(
-            self.motion.signals, memory, effect, self.robot, self.motion.period
-        )
+        read = self.motion.signals if signals is None else signals
+        return effect.effect.undone(read, memory, effect, self.robot, self.motion.period)
 
-    def remembered(self, effect: ResolvedSensorEffect) -> np.ndarray:
-        """What a sensor effect remembers over the log, of torques without their white noise: it
-        would become an acceleration.
+    def remembered(
+        self, effect: ResolvedSensorEffect, signals: SensorSignals | None = None
+    ) -> np.ndarray:
+        """What a sensor effect remembers over the log, or over others, of torques without their
+        white noise: it would become an acceleration.
 
         A simulation of ours begins with no memory; any other log begins as if it had always been as
         it is then.
         """
-        motion, signals = self.motion, self.motion.signals
+        motion, signals = self.motion, signals or self.motion.signals
         torque = signals.torque_command
         corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
         smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 
+from fbse_drake.discrepancy.diagnosis.dictionary import follows_torque
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
@@ -17,7 +18,8 @@ from fbse_drake.effects.sensor import FootForceGain
 # No explanation has more parts than this.
 _MOST_EFFECTS = 16
 # What an effect takes off a row may be wrong by this share, if its shape is not known but fitted
-# (nonlinear parameters); so small a rest is no evidence of another effect.
+# (nonlinear parameters); so small a rest is no evidence of another effect where it is not known at
+# which velocity within a step a law holds, nor of one that follows the torque.
 _MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
@@ -213,7 +215,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     rows = added.signature.rows
     if base.deviance - wider.deviance < fits.required(added):
         return False
-    if fits.dictionary.per_step:
+    if fits.dictionary.per_step or follows_torque(added.effect):
         exact = fits.explain([c for c in base.candidates if not c.nonlinear_names])
         taken, gained = (
             float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
@@ -245,16 +247,23 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         if not issubclass(added.effect, JointTorqueEffect):
             # Masses, places and offsets have sizes that a bad fit does not widen.
             allowed = min(allowed, _IMPLAUSIBLE * widest)
-        if (
-            value < low
-            or value > high + 3 * deviation
-            or abs(value) > _IMPLAUSIBLE * widest + allowed
-        ):
+        if value < low or value > high + 3 * deviation:
+            return False
+        if abs(value) > _IMPLAUSIBLE * widest + allowed and not _is_carried(fits, wider, added):
             return False
         # What is not told from nothing may not be implausible as well.
         if abs(value) > widest and least <= 0 <= most:
             return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
+
+
+def _is_carried(fits: Fits, explanation: Explanation, member: Candidate) -> bool:
+    """Is what a member takes of joints' torques no more than they are given, however much that
+    is?"""
+    return (
+        issubclass(member.effect, JointTorqueEffect)
+        and fits.dictionary.significance.share(explanation, member) < 1.0
+    )
 
 
 def is_disbelieved(
