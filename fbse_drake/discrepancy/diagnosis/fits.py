@@ -242,12 +242,14 @@ class Fits:
 
         With u = share * torque, the rest torque - u - ... is the error of the torque times 1 -
         share: a share near 1 would explain everything. As the error of the torque itself it is the
-        larger the more is taken.
+        larger the more is taken. Of a torque from which the noise is taken first, see
+        `Reading.kept_noise`, nothing is taken of it.
         """
         taking = [c for c in candidates if self.dictionary.takes_torque(c.effect)]
         if self.dictionary.per_step or not taking:
             return 1.0
-        torque = self.dictionary.predictor.motion.blocks.torque_command
+        predictor = self.dictionary.predictor
+        torque, kept = predictor.motion.blocks.torque_command, predictor.reading.kept_noise
         taken: dict[int, np.ndarray] = {}
         start = 0
         for c in candidates:
@@ -264,7 +266,7 @@ class Fits:
             known = self.white.residual.known[:, row]
             own, rest = (
                 float((part[known] ** 2).sum())
-                for part in (torque[:, row], torque[:, row] - values)
+                for part in (torque[:, row], torque[:, row] - kept[row] * values)
             )
             if own > 0 and rest > 0:
                 factor[row] = own / rest

@@ -22,7 +22,7 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import polished, settled
+from fbse_drake.discrepancy.diagnosis.refinement import converged, polished
 from fbse_drake.discrepancy.diagnosis.selection import is_shown, is_significant
 from fbse_drake.discrepancy.diagnosis.spread import recordings
 from fbse_drake.discrepancy.identification.regression import Signature
@@ -458,7 +458,7 @@ def _with_laws(
     for law in laws:
         there = {t for c in others if c.effect is law for t in c.targets} & set(member.targets)
         if not there:
-            result = settled(proposals.fits, proposals.beside(result, law, member.targets))
+            result = converged(proposals.fits, proposals.beside(result, law, member.targets))
         elif len(there) < len(member.targets):
             return None
     return result

@@ -127,6 +127,13 @@ class Reading:
         return np.where(torque == 0, 0.0, result)
 
     @cached_property
+    def kept_noise(self) -> np.ndarray:
+        """Share of the power of each torque's white noise that is left in it where laws take it,
+        averaged over blocks, (n,)."""
+        highest = 0.5 / (self.motion.length * self.motion.period)
+        return np.array([min(1.0, corner / highest) or 1.0 for corner in self._torque_corners])
+
+    @cached_property
     def _torque_corners(self) -> list[float]:
         """Frequency above which each joint's torque is little but noise [Hz]; 0 for none."""
         motion = self.motion

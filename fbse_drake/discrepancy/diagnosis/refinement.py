@@ -52,7 +52,7 @@ def polished(fits: Fits, explanation: Explanation) -> Explanation:
     return fits.explain(moved)
 
 
-def settled(fits: Fits, explanation: Explanation) -> Explanation:
+def converged(fits: Fits, explanation: Explanation) -> Explanation:
     """An explanation that is polished as long as that brings something: of a law that was fitted in
     another's place the values may be far from where they fit."""
     for _ in range(_MOST_POLISHINGS):

@@ -15,8 +15,8 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import polished
-from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_shown
+from fbse_drake.discrepancy.diagnosis.refinement import converged
+from fbse_drake.discrepancy.diagnosis.selection import MISFIT, best_additions, is_shown
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
@@ -78,9 +78,20 @@ def indistinguishable(
     independent.
 
     One with fewer parameters does also if chance may have brought what the final explanation has
-    more.
+    more; and one that shifts the torque in time as a member does, if it takes off all of what that
+    takes off but for what a law of unknown shape may be wrong by.
     """
     judge = Judge(fits, final)
+
+    def shifts_alike(member: Candidate, rival: Explanation) -> bool:
+        if member.has_linear or rival.candidates[-1].has_linear:
+            return False
+        rest = fits.explain([c for c in final.candidates if c is not member])
+        taken, lost = (
+            float((worse.held_out_sse - final.held_out_sse)[member.signature.rows].sum())
+            for worse in (rest, rival)
+        )
+        return lost < MISFIT * taken
 
     def equals(rival: Explanation) -> bool:
         more = len(final.solved.parameters) - len(rival.solved.parameters)
@@ -88,7 +99,10 @@ def indistinguishable(
         lost = rival.deviance - final.deviance
         return lost < least or judge.independent_share(rival, final) * lost < least
 
-    return {k: [e for e in found if equals(e)] for k, found in of_members.items()}
+    return {
+        k: [e for e in found if equals(e) or shifts_alike(final.candidates[k], e)]
+        for k, found in of_members.items()
+    }
 
 
 def settled(
@@ -121,13 +135,7 @@ def _contains(law: type[Effect], other: type[Effect]) -> bool:
 def fitted(fits: Fits, explanation: Explanation) -> Explanation:
     """An explanation at the values that fit it best, found by Gauss-Newton steps, and for its last
     member by a search over what is nonlinear in it."""
-    best = _searched(fits, explanation)
-    for _ in range(_ROUNDS):
-        moved = polished(fits, best)
-        if not moved.deviance < best.deviance - 1.0:
-            break
-        best = moved
-    return best
+    return converged(fits, _searched(fits, explanation))
 
 
 def _searched(fits: Fits, explanation: Explanation) -> Explanation:

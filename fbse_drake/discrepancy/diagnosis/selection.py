@@ -20,7 +20,7 @@ _MOST_EFFECTS = 16
 # What an effect takes off a row may be wrong by this share, if its shape is not known but fitted
 # (nonlinear parameters); so small a rest is no evidence of another effect where it is not known at
 # which velocity within a step a law holds, nor of one that follows the torque.
-_MISFIT = 0.02
+MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
 # No more than so many standard deviations of what is believed of it beforehand, if anything is.
@@ -221,7 +221,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
             float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
             for a, b in ((exact, base), (base, wider))
         )
-        if gained < _MISFIT * taken:
+        if gained < MISFIT * taken:
             return False
     start = wider.start(added)
     names = added.linear_names if added.has_linear else added.nonlinear_names
