@@ -23,12 +23,12 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import converged, polished
-from fbse_drake.discrepancy.diagnosis.selection import is_shown, is_significant
+from fbse_drake.discrepancy.diagnosis.selection import MISFIT, is_shown, is_significant
 from fbse_drake.discrepancy.diagnosis.spread import recordings
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombViscousFriction
-from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.effects.joint_torque import JointTorqueEffect, Reduction
 
 # Level of the region of confidence that must not contain "no effect".
 _CONFIDENCE = 0.95
@@ -44,6 +44,8 @@ _LEAST_OF_REST = 0.1
 # A row is worse for a member if its held-out error rises by more than this share: a body that is
 # heavier brings the noise of its acceleration, also where its mass hardly shows.
 _WORSE = 0.01
+# A larger law that lowers the held-out deviance by less brings nothing.
+_NOTHING = 1.0
 # Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
 # of two that round alike.
 _ROUNDING = 1e-3
@@ -272,6 +274,18 @@ class Judge:
         rows = self.gain_by_row(smaller, explanation) - COMPLEXITY * more
         return self.gain(smaller, explanation) < least and rows.max() < least
 
+    def is_nearly_as_good(
+        self, smaller: Explanation, explanation: Explanation, member: Candidate
+    ) -> bool:
+        """Does a simpler law in a member's place take off all that it takes but for what a law of
+        unknown shape may be wrong by?"""
+        rest = self._fits.explain([c for c in explanation.candidates if c is not member])
+        taken, lost = (
+            float((worse.held_out_sse - explanation.held_out_sse)[member.signature.rows].sum())
+            for worse in (rest, smaller)
+        )
+        return lost < MISFIT * taken
+
 
 def needs_inertia(fits: Fits, explanation: Explanation, trusting: Fits) -> bool:
     """Does an explanation need inertia that is fitted along, or does that of the model do as well?
@@ -418,7 +432,8 @@ def _acts(law: Signature) -> np.ndarray:
 
 def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With simpler laws in the place of one that contains them, wherever it is: it is one law for
-    all joints unless none of them needs it."""
+    all joints where it may be, for not every joint shows what it has. Where the larger law brings
+    nothing, it is not."""
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
         smaller: Explanation | None = explanation
         for key in [c.key for c in explanation.candidates if c.effect is effect]:
@@ -429,6 +444,10 @@ def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> It
             smaller = next(_simpler(proposals, judge, smaller, member), None)
         if smaller is not None:
             yield smaller
+        for member in [c for c in explanation.candidates if c.effect is effect]:
+            for smaller in _simpler(proposals, judge, explanation, member):
+                if judge.drop_by_row(smaller, explanation).sum() < _NOTHING:
+                    yield smaller
 
 
 def _simpler(
@@ -441,8 +460,21 @@ def _simpler(
     for reduction in member.effect.reductions:
         if tried.issuperset(reduction.effects):
             smaller = _with_laws(proposals, explanation, member, reduction.effects)
-            if smaller is not None and judge.is_as_good(smaller, explanation):
+            if smaller is not None and (
+                judge.is_as_good(smaller, explanation)
+                or (
+                    _is_without(explanation, member, reduction)
+                    and judge.is_nearly_as_good(smaller, explanation, member)
+                )
+            ):
                 yield smaller
+
+
+def _is_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:
+    """Are all amounts of a law that a reduction is without at their bound of zero?"""
+    values, _ = explanation.values(member)
+    amounts = [name for name in reduction.at if name in member.linear_names]
+    return bool(amounts) and all(values[name] == 0.0 for name in amounts)
 
 
 def _with_laws(
@@ -453,14 +485,21 @@ def _with_laws(
 ) -> Explanation | None:
     """With laws in the place of a member that are not there yet; None if some are there for some of
     its targets alone."""
-    others = [c for c in explanation.candidates if c is not member]
-    result = proposals.fits.explain(others)
+    fits, others = proposals.fits, [c for c in explanation.candidates if c is not member]
+    missing = []
     for law in laws:
         there = {t for c in others if c.effect is law for t in c.targets} & set(member.targets)
-        if not there:
-            result = converged(proposals.fits, proposals.beside(result, law, member.targets))
-        elif len(there) < len(member.targets):
+        if 0 < len(there) < len(member.targets):
             return None
+        missing += [] if there else [law]
+    result = fits.explain(others)
+    for law in missing:
+        result = converged(fits, proposals.beside(result, law, member.targets))
+    # The first ones were fitted where the last ones lacked.
+    for law in missing[:-1]:
+        rest = [c for c in result.candidates if c.key != (law, member.targets)]
+        anew = converged(fits, proposals.beside(fits.explain(rest), law, member.targets))
+        result = min(result, anew, key=lambda e: e.deviance)
     return result
 
 

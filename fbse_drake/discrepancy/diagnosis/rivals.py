@@ -16,7 +16,7 @@ from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import converged
-from fbse_drake.discrepancy.diagnosis.selection import MISFIT, best_additions, is_shown
+from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_shown
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
@@ -86,12 +86,7 @@ def indistinguishable(
     def shifts_alike(member: Candidate, rival: Explanation) -> bool:
         if member.has_linear or rival.candidates[-1].has_linear:
             return False
-        rest = fits.explain([c for c in final.candidates if c is not member])
-        taken, lost = (
-            float((worse.held_out_sse - final.held_out_sse)[member.signature.rows].sum())
-            for worse in (rest, rival)
-        )
-        return lost < MISFIT * taken
+        return judge.is_nearly_as_good(rival, final, member)
 
     def equals(rival: Explanation) -> bool:
         more = len(final.solved.parameters) - len(rival.solved.parameters)
