@@ -64,6 +64,7 @@ def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
         if smaller is None:
             return explanation
         explanation = polished(proposals.fits, smaller)
+        judge = judge.after(explanation)
 
 
 def blocks_per_sample(scores: np.ndarray) -> np.ndarray:
@@ -119,10 +120,15 @@ class Judge:
     """What members of an explanation bring, in effectively independent samples."""
 
     def __init__(self, fits: Fits, explanation: Explanation):
-        """Measures what the largest explanation leaves: what a smaller one leaves is no noise."""
-        self._fits, self._left = fits, fits.leftover(explanation)
+        """Measures what the best explanation leaves: what others leave is no noise."""
+        self._fits, self._left, self._best = fits, fits.leftover(explanation), explanation.deviance
         parts = list(recordings(fits.dictionary.predictor.motion).values())
         self._recordings = parts if len(parts) > 1 else []
+
+    def after(self, explanation: Explanation) -> "Judge":
+        """One that knows another explanation as well."""
+        is_better = explanation.deviance < self._best - MARGIN
+        return Judge(self._fits, explanation) if is_better else self
 
     def drop_by_row(self, base: Explanation, wider: Explanation) -> np.ndarray:
         """Drop of the held-out deviance in each row, as if blocks were independent, (R,)."""
@@ -441,7 +447,7 @@ def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> It
                 break
             # Others may have been moved to where they fit.
             member = next(c for c in smaller.candidates if c.key == key)
-            smaller = next(_simpler(proposals, judge, smaller, member), None)
+            smaller = next(_simpler(proposals, judge.after(smaller), smaller, member), None)
         if smaller is not None:
             yield smaller
         for member in [c for c in explanation.candidates if c.effect is effect]:
