@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
+from recorded_arm import ARM
 
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
@@ -120,3 +121,28 @@ def test_lag_and_delay_are_confusable_where_noise_hides_the_difference(hidden: s
     (finding,) = diagnose(noisy(hidden, 1), tried).chosen
     assert finding.targets == ("elbow",)
     assert {finding.effect, *finding.confusable_with} >= {"TorqueLag", "TorqueDelay"}
+
+
+def test_friction_that_steps_is_no_elasticity() -> None:
+    """Torques that step with friction look like a twist that steps, and their noise is in both."""
+    for seed in range(4):
+        course = ARM.course(seed)
+        friction = 0.2 * course.torque.std(axis=0) * np.tanh(course.velocity / 0.01)
+        chosen = diagnose(ARM.predictor(ARM.log(course, course.torque + friction, seed))).chosen
+        assert {finding.effect for finding in chosen} == {"CoulombFriction"}
+        assert {joint for finding in chosen for joint in finding.targets} == set(ARM.joints)
+
+
+def test_a_gain_pays_for_no_noise_that_its_regressor_has_not() -> None:
+    """A wrist's torque is nearly all inertia and friction: as if the error of the torque grew with
+    the gain, a rotor that is as large explained more, with confidence."""
+    course = ARM.course()
+    torque = course.torque + 0.6 * course.velocity
+    torque[:, 3] /= 1.0 - 0.1
+    (found,) = (
+        finding
+        for finding in diagnose(ARM.predictor(ARM.log(course, torque))).chosen
+        if finding.effect != "ViscousFriction"
+    )
+    assert found.targets == ("axis_4",)
+    assert "TorqueGain" in {found.effect, *found.confusable_with}

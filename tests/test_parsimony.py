@@ -176,6 +176,21 @@ def test_friction_of_a_recorded_arm_is_the_smallest_law_that_holds():
         assert all(finding.targets == ("axis_3",) for finding in found)
 
 
+def test_joints_that_need_no_hump_have_none():
+    """Friction in all joints of an arm that steps as sharply as its velocity is read, and a hump in
+    one of them."""
+    course = ARM.course()
+    velocity, sizes = course.velocity, 0.2 * course.torque.std(axis=0)
+    friction = sizes * (np.tanh(velocity / 0.002) + velocity / velocity.std(axis=0))
+    hump = np.tanh(velocity[:, 0] / 0.02) - np.tanh(velocity[:, 0] / 0.3)
+    friction[:, 0] += 3.0 * sizes[0] * hump
+    diagnosis = diagnose(ARM.predictor(ARM.log(course, course.torque + friction)))
+    named = {(f.effect, joint) for f in diagnosis.chosen for joint in f.targets}
+    first, *others = ARM.joints
+    plain = ("CoulombFriction", "ViscousFriction")
+    assert named == {("StribeckFriction", first)} | {(law, j) for law in plain for j in others}
+
+
 def test_a_law_with_a_hump_is_called_stribeck(swing: tuple[Scenario, Log]):
     diagnosis = diagnosis_of(
         swing,

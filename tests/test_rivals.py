@@ -270,3 +270,21 @@ def test_a_rival_that_does_not_pay_takes_no_place(
     monkeypatch.setattr("fbse_drake.discrepancy.diagnosis.diagnose.settled", settled)
     diagnosis = diagnose(pushed, [TorqueBias, Wrench])
     assert [finding.effect for finding in diagnosis.chosen] == ["Wrench"]
+
+
+@pytest.mark.parametrize("hidden", ["TorqueDelay", "TorqueLag"])
+def test_lag_and_delay_that_do_the_same_but_for_what_friction_may_hide_are_confusable(
+    hidden: str,
+) -> None:
+    """Sharp friction is fitted by a law that is not quite its own: which of the two fits better
+    beside it says nothing."""
+    course = ARM.course()
+    given = course.torque + 25.0 * np.tanh(course.velocity / 0.002) * (np.arange(6) == 0)
+    late, time = 0.008, course.time
+    if hidden == "TorqueDelay":
+        given[:, 0] = np.interp(time + late, time, given[:, 0])
+    else:
+        given[:, 0] += late * course.rate(given)[:, 0]
+    chosen = diagnose(ARM.predictor(ARM.log(course, given))).chosen
+    (found,) = (finding for finding in chosen if finding.effect.startswith("Torque"))
+    assert hidden in {found.effect, *found.confusable_with}

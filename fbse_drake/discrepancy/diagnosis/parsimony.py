@@ -44,6 +44,8 @@ _LEAST_OF_REST = 0.1
 # A row is worse for a member if its held-out error rises by more than this share: a body that is
 # heavier brings the noise of its acceleration, also where its mass hardly shows.
 _WORSE = 0.01
+# What a smaller law is without is a small part of what it has, if it is no more than this share.
+_SMALL_PART = 0.1
 # A larger law that lowers the held-out deviance by less brings nothing.
 _NOTHING = 1.0
 # Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
@@ -438,8 +440,8 @@ def _acts(law: Signature) -> np.ndarray:
 
 def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With simpler laws in the place of one that contains them, wherever it is: it is one law for
-    all joints where it may be, for not every joint shows what it has. Where the larger law brings
-    nothing, it is not."""
+    all joints where it may be, for not every joint shows what it has. Where it brings nothing, it
+    is not."""
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
         smaller: Explanation | None = explanation
         for key in [c.key for c in explanation.candidates if c.effect is effect]:
@@ -451,36 +453,59 @@ def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> It
         if smaller is not None:
             yield smaller
         for member in [c for c in explanation.candidates if c.effect is effect]:
-            for smaller in _simpler(proposals, judge, explanation, member):
-                if judge.drop_by_row(smaller, explanation).sum() < _NOTHING:
-                    yield smaller
+            yield from _simpler(proposals, judge, explanation, member, if_needless=True)
 
 
 def _simpler(
-    proposals: Proposals, judge: Judge, explanation: Explanation, member: Candidate
+    proposals: Proposals,
+    judge: Judge,
+    explanation: Explanation,
+    member: Candidate,
+    *,
+    if_needless: bool = False,
 ) -> Iterator[Explanation]:
-    """With the simplest laws in the place of a member that contains them and is no better."""
+    """With the simplest laws in the place of a member that contains them and is no better.
+
+    Args:
+        if_needless: only where it brings nothing.
+    """
     if not issubclass(member.effect, JointTorqueEffect):
         return
     tried = set(proposals.fits.dictionary.effects)
     for reduction in member.effect.reductions:
-        if tried.issuperset(reduction.effects):
-            smaller = _with_laws(proposals, explanation, member, reduction.effects)
-            if smaller is not None and (
-                judge.is_as_good(smaller, explanation)
-                or (
-                    _is_without(explanation, member, reduction)
-                    and judge.is_nearly_as_good(smaller, explanation, member)
-                )
-            ):
-                yield smaller
+        if not tried.issuperset(reduction.effects):
+            continue
+        smaller = _with_laws(proposals, explanation, member, reduction.effects)
+        if smaller is None:
+            continue
+        is_needless = judge.drop_by_row(smaller, explanation).sum() < _NOTHING or (
+            _is_without(explanation, member, reduction)
+            and judge.is_nearly_as_good(smaller, explanation, member)
+        )
+        if is_needless or (not if_needless and judge.is_as_good(smaller, explanation)):
+            yield smaller
 
 
 def _is_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:
-    """Are all amounts of a law that a reduction is without at their bound of zero?"""
-    values, _ = explanation.values(member)
-    amounts = [name for name in reduction.at if name in member.linear_names]
-    return bool(amounts) and all(values[name] == 0.0 for name in amounts)
+    """Are all amounts of a law that a reduction is without a small part of the others, and told
+    from zero by nothing?"""
+    values, intervals = explanation.values(member)
+    without = [name for name in reduction.at if name in member.linear_names]
+    kept = [name for name in member.linear_names if name not in without]
+    return bool(without) and all(
+        intervals[name][0] <= 0.0 <= intervals[name][1]
+        and abs(values[name])
+        <= _SMALL_PART
+        * max(
+            (
+                abs(values[other])
+                for other in kept
+                if member.parameters[other].unit == member.parameters[name].unit
+            ),
+            default=0.0,
+        )
+        for name in without
+    )
 
 
 def _with_laws(
