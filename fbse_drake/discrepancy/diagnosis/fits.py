@@ -235,21 +235,27 @@ class Fits:
         )
 
     def torque_factor(
-        self, candidates: Sequence[Candidate], parameters: np.ndarray
+        self,
+        candidates: Sequence[Candidate],
+        parameters: np.ndarray,
+        kept: np.ndarray | float = 1.0,
     ) -> np.ndarray | float:
         """What the squares of each row are to be multiplied with where torque is measured and
         effects take a share of it, (R,).
 
         With u = share * torque, the rest torque - u - ... is the error of the torque times 1 -
         share: a share near 1 would explain everything. As the error of the torque itself it is the
-        larger the more is taken. Of a torque from which the noise is taken first, see
-        `Reading.kept_noise`, nothing is taken of it.
+        larger the more is taken.
+
+        Args:
+            kept: share of the torque's error that is in what effects take of it, (n,), or in all
+                joints.
         """
         taking = [c for c in candidates if self.dictionary.takes_torque(c.effect)]
         if self.dictionary.per_step or not taking:
             return 1.0
-        predictor = self.dictionary.predictor
-        torque, kept = predictor.motion.blocks.torque_command, predictor.reading.kept_noise
+        torque = self.dictionary.predictor.motion.blocks.torque_command
+        kept = np.broadcast_to(kept, torque.shape[1])
         taken: dict[int, np.ndarray] = {}
         start = 0
         for c in candidates:
@@ -271,6 +277,20 @@ class Fits:
             if own > 0 and rest > 0:
                 factor[row] = own / rest
         return factor
+
+    def if_left_is_noise(self, explanation: Explanation) -> float:
+        """Its deviance if all that it leaves were white noise of the torque, of which little is in
+        regressors of torques that are free of it, see `Reading.kept_noise`."""
+        if explanation.fit is None:
+            return explanation.deviance
+        candidates, parameters = explanation.candidates, explanation.fit.parameters
+        of_noise = self.torque_factor(
+            candidates, parameters, self.dictionary.predictor.reading.kept_noise
+        )
+        factor = of_noise / self.torque_factor(candidates, parameters)
+        deviance = self.white.deviance
+        sse = explanation.held_out_sse
+        return explanation.deviance + deviance(sse * factor) - deviance(sse)
 
     @property
     def noise_alone(self) -> Explanation:

@@ -79,7 +79,8 @@ def indistinguishable(
 
     One with fewer parameters does also if chance may have brought what the final explanation has
     more; and one that shifts the torque in time as a member does, if it takes off all of what that
-    takes off but for what a law of unknown shape may be wrong by.
+    takes off but for what a law of unknown shape may be wrong by. Rivals that take a share of the
+    torque are given the benefit of the doubt, see `Fits.if_left_is_noise`.
     """
     judge = Judge(fits, final)
 
@@ -91,7 +92,7 @@ def indistinguishable(
     def equals(rival: Explanation) -> bool:
         more = len(final.solved.parameters) - len(rival.solved.parameters)
         least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-        lost = rival.deviance - final.deviance
+        lost = fits.if_left_is_noise(rival) - final.deviance
         return lost < least or judge.independent_share(rival, final) * lost < least
 
     return {
