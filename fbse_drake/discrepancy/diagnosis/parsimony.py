@@ -59,13 +59,15 @@ def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
     Members that do not pay go, the least useful first; then laws are reduced, then joints pooled;
     until nothing changes.
     """
+    # What is made smaller is moved to where it fits, which is no merit of what is smaller.
+    explanation = converged(proposals.fits, explanation)
     judge = Judge(proposals.fits, explanation)
     while True:
         proposals.fits.dictionary.progress("looking for a smaller explanation")
         smaller = next(_smaller(proposals, judge, explanation), None)
         if smaller is None:
             return explanation
-        explanation = polished(proposals.fits, smaller)
+        explanation = converged(proposals.fits, smaller)
         judge = judge.after(explanation)
 
 
@@ -176,6 +178,16 @@ class Judge:
             again = fits.explain([*rest.candidates, member])
             return is_shown(fits, member) and is_significant(fits, rest, again, member)
         return self._are_proven(rest, whole, [member]) and self._is_sound(rest, whole, member)
+
+    def all_pay(
+        self, whole: Explanation, laws: Sequence[type[Effect]], targets: tuple[str, ...]
+    ) -> bool:
+        """Is each of these laws in some joints worth its parameters?"""
+        return all(
+            self.pays(self._fits.explain([c for c in whole.candidates if c is not m]), whole, m)
+            for m in whole.candidates
+            if m.effect in laws and m.targets == targets
+        )
 
     def pay_together(
         self,
@@ -482,7 +494,9 @@ def _simpler(
             _is_without(explanation, member, reduction)
             and judge.is_nearly_as_good(smaller, explanation, member)
         )
-        if is_needless or (not if_needless and judge.is_as_good(smaller, explanation)):
+        is_smaller = is_needless or (not if_needless and judge.is_as_good(smaller, explanation))
+        # What takes its place has to stay.
+        if is_smaller and judge.all_pay(smaller, reduction.effects, member.targets):
             yield smaller
 
 
