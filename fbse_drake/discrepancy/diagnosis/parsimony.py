@@ -504,20 +504,15 @@ def _is_without(explanation: Explanation, member: Candidate, reduction: Reductio
     """Are all amounts of a law that a reduction is without a small part of the others, and told
     from zero by nothing?"""
     values, intervals = explanation.values(member)
-    without = [name for name in reduction.at if name in member.linear_names]
-    kept = [name for name in member.linear_names if name not in without]
+    units = {name: member.parameters[name].unit for name in member.linear_names}
+    without = [name for name in units if name in reduction.at]
+
+    def small(name: str) -> float:
+        kept = (o for o, unit in units.items() if o not in without and unit == units[name])
+        return _SMALL_PART * max((abs(values[other]) for other in kept), default=0.0)
+
     return bool(without) and all(
-        intervals[name][0] <= 0.0 <= intervals[name][1]
-        and abs(values[name])
-        <= _SMALL_PART
-        * max(
-            (
-                abs(values[other])
-                for other in kept
-                if member.parameters[other].unit == member.parameters[name].unit
-            ),
-            default=0.0,
-        )
+        intervals[name][0] <= 0.0 <= intervals[name][1] and abs(values[name]) <= small(name)
         for name in without
     )
 

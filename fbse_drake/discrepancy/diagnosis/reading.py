@@ -131,7 +131,8 @@ class Reading:
         """Share of the power of each torque's white noise that is left in it where laws take it,
         averaged over blocks, (n,)."""
         highest = 0.5 / (self.motion.length * self.motion.period)
-        return np.array([min(1.0, corner / highest) or 1.0 for corner in self._torque_corners])
+        # A corner of 0 is none.
+        return np.array([min(1.0, c / highest) if c > 0 else 1.0 for c in self._torque_corners])
 
     @cached_property
     def _torque_corners(self) -> list[float]:
