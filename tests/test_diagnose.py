@@ -355,6 +355,29 @@ def test_how_far_a_single_guess_goes_is_told_where_nothing_can_be_named() -> Non
         read_findings(content)
 
 
+def test_friction_of_all_joints_is_named_as_what_it_is() -> None:
+    """Coulomb and viscous friction as measured on HRP-2's legs: where viscous friction takes less
+    than what Coulomb friction of a fitted shape may be wrong by, it was called Stribeck's. Of hips
+    that hardly turn nothing can be said."""
+    name, changes = "hrp2_friction_walk", ("duration=3", "estimator=!NoEstimator {}")
+    walk = load_scenario(name, overrides=[*changes])
+    true = walk.robot.effects["joint_friction"]
+    diagnosis = diagnose(Predictor(walk, simulate(walk).log))
+    assert diagnosis.verdict == "effect_found"
+    assert {f.effect for f in diagnosis.chosen} == {"CoulombFriction", "ViscousFriction"}
+    turning = {joint for joint in true.coulomb if not joint.endswith("hip_yaw")}
+    for effect, amount in (("CoulombFriction", "coulomb"), ("ViscousFriction", "viscous")):
+        found = {
+            joint: f.parameters[amount].value
+            for f in diagnosis.chosen
+            if f.effect == effect
+            for joint in f.targets
+        }
+        assert turning <= set(found)
+        for joint in turning:
+            assert found[joint] == pytest.approx(getattr(true, amount)[joint], rel=0.1)
+
+
 def test_small_friction_beside_a_large_bias_is_found() -> None:
     """A bias has the shape that it has: what it leaves is no misfit, however little that is of what
     it takes."""

@@ -10,7 +10,7 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation,
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.sensor import FootForceGain
@@ -216,7 +216,9 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     if base.deviance - wider.deviance < fits.required(added):
         return False
     if fits.dictionary.per_step or follows_torque(added.effect):
-        exact = fits.explain([c for c in base.candidates if not c.nonlinear_names])
+        exact = fits.explain(
+            [c for c in base.candidates if not c.nonlinear_names or _is_one_law_with(c, added)]
+        )
         taken, gained = (
             float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
             for a, b in ((exact, base), (base, wider))
@@ -255,6 +257,17 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         if abs(value) > widest and least <= 0 <= most:
             return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
+
+
+def _is_one_law_with(member: Candidate, added: Candidate) -> bool:
+    """Do two laws of a joint make up a larger one together? The shape of the one then leaves
+    nothing that looks like the other."""
+    return bool(set(member.targets) & set(added.targets)) and any(
+        {member.effect, added.effect} <= set(reduction.effects)
+        for law in library().values()
+        if issubclass(law, JointTorqueEffect)
+        for reduction in law.reductions
+    )
 
 
 def _is_carried(fits: Fits, explanation: Explanation, member: Candidate) -> bool:
