@@ -485,7 +485,9 @@ def _simpler(
         return
     tried = set(proposals.fits.dictionary.effects)
     for reduction in member.effect.reductions:
-        if not tried.issuperset(reduction.effects):
+        if not tried.issuperset(reduction.effects) or (
+            if_needless and not _may_be_without(explanation, member, reduction)
+        ):
             continue
         smaller = _with_laws(proposals, explanation, member, reduction.effects)
         if smaller is None:
@@ -500,10 +502,16 @@ def _simpler(
             yield smaller
 
 
+def _may_be_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:
+    """Does nothing tell the amounts of a law that a reduction is without from zero?"""
+    _, intervals = explanation.values(member)
+    without = [name for name in member.linear_names if name in reduction.at]
+    return bool(without) and all(intervals[n][0] <= 0.0 <= intervals[n][1] for n in without)
+
+
 def _is_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:
-    """Are all amounts of a law that a reduction is without a small part of the others, and told
-    from zero by nothing?"""
-    values, intervals = explanation.values(member)
+    """The same; and are they a small part of the law's other amounts?"""
+    values, _ = explanation.values(member)
     units = {name: member.parameters[name].unit for name in member.linear_names}
     without = [name for name in units if name in reduction.at]
 
@@ -511,9 +519,8 @@ def _is_without(explanation: Explanation, member: Candidate, reduction: Reductio
         kept = (o for o, unit in units.items() if o not in without and unit == units[name])
         return _SMALL_PART * max((abs(values[other]) for other in kept), default=0.0)
 
-    return bool(without) and all(
-        intervals[name][0] <= 0.0 <= intervals[name][1] and abs(values[name]) <= small(name)
-        for name in without
+    return _may_be_without(explanation, member, reduction) and all(
+        abs(values[name]) <= small(name) for name in without
     )
 
 
