@@ -103,8 +103,10 @@ class EffectStatus:
     def over_plausible(self) -> dict[str, float]:
         """The smallest value that would have been shown, over the largest plausible one, by
         target."""
-        largest = self.largest_plausible
-        return {target: size / largest[target] for target, size in self.smallest_detectable.items()}
+        return {
+            target: size / self.largest_plausible.get(target, np.inf)
+            for target, size in self.smallest_detectable.items()
+        }
 
     @property
     def command(self) -> str | None:

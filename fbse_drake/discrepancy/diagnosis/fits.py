@@ -281,9 +281,7 @@ class Fits:
     def if_left_is_noise(self, explanation: Explanation) -> float:
         """Its deviance if all that it leaves were white noise of the torque, of which little is in
         regressors of torques that are free of it, see `Reading.kept_noise`."""
-        if explanation.fit is None:
-            return explanation.deviance
-        candidates, parameters = explanation.candidates, explanation.fit.parameters
+        candidates, parameters = explanation.candidates, explanation.solved.parameters
         of_noise = self.torque_factor(
             candidates, parameters, self.dictionary.predictor.reading.kept_noise
         )
