@@ -17,9 +17,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks import mujoco_hidden
 from benchmarks.cases import Result
 from fbse_drake import Log, load_scenario
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.effects.actuation import TorqueSaturation
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.geometry import ImuPosition, LinkLength
+from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.robot.plant import Ground, Robot, make_robot
 from fbse_drake.scenario import (
@@ -376,6 +379,18 @@ def test_cases_are_drawn_alike_each_time_and_hide_what_the_robot_can_have() -> N
             # Refused if the robot has no such target, or the value cannot be.
             hidden.make().resolve(robot.description)
             assert hidden.size > 0
+
+
+@needs_mujoco
+def test_what_a_mass_leaves_of_impacts_is_no_limit_of_a_drive() -> None:
+    """A heavier thigh: linearised, its mass leaves spikes where feet land, when torques are
+    largest."""
+    case = random_case(385)
+    scenario, reference = setting(case)
+    log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
+    diagnosis = diagnose(Predictor(scenario, log), [BodyMass, TorqueSaturation])
+    assert [finding.effect for finding in diagnosis.chosen] == ["BodyMass"]
+    assert diagnosis.verdict == "effect_found"
 
 
 @needs_mujoco

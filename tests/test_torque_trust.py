@@ -354,6 +354,25 @@ def test_a_test_that_sees_little_acquits_nothing(pendulum: Course) -> None:
     assert verdicts == {"not_visible", "unknown_effect"}
 
 
+@pytest.mark.parametrize(
+    ("kick", "verdict"), [(0.0, "nothing_missing"), (0.2, "nothing_missing"), (3.0, "not_visible")]
+)
+def test_far_more_than_noise_is_not_acquitted_for_telling_nothing(
+    pendulum: Course, kick: float, verdict: str
+) -> None:
+    """Kicks at random, as of play: what comes later does not show in them, and no law is behind
+    them. Small ones pass for noise."""
+    random = np.random.default_rng(5)
+    kicks = kick * random.normal(size=pendulum.torque.shape)
+    kicks[random.random(size=kicks.shape) > 0.05] = 0.0
+    log = PENDULUM.log(pendulum, pendulum.torque + kicks)
+    diagnosis = diagnose(PENDULUM.predictor(log), [CoulombFriction, ViscousFriction])
+    assert (diagnosis.verdict, diagnosis.chosen) == (verdict, [])
+    is_noisy = verdict == "not_visible"
+    assert diagnosis.noisy == ((PENDULUM.joints[0],) if is_noisy else ())
+    assert ("follows nothing that was measured" in diagnosis_outcome(diagnosis)) == is_noisy
+
+
 def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:
     """One way up and down: friction that grows with the load does so with time. Where the motion is
     repeated a drift is named."""

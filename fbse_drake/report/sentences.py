@@ -26,6 +26,8 @@ from fbse_drake.report.html import Step, number
 _DISTURBED, _MOST_PLACES = 3, 2
 # What is left follows a variable that explains more than this share of it.
 _FOLLOWS = 0.1
+# What far more than the sensors' noise is that follows nothing.
+_OF_NOTHING = "noise that nobody told of, or impacts, as in a gear with play"
 
 _COURSES = {
     "falls": "the error falls",
@@ -246,6 +248,12 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"{number(diagnosis.held_out_before)} times the sensors' noise, and whether that is "
             f"noise as well does not show in so few averages of {_rows(diagnosis.untested)}."
         )
+    if diagnosis.verdict == "not_visible" and diagnosis.noisy:
+        return (
+            "This log cannot tell whether something is missing: the model leaves over "
+            f"{number(diagnosis.held_out_before)} times the sensors' noise, and what is left in "
+            f"{_rows(diagnosis.noisy)} follows nothing that was measured. It is {_OF_NOTHING}."
+        )
     if diagnosis.verdict == "not_visible":
         return (
             f"This log cannot tell whether something is missing: {hidden} of {len(statuses)} "
@@ -259,11 +267,16 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 
 def _open(diagnosis: Diagnosis) -> str:
-    """Says that more may be missing than was found, in a log too short to tell."""
-    if not diagnosis.untested:
-        return ""
-    rows = _rows(diagnosis.untested)
-    return f" Whether what is left in {rows} is noise does not show in so few averages."
+    """Says that more may be missing than was found."""
+    text = ""
+    if diagnosis.untested:
+        rows = _rows(diagnosis.untested)
+        text += f" Whether what is left in {rows} is noise does not show in so few averages."
+    if diagnosis.noisy:
+        rows = _rows(diagnosis.noisy)
+        text += f" More than the sensors' noise is left in {rows} and follows nothing that was "
+        text += f"measured: {_OF_NOTHING}."
+    return text
 
 
 def _suggested(found: str) -> str:
@@ -409,6 +422,13 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[St
     if diagnosis.partial is None and diagnosis.verdict == "not_visible":
         if diagnosis.untested:
             steps.append(Step("Record for longer, or average over less (recording.block)."))
+        if diagnosis.noisy:
+            steps.append(
+                Step(
+                    f"Look at what is left in {_rows(diagnosis.noisy)}: noise is said in the "
+                    "scenario (recording.torque_noise), and play is felt when the machine is off."
+                )
+            )
         hidden = {
             name: status for name, status in statuses.items() if status.verdict == "not_visible"
         }

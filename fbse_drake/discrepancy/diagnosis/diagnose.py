@@ -14,7 +14,12 @@ from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance, disturbanc
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
-from fbse_drake.discrepancy.diagnosis.parsimony import frugal, in_fits, needs_inertia
+from fbse_drake.discrepancy.diagnosis.parsimony import (
+    frugal,
+    in_fits,
+    needs_inertia,
+    without_stand_ins,
+)
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, polished, remeasured
@@ -32,6 +37,7 @@ from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import (
     Structure,
     leftover_structure,
+    noisy_rows,
     untested_rows,
 )
 from fbse_drake.effects.effect import Effect, library
@@ -159,6 +165,8 @@ class Diagnosis:
     disturbances: tuple[Disturbance, ...] = ()
     # Rows in which more than noise is left, but in too few averages to say that it is none.
     untested: tuple[str, ...] = ()
+    # Rows in which far more than the sensors' noise is left, and follows nothing.
+    noisy: tuple[str, ...] = ()
     # What explains the log and raises the error of data that was set aside: it is not named.
     refuted: tuple[Finding, ...] = ()
 
@@ -247,7 +255,7 @@ def diagnose(
         inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     ):
         verdict = "effect_found"
-    elif partial is not None or hidden > 0.5 * len(statuses) or search.untested:
+    elif partial is not None or hidden > 0.5 * len(statuses) or search.untested or search.noisy:
         verdict = "not_visible"
     else:
         verdict = "nothing_missing"
@@ -267,6 +275,7 @@ def diagnose(
         partial,
         disturbances=disturbed,
         untested=search.untested,
+        noisy=search.noisy,
     )
 
 
@@ -288,6 +297,8 @@ class _Search:
     disturbances: tuple[Disturbance, ...]
     # Rows of which a log as short as this cannot tell.
     untested: tuple[str, ...]
+    # Rows in which what is left is far more than noise, and follows nothing.
+    noisy: tuple[str, ...]
     partial: str | None
 
 
@@ -315,11 +326,12 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
     significance = proposals.fits.dictionary.significance
     tolerance = predictor.scenario.identify.tolerance
     structures = leftover_structure(predictor.motion, remaining, left)
-    unexplained = [
-        structure
-        for structure in structures
-        if not significance.left_share(structure, remaining) < tolerance
-    ]
+
+    def matters(row: int) -> bool:
+        return not significance.left_share(row, left, remaining) < tolerance
+
+    unexplained = [structure for structure in structures if matters(structure.index)]
+    noisy = noisy_rows(predictor.motion, remaining, left, structures)
     disturbed = disturbances(remaining, left, [structure.index for structure in unexplained])
     return _Search(
         proposals,
@@ -330,6 +342,7 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         unexplained,
         disturbed,
         untested_rows(predictor.motion, remaining, left, structures),
+        tuple(remaining.residual.rows[row].name for row in noisy if matters(row)),
         partial,
     )
 
@@ -389,11 +402,12 @@ def _settled_and_frugal(
     place, the other stays.
     """
     final, found = settled(proposals, explanation)
-    if final is explanation:
-        return final, found
-    smaller = frugal(proposals, final)
-    if smaller.deviance > explanation.deviance + MARGIN:
-        smaller = explanation
+    smaller = final
+    if final is not explanation:
+        smaller = frugal(proposals, final)
+        if smaller.deviance > explanation.deviance + MARGIN:
+            smaller = explanation
+    smaller = without_stand_ins(proposals.fits, smaller)
     return smaller, found if smaller is final else rivals(proposals, smaller)
 
 
@@ -640,6 +654,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             for name, s in diagnosis.effects.items()
         },
         "untested": list(diagnosis.untested),
+        "noisy": list(diagnosis.noisy),
         "refuted": [{"effect": f.effect, "joints": list(f.targets)} for f in diagnosis.refuted],
         "left_out": [
             {"start": d.start, "end": d.end, "rows": list(d.rows)} for d in diagnosis.disturbances

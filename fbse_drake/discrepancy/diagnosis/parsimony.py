@@ -22,7 +22,7 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import converged, polished
+from fbse_drake.discrepancy.diagnosis.refinement import beside_model, converged, polished
 from fbse_drake.discrepancy.diagnosis.selection import MISFIT, is_shown, is_significant
 from fbse_drake.discrepancy.diagnosis.spread import recordings
 from fbse_drake.discrepancy.identification.regression import Signature
@@ -69,6 +69,30 @@ def frugal(proposals: Proposals, explanation: Explanation) -> Explanation:
             return explanation
         explanation = converged(proposals.fits, smaller)
         judge = judge.after(explanation)
+
+
+def without_stand_ins(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation without members that bring nothing when the others' inertia, geometry and
+    sensor effects are in the model.
+
+    Linearised, those leave something where accelerations are large, as of impacts, that looks like
+    a law of its own.
+    """
+    found = beside_model(fits, explanation)
+    if found is None:
+        return explanation
+    inside, moved = found
+    kept = list(moved.values())
+    while True:
+        whole = inside.explain(kept)
+        without = {c: inside.explain([o for o in kept if o is not c]) for c in kept}
+        idle = [c for c in kept if not is_significant(inside, without[c], whole, c)]
+        if not idle:
+            break
+        kept.remove(min(idle, key=lambda c: without[c].deviance))
+    if len(kept) == len(moved):
+        return explanation
+    return fits.explain([c for c in explanation.candidates if c not in moved or moved[c] in kept])
 
 
 def blocks_per_sample(scores: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """What becomes of an explanation that is taken at its word: linear about its own values, with
 possible bodies, added to the model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,6 +18,7 @@ from fbse_drake.discrepancy.identification.inertial import (
 )
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.residual import Residual
+from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.geometry import GeometryEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -221,10 +223,7 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
     is not the sum of what each of them adds: they are fitted anew beside the difference, as long as
     less is left then.
     """
-    if fits.dictionary.inertia is not None or not any(
-        issubclass(c.effect, InertiaEffect | GeometryEffect | SensorEffect)
-        for c in explanation.candidates
-    ):
+    if fits.dictionary.inertia is not None or not any(map(_is_of_model, explanation.candidates)):
         return explanation, fits.white, fits.leftover(explanation)
     inside = _in_model(fits, explanation)
     for _ in range(_CORRECTIONS):
@@ -246,6 +245,29 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
     )
 
 
+def _is_of_model(candidate: Candidate) -> bool:
+    """Is what a candidate does another one in a model that has it than linearised about one that
+    does not?"""
+    return issubclass(candidate.effect, InertiaEffect | GeometryEffect | SensorEffect)
+
+
+def beside_model(
+    fits: Fits, explanation: Explanation
+) -> tuple[Fits, dict[Candidate, Candidate]] | None:
+    """Fits of the residual by a model that has the inertia, geometry and sensor effects of an
+    explanation, and its other members in them; None if it has not both."""
+    members = explanation.candidates
+    others = [c for c in members if not _is_of_model(c)]
+    if fits.dictionary.inertia is not None or not 0 < len(others) < len(members):
+        return None
+    effects = [
+        effect for effect, c in zip(explanation.effects, members, strict=True) if _is_of_model(c)
+    ]
+    inside = Fits(fits.dictionary, WhitenedResidual(_residual_with(fits, effects)))
+    moved = {c: replace(c, signature=inside.white.whiten_signature(c.raw)) for c in others}
+    return inside, moved
+
+
 @dataclass(frozen=True)
 class _InModel:
     """What is left when effects are in the model, with as many squares as before, (R,)."""
@@ -256,19 +278,24 @@ class _InModel:
 
 
 def _in_model(fits: Fits, explanation: Explanation) -> _InModel:
-    predictor = fits.dictionary.predictor
-    scenario = predictor.scenario
-    effects = dict(scenario.believed.effects)
-    for k, effect in enumerate(explanation.effects):
-        effects, beside = without_surplus(effects, effect, predictor.robot.description)
-        if beside is not None:
-            effects[f"_found_{k}"] = beside
-    believed = replace(scenario.believed, effects=effects)
-    residual = predictor.of(replace(scenario, model=believed)).residual
+    residual = _residual_with(fits, explanation.effects)
     white = WhitenedResidual(residual)
     share = fits.white.count / np.maximum(white.count, 1)
     factor = fits.torque_factor(explanation.candidates, explanation.solved.parameters)
     return _InModel(residual, white, white.sse * share * factor)
+
+
+def _residual_with(fits: Fits, found: Sequence[Effect]) -> Residual:
+    """Of the model with effects that were found."""
+    predictor = fits.dictionary.predictor
+    scenario = predictor.scenario
+    effects = dict(scenario.believed.effects)
+    for k, effect in enumerate(found):
+        effects, beside = without_surplus(effects, effect, predictor.robot.description)
+        if beside is not None:
+            effects[f"_found_{k}"] = beside
+    believed = replace(scenario.believed, effects=effects)
+    return predictor.of(replace(scenario, model=believed)).residual
 
 
 def _beside_interplay(fits: Fits, explanation: Explanation, left: Residual) -> Explanation:

@@ -10,7 +10,6 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.identification.structure import Structure
 from fbse_drake.discrepancy.residual.residual import rms
 
 
@@ -59,13 +58,17 @@ class Significance:
         measured = np.isfinite(sizes) & np.isfinite(added) & (sizes > 0)
         return float((added[measured] / sizes[measured]).max()) if measured.any() else np.nan
 
-    def left_share(self, structure: Structure, white: WhitenedResidual) -> float:
+    def left_share(self, row: int, left: np.ndarray, white: WhitenedResidual) -> float:
         """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it
-        has none."""
-        noise = white.residual.noise_floor[structure.index]
-        return float(
-            np.sqrt(max(structure.ratio**2 - 1.0, 0.0)) * noise / self._sizes[structure.index]
-        )
+        has none.
+
+        Args:
+            row: its place.
+            left: what is left of the whitened residual, (B, R).
+        """
+        beyond = float((left[:, row] ** 2).sum()) / max(1, white.count[row]) - 1.0
+        noise = white.residual.noise_floor[row]
+        return float(np.sqrt(max(beyond, 0.0)) * noise / self._sizes[row])
 
 
 def _length(vectors: np.ndarray) -> float:

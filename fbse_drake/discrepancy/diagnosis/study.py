@@ -270,6 +270,9 @@ def _reason(diagnoses: list[Diagnosis]) -> str:
         return f"no effect of the library explains what is left in {rows}"
     if last.verdict == "not_visible" and last.untested:
         return "this data is too short to tell what is left from noise"
+    if last.verdict == "not_visible" and last.noisy:
+        rows = ", ".join(map(words, last.noisy))
+        return f"what is left in {rows} is more than the sensors' noise and follows nothing"
     if last.verdict == "not_visible" and last.held_out_before > 1.0:
         return "this data does not excite what could still be missing"
     left = f"what is left is {last.held_out_before:.2f} times the sensors' noise"

@@ -19,6 +19,8 @@ _PIECES = 8
 # A row whose held-out residual exceeds the sensors' noise by more than this factor has something
 # left.
 EXCESS = 1.2
+# What tells nothing of what comes later passes for noise up to so many times what is tolerated.
+_LOUD = 3.0
 # Drop of the held-out deviance at which a smooth function of several variables counts as found,
 # beside what is doubted about known laws.
 _DROP = 25.0
@@ -116,6 +118,35 @@ def untested_rows(
         and 0 < white.count[k] < _TELLING
         and usual[k] > _tolerated(white, k)
     )
+
+
+def noisy_rows(
+    motion: RecordedMotion,
+    white: WhitenedResidual,
+    left: np.ndarray,
+    structures: Sequence[Structure],
+) -> list[int]:
+    """Places of rows in which far more is left than the sensors' noise, although it tells nothing:
+    noise that nobody told of, or impacts, as in a gear with backlash.
+
+    Feet's own impacts do not count, nor do soles, which give.
+
+    Args:
+        white, left: see `leftover_structure`.
+        structures: what that found.
+    """
+    if motion.robot.has_floating_base:
+        left = _without_impacts(left, white.residual.known)
+    usual = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
+    told = {structure.index for structure in structures}
+    return [
+        k
+        for k, row in enumerate(white.residual.rows)
+        if row.kind != "kinematic"
+        and k not in told
+        and white.count[k] >= _FEWEST
+        and usual[k] > _LOUD * _tolerated(white, k)
+    ]
 
 
 def _tolerated(white: WhitenedResidual, row: int) -> float:
