@@ -150,6 +150,30 @@ def crooked(run) -> Predictor:
     )
 
 
+@pytest.mark.parametrize(
+    ("coulomb", "transition", "expected"),
+    [
+        (0.3, 0.001, ("CoulombFriction", "coulomb", 0.3)),
+        (50.0, 0.5, ("ViscousFriction", "viscous", 100.0)),
+    ],
+)
+def test_friction_of_what_hardly_moves_is_what_its_speed_reaches(
+    coulomb: float, transition: float, expected: tuple[str, str, float]
+) -> None:
+    """A servo that turns by 5 mrad, at 9 mrad/s at most: friction that levels off far beyond that
+    is viscous, however much of it there is, or the beginning of Coulomb friction."""
+    servo = replace(PENDULUM, amplitude=tuple(0.003 * a for a in PENDULUM.amplitude))
+    course = servo.course(1)
+    assert 0.005 < np.abs(course.velocity).max() < 0.01
+    friction = coulomb * np.tanh(course.velocity / transition)
+    diagnosis = diagnose(servo.predictor(servo.log(course, course.torque + friction)))
+    effect, parameter, value = expected
+    (finding,) = diagnosis.chosen
+    assert finding.effect == effect
+    assert finding.parameters[parameter].value == pytest.approx(value, rel=0.01)
+    assert ("CoulombFriction" in finding.confusable_with) == (effect == "ViscousFriction")
+
+
 def test_a_crooked_imu_is_no_bias_and_no_slope(crooked: Predictor) -> None:
     names = ("AccelerometerBias", "BodyCentreOfMass", "GroundSlope", "GyroscopeBias")
     effects = [ImuMisalignment, *(library()[name] for name in names)]

@@ -72,6 +72,11 @@ class CoulombFriction(JointTorqueEffect):
     def rise(linear: np.ndarray, nonlinear: np.ndarray, typical: JointMotion) -> Rise:  # noqa: ARG004
         return Rise(speeds=(nonlinear[0],))
 
+    @staticmethod
+    def in_part() -> type[JointTorqueEffect]:
+        """Below its transition."""
+        return ViscousFriction
+
 
 @in_library
 @dataclass(frozen=True)

@@ -68,6 +68,8 @@ class Dictionary:
         self.per_step = predictor.scenario.recording.rows == "per_step"
         self.joints = predictor.robot.joint_names
         self.travel = travel_of(predictor.motion.signals.joint_position)
+        # The largest of each joint, (n,) [rad/s].
+        self.speed = np.abs(predictor.motion.signals.joint_velocity).max(axis=0)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
         untrusted = untrusted_bodies(predictor.robot, predictor.scenario.identify.inertia)
         self._untrusted = set(untrusted)

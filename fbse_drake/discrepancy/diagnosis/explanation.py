@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -98,6 +98,13 @@ class Explanation:
         start = self.start(candidate)
         part = slice(start, start + len(names))
         return names, self.solved.parameters[part] + offsets[: len(names)], part
+
+    def as_fitted(self, candidate: Candidate) -> Candidate:
+        """A candidate with the nonlinear values that were found; its columns are as they were."""
+        names, values, _ = self.fitted(candidate)
+        found = dict(zip(names, values, strict=True))
+        known = zip(candidate.nonlinear_names, candidate.nonlinear, strict=True)
+        return replace(candidate, nonlinear=np.array([found.get(*one) for one in known]))
 
     def values(
         self, candidate: Candidate

@@ -137,7 +137,10 @@ def _smaller(
             yield without[member]
     explained = judge.explained(explanation)
     for member in by_gain:
-        if not explained[member.signature.rows].any():
+        rows = member.signature.rows
+        taken = (without[member].held_out_sse - explanation.held_out_sse)[rows]
+        # Where there was next to nothing, any law explains the most of it.
+        if not explained[rows[taken >= _LEAST_OF_REST * taken.max()]].any():
             yield without[member]
     yield from _on_fewer_targets(proposals, judge, explanation)
     yield from _reduced(proposals, judge, explanation)
@@ -261,7 +264,7 @@ class Judge:
             and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
             and self._is_all_of_it(rest, whole, member)
-            and is_shown(fits, member)
+            and is_shown(fits, whole.as_fitted(member))
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
         )
 

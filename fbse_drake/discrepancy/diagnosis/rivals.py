@@ -112,7 +112,7 @@ def settled(
             for k, of_member in found.items()
             for e in of_member
             if e.deviance < final.deviance - MARGIN
-            and is_shown(fits, e.candidates[-1])
+            and is_shown(fits, e.as_fitted(e.candidates[-1]))
             and not _contains(e.candidates[-1].effect, final.candidates[k].effect)
             and fits.dictionary.predictor.can_have(e.effects)
         ]

@@ -23,6 +23,10 @@ _MOST_EFFECTS = 16
 MISFIT = 0.02
 # A value may lie beyond the plausible range by this factor.
 _IMPLAUSIBLE = 3.0
+# Beyond that a law may take what its joint is given, if its relative deviation is less than this.
+_KNOWN = 0.1
+# A law that levels off with speed shows that up to so many times the speed that its joint reaches.
+_REACH = 2.0
 # No more than so many standard deviations of what is believed of it beforehand, if anything is.
 _DISBELIEVED = 3.0
 
@@ -162,10 +166,20 @@ def is_shown(fits: Fits, candidate: Candidate) -> bool:
 def _shows_within(fits: Fits, candidate: Candidate) -> bool:
     """Does it act where the joints were? That others could have done the same is another
     question."""
-    effect = candidate.effect
+    effect, dictionary = candidate.effect, fits.dictionary
     if not issubclass(effect, JointTorqueEffect):
         return True
-    return bool(np.any(effect.shows_within(_travel(fits, candidate), candidate.nonlinear)))
+    joints = dictionary.predictor.joints_of(candidate.signature.rows)
+    reached = _REACH * float(dictionary.speed[joints].max())
+    levels_off = (
+        value
+        for name, value in zip(candidate.nonlinear_names, candidate.nonlinear, strict=True)
+        if candidate.parameters[name].unit in ("rad/s", "m/s")
+    )
+    return bool(
+        np.any(effect.shows_within(dictionary.travel[joints], candidate.nonlinear))
+        and all(speed <= reached for speed in levels_off)
+    )
 
 
 def could_be(proposals: Proposals, base: Explanation, wider: Explanation, added: Candidate) -> bool:
@@ -251,8 +265,11 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
             allowed = min(allowed, _IMPLAUSIBLE * widest)
         if value < low or value > high + 3 * deviation:
             return False
-        if abs(value) > _IMPLAUSIBLE * widest + allowed and not _is_carried(fits, wider, added):
-            return False
+        if abs(value) > _IMPLAUSIBLE * widest + allowed:
+            # Of what hardly moves a small torque is an enormous damping, or any other law.
+            is_known = parameter.unit in ("Nm", "N") or deviation < _KNOWN * abs(value)
+            if not (is_known and _is_carried(fits, wider, added)):
+                return False
         # What is not told from nothing may not be implausible as well.
         if abs(value) > widest and least <= 0 <= most:
             return False
