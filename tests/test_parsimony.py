@@ -191,6 +191,33 @@ def test_joints_that_need_no_hump_have_none():
     assert named == {("StribeckFriction", first)} | {(law, j) for law in plain for j in others}
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_hump_in_one_joint_makes_none_in_others(seed: int) -> None:
+    """Coulomb and viscous friction of all joints, of which one has a hump as well: what others take
+    of it does not pay for what a hump costs."""
+    course = ARM.course(seed)
+    velocity, torque = course.velocity, np.sqrt((course.torque**2).mean(axis=0))
+    speed = np.sqrt((velocity**2).mean(axis=0))
+    friction = torque * (0.2 * np.tanh(velocity / 0.03) + 0.15 * velocity / speed)
+    humped = velocity[:, 3]
+    hump = np.tanh(humped / 0.02) - np.tanh(humped / (0.3 * speed[3]))
+    friction[:, 3] += 0.5 * torque[3] * hump
+    names = (*FRICTION[:3], "TorqueBias")
+    diagnosis = diagnose(
+        ARM.predictor(ARM.log(course, course.torque + friction, seed)),
+        [library()[name] for name in names],
+    )
+    laws: dict[str, set[str]] = {}
+    for finding in diagnosis.chosen:
+        laws.setdefault(finding.effect, set()).update(finding.targets)
+    others = {*ARM.joints} - {"axis_4"}
+    assert laws == {
+        "CoulombFriction": others,
+        "ViscousFriction": others,
+        "StribeckFriction": {"axis_4"},
+    }
+
+
 def test_a_law_with_a_hump_is_called_stribeck(swing: tuple[Scenario, Log]):
     diagnosis = diagnosis_of(
         swing,

@@ -46,8 +46,6 @@ _LEAST_OF_REST = 0.1
 _WORSE = 0.01
 # What a smaller law is without is a small part of what it has, if it is no more than this share.
 _SMALL_PART = 0.1
-# A larger law that lowers the held-out deviance by less brings nothing.
-_NOTHING = 1.0
 # Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
 # of two that round alike.
 _ROUNDING = 1e-3
@@ -213,7 +211,7 @@ class Judge:
         return all(
             self.pays(self._fits.explain([c for c in whole.candidates if c is not m]), whole, m)
             for m in whole.candidates
-            if m.effect in laws and m.targets == targets
+            if m.effect in laws and set(m.targets) & set(targets)
         )
 
     def pay_together(
@@ -479,8 +477,8 @@ def _acts(law: Signature) -> np.ndarray:
 
 def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
     """With simpler laws in the place of one that contains them, wherever it is: it is one law for
-    all joints where it may be, for not every joint shows what it has. Where it brings nothing, it
-    is not."""
+    all joints where it may be, for not every joint shows what it has. Where it brings less than its
+    parameters cost, it is not."""
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
         smaller: Explanation | None = explanation
         for key in [c.key for c in explanation.candidates if c.effect is effect]:
@@ -506,7 +504,7 @@ def _simpler(
     """With the simplest laws in the place of a member that contains them and is no better.
 
     Args:
-        if_needless: only where it brings nothing.
+        if_needless: only where it brings less than its parameters cost.
     """
     if not issubclass(member.effect, JointTorqueEffect):
         return
@@ -517,9 +515,7 @@ def _simpler(
         ):
             continue
         smaller = _with_laws(proposals, explanation, member, reduction.effects)
-        if smaller is None:
-            continue
-        is_needless = judge.drop_by_row(smaller, explanation).sum() < _NOTHING or (
+        is_needless = smaller.deviance <= explanation.deviance or (
             _is_without(explanation, member, reduction)
             and judge.is_nearly_as_good(smaller, explanation, member)
         )
@@ -556,23 +552,21 @@ def _with_laws(
     explanation: Explanation,
     member: Candidate,
     laws: Sequence[type[JointTorqueEffect]],
-) -> Explanation | None:
-    """With laws in the place of a member that are not there yet; None if some are there for some of
-    its targets alone."""
+) -> Explanation:
+    """With laws in the place of a member, for those of its targets that have them not yet."""
     fits, others = proposals.fits, [c for c in explanation.candidates if c is not member]
     missing = []
     for law in laws:
-        there = {t for c in others if c.effect is law for t in c.targets} & set(member.targets)
-        if 0 < len(there) < len(member.targets):
-            return None
-        missing += [] if there else [law]
+        there = {t for c in others if c.effect is law for t in c.targets}
+        targets = tuple(t for t in member.targets if t not in there)
+        missing += [(law, targets)] if targets else []
     result = fits.explain(others)
-    for law in missing:
-        result = converged(fits, proposals.beside(result, law, member.targets))
+    for law, targets in missing:
+        result = converged(fits, proposals.beside(result, law, targets))
     # The first ones were fitted where the last ones lacked.
-    for law in missing[:-1]:
-        rest = [c for c in result.candidates if c.key != (law, member.targets)]
-        anew = converged(fits, proposals.beside(fits.explain(rest), law, member.targets))
+    for law, targets in missing[:-1]:
+        rest = [c for c in result.candidates if c.key != (law, targets)]
+        anew = converged(fits, proposals.beside(fits.explain(rest), law, targets))
         result = min(result, anew, key=lambda e: e.deviance)
     return result
 
