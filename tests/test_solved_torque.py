@@ -362,10 +362,13 @@ def test_motor_crosses_the_gap_before_the_link_feels_it(tmp_path: Path):
     loss, crossing = found["loss"], np.sqrt(2 * gap * inertia / drive)
     assert np.all(loss[:100] == 0)
     assert loss[101] == -drive
-    # The impulse that never arrives is the drive's over the crossing.
-    assert -loss.sum() * H == pytest.approx(drive * crossing, rel=0.03)
-    assert np.all(loss[100 + round(crossing / H) + 2 :] == 0)
-    assert found["velocity"][300] == pytest.approx(drive / 0.05 * (0.1 - 0.2 + crossing), rel=0.02)
+    # What the drive gives the rotor meanwhile the link gets when it is hit.
+    closed = 100 + round(crossing / H) + 2
+    speed = drive / 0.05 * 0.1
+    assert found["velocity"][closed - 5] == pytest.approx(speed, rel=0.01)
+    assert np.all(loss[closed:] == 0)
+    assert loss.sum() == pytest.approx(0.0, abs=1e-9)
+    assert found["velocity"][300] == pytest.approx(drive / 0.05 * (0.1 - 0.2), rel=0.02)
 
 
 def test_directional_friction_alone_stays_bounded(tmp_path: Path):

@@ -1,7 +1,7 @@
 """Torques of gears and cables: springs, ripple, hysteresis, backlash."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,6 +17,10 @@ from fbse_drake.effects.joint_torque import (
     Rise,
     affine_recursion,
 )
+from fbse_drake.robot.plant import Robot
+
+# Factor that the inertia of a rotor may be off by in a model that has one.
+_KNOWN_WITHIN = 2.0
 
 
 @in_library
@@ -160,21 +164,24 @@ class Backlash(JointTorqueEffect):
     """Play between motor and link: when the torque changes sign the motor crosses the gap, and
     until then nothing reaches the link.
 
-    In the gap the rotor turns against the link with the acceleration command / rotor_inertia; the
-    link's own motion is left out, and so is the impact at the other side. The step in which the gap
-    closes counts in part. An encoder on the motor's side shows where the rotor is in the gap.
+    u = rotor_inertia dv/dt, with v the rotor's velocity against the link
+
+    In the gap that is the command, for the link's own motion is left out. At the other side the
+    rotor stays (a plastic impact), and all of its momentum reaches the link within a step from when
+    the gap closes. An encoder on the motor's side shows where the rotor is in the gap.
     """
 
     description: ClassVar[str] = (
         "Play in the gear, which the motor must cross whenever its torque changes sign."
     )
     signature: ClassVar[str] = (
-        "No torque reaches the link for some milliseconds after the command changes sign."
+        "No torque reaches the link for some milliseconds after the command changes sign; then "
+        "it is hit."
     )
     experiment: ClassVar[str] = "Swing each joint so that its torque changes sign often."
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "gap": Parameter("rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0),
+        "gap": Parameter("rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0, grid=25),
         "rotor_inertia": Parameter(
             "kg m^2", linear=False, plausible=(0.02, 1.0), bounds=(1e-9, np.inf), grid=3
         ),
@@ -185,12 +192,23 @@ class Backlash(JointTorqueEffect):
     gap: dict[str, float] = field(default_factory=dict)
     rotor_inertia: dict[str, float] = field(default_factory=lambda: {"all": 0.25})
 
+    @classmethod
+    def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
+        """A model that has a rotor in the joint knows its inertia well enough: of the torque alone
+        only its product with the gap can be told."""
+        parameters, known = super().parameters_on(robot, target), robot.rotor_inertia(target)
+        if known > 0.0:
+            plausible = (known / _KNOWN_WITHIN, known * _KNOWN_WITHIN)
+            rotor = replace(parameters["rotor_inertia"], plausible=plausible, grid=1)
+            parameters["rotor_inertia"] = rotor
+        return parameters
+
     @staticmethod
     def basis(
         motion: JointMotion, nonlinear: np.ndarray
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
-        _, _, share = _cross(motion, nonlinear)
-        return (share * motion.command,), (0.0,)
+        *_, taken = _cross(motion, nonlinear)
+        return (taken,), (0.0,)
 
     @classmethod
     def shows_in(cls, motion: JointMotion) -> bool:
@@ -205,12 +223,11 @@ class Backlash(JointTorqueEffect):
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
         gap, _ = nonlinear
-        return np.stack([0.5 * gap * np.sign(motion.command), np.zeros_like(gap)])
+        return np.stack([0.5 * gap * np.sign(motion.command), *np.zeros((2, *gap.shape))])
 
     @staticmethod
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        offset, velocity, _ = _cross(motion, nonlinear)
-        return np.stack([offset, velocity])
+        return _cross(motion, nonlinear)[:3]
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -221,48 +238,59 @@ class Backlash(JointTorqueEffect):
             np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1)
             for array in (command, *values)
         ]
-        ends = _crossings(first[0].ravel(), first[1].ravel(), *steps, motion.time_step)[:2, :-1]
-        ends = np.moveaxis(ends.reshape(2, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
+        start = first.reshape(3, -1)
+        ends = _crossings(*start, *steps, motion.time_step)[:3, :-1]
+        ends = np.moveaxis(ends.reshape(3, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
         return np.concatenate([first, ends], axis=-2)
 
 
 def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-    """Result of `_crossings` for one step, (3, ...); the memory is offset and velocity at its
-    start."""
+    """Result of `_crossings` for one step, (4, ...); the memory is what it begins with."""
     arrays = np.broadcast_arrays(*motion.memory, motion.command, *nonlinear)
-    offset, velocity, *step = (np.ascontiguousarray(array).reshape(1, -1) for array in arrays)
-    return _crossings(offset[0], velocity[0], *step, motion.time_step).reshape(3, *arrays[0].shape)
+    flat = [np.ascontiguousarray(array).reshape(1, -1) for array in arrays]
+    start, step = [array[0] for array in flat[:3]], flat[3:]
+    return _crossings(*start, *step, motion.time_step).reshape(4, *arrays[0].shape)
 
 
 @njit(cache=True)
 def _crossings(
     offset: np.ndarray,
     velocity: np.ndarray,
+    impact: np.ndarray,
     command: np.ndarray,
     gap: np.ndarray,
     inertia: np.ndarray,
     time_step: float,
 ) -> np.ndarray:
-    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step, and
-    for which share of the step they were free, (3, N, C).
+    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step,
+    momentum of an impact that is still to reach the link then [Nm s], and the torque that they take
+    in the step [Nm], (4, N, C).
+
+    An impact lasts for a step from when the gap closes, so that all is smooth in the parameters.
 
     Args:
-        offset, velocity: at the start, (C,); the offset is within half the gap to either side.
+        offset, velocity, impact: at the start, (C,); the offset is within half the gap to either
+            side.
         command, gap, inertia: of each step, (N, C).
     """
-    result = np.empty((3, *command.shape))
+    result = np.empty((4, *command.shape))
     for j in range(command.shape[1]):
-        x, v = offset[j], velocity[j]
+        x, v, coming = offset[j], velocity[j], impact[j]
         for k in range(command.shape[0]):
-            v += time_step * command[k, j] / inertia[k, j]
+            torque, R = command[k, j], inertia[k, j]
+            before, taken, coming = v, -coming / time_step, 0.0
+            v += time_step * torque / R
             travel, side = time_step * v, 0.5 * gap[k, j]
             room = side - np.sign(travel) * x
-            share = 1.0
-            if abs(travel) >= room:
-                if travel != 0:
-                    share = room / abs(travel)
-                x, v = side * np.sign(travel), 0.0
-            else:
+            if abs(travel) < room:
                 x += travel
-            result[0, k, j], result[1, k, j], result[2, k, j] = x, v, share
+                taken += torque
+            elif travel != 0.0:
+                share = room / abs(travel)
+                momentum = R * before + share * time_step * torque
+                coming = share * momentum
+                taken += share * torque - (momentum - coming) / time_step
+                x, v = side * np.sign(travel), 0.0
+            result[0, k, j], result[1, k, j], result[2, k, j] = x, v, coming
+            result[3, k, j] = taken
     return result

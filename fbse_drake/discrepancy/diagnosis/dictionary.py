@@ -271,16 +271,21 @@ class Dictionary:
 
     def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
         """First grid of an effect's nonlinear values for each joint, (m, G, n)."""
-        searched = [p for p in effect.parameters.values() if not p.linear]
-        most = {0: 1, 1: 1000, 2: 5}.get(len(searched), 3)
-        axes = [np.geomspace(*p.plausible, min(most, p.grid)) for p in searched]
-        points = (
-            np.array(list(itertools.product(*axes))).T.reshape(len(searched), -1)
-            if searched
-            else np.zeros((0, 1))
-        )
-        factors = np.stack([self._factors(effect, joint) for joint in self.joints], axis=1)
-        return points[:, :, None] * factors[:, None]
+        return np.stack([self._points_on(effect, joint) for joint in self.joints], axis=2)
+
+    def _points_on(self, effect: type[JointTorqueEffect], joint: str) -> np.ndarray:
+        """The same of one joint, (m, G)."""
+        searched = [p for p in self.parameters(effect, joint).values() if not p.linear]
+        if not searched:
+            return np.zeros((0, 1))
+        most = {0: 1, 1: 1000, 2: 5}.get(sum(p.grid > 1 for p in searched), 3)
+        axes = [
+            np.geomspace(*p.plausible, min(most, p.grid))
+            if p.grid > 1
+            else np.sqrt(np.prod(p.plausible, keepdims=True))
+            for p in searched
+        ]
+        return np.array(list(itertools.product(*axes))).T
 
     def grid(self, effect: type[JointTorqueEffect]) -> Iterator[tuple[int, np.ndarray]]:
         """Columns of an effect's first grid, (B, p, G), row by row of all joints."""
@@ -315,8 +320,11 @@ class Dictionary:
         )
 
     def usual_at(self, effect: type[Effect], target: str) -> np.ndarray:
-        """Usual values of the nonlinear parameters in the units of a target, (m,)."""
-        return usual_values(effect) * self._factors(effect, target)
+        """Usual values of the nonlinear parameters in the units of a target, as far as they are
+        plausible there, (m,)."""
+        ranges = [p.plausible for p in self.parameters(effect, target).values() if not p.linear]
+        low, high = np.array(ranges).reshape(-1, 2).T
+        return np.clip(usual_values(effect) * self._factors(effect, target), low, high)
 
     def columns(
         self,

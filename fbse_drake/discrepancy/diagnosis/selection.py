@@ -25,6 +25,8 @@ MISFIT = 0.02
 _IMPLAUSIBLE = 3.0
 # Beyond that a law may take what its joint is given, if its relative deviation is less than this.
 _KNOWN = 0.1
+# Values that are held at the end of a range are off by this share of it.
+_ROUNDING = 1e-9
 # A law that levels off with speed shows that up to so many times the speed that its joint reaches.
 _REACH = 2.0
 # No more than so many standard deviations of what is believed of it beforehand, if anything is.
@@ -226,19 +228,10 @@ def _travel(fits: Fits, candidate: Candidate) -> np.ndarray:
 def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
     """Does a candidate bring more than chance to an explanation without it, with values that can
     be?"""
-    rows = added.signature.rows
     if base.deviance - wider.deviance < fits.required(added):
         return False
-    if fits.dictionary.per_step or follows_torque(added.effect):
-        exact = fits.explain(
-            [c for c in base.candidates if not c.nonlinear_names or _is_one_law_with(c, added)]
-        )
-        taken, gained = (
-            float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
-            for a, b in ((exact, base), (base, wider))
-        )
-        if gained < MISFIT * taken:
-            return False
+    if _may_be_misfit(fits, base, wider, added):
+        return False
     start = wider.start(added)
     names = added.linear_names if added.has_linear else added.nonlinear_names
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
@@ -271,9 +264,31 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
             if not (is_known and _is_carried(fits, wider, added)):
                 return False
         # What is not told from nothing may not be implausible as well.
-        if abs(value) > widest and least <= 0 <= most:
+        if abs(value) > (1 + _ROUNDING) * widest and least <= 0 <= most:
             return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
+
+
+def _may_be_misfit(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
+    """May a candidate explain what laws of fitted shapes are wrong by?"""
+    if not (fits.dictionary.per_step or follows_torque(added.effect)):
+        return False
+    rows = added.signature.rows
+    exact = fits.explain(
+        [c for c in base.candidates if not c.nonlinear_names or _is_one_law_with(c, added)]
+    )
+    taken, gained = (
+        float(np.maximum(a.sse[rows] - b.sse[rows], 0.0).sum())
+        for a, b in ((exact, base), (base, wider))
+    )
+    if gained >= MISFIT * taken:
+        return False
+    # Between two encoders shapes are what they are.
+    between = [row for row in rows if fits.white.residual.rows[row].kind == "transmission"]
+    before, after = (
+        fits.white.deviance_by_row(e.held_out_sse)[between].sum() for e in (base, wider)
+    )
+    return bool(before - after < fits.required(added))
 
 
 def _is_one_law_with(member: Candidate, added: Candidate) -> bool:
