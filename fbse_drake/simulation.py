@@ -395,6 +395,7 @@ def _law(scenario: Scenario, robot: Robot, ticks: Mapping[str, np.ndarray]) -> n
         time=np.arange(count)[:, None] * time_step,
         time_step=time_step,
         load=np.vstack([command[:1], command[: count - 1] - loss[1:count]]),
+        rotor_inertia=robot.rotor_inertias,
     )
     return law_over_time(effects, motion)
 

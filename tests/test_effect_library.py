@@ -198,6 +198,24 @@ def test_gap_is_crossed_with_the_rotor_s_acceleration():
     assert torque.sum() == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("attached", [0.0, 0.25])
+def test_what_the_link_does_not_get_the_rotor_has_or_gives_it_back(attached: float):
+    """Its momentum against the link and what is still to come is the impulse that was taken, also
+    of a link that is shaken."""
+    time, random = np.arange(3000)[:, None] * H, np.random.default_rng(2)
+    command = 6.0 * np.sin(20.0 * time) + 3.0 * np.sin(47.0 * time)
+    velocity = np.cumsum(0.02 * random.standard_normal(time.shape), axis=0)
+    motion = JointMotion(velocity, command=command, time_step=H, rotor_inertia=np.array([attached]))
+    nonlinear, inertia = np.array([[0.01], [0.25]]), 0.25
+    (taken,) = basis_over_time(Backlash, motion, nonlinear)
+    offset, rate, coming, *_ = Backlash.memory_over_time(motion, nonlinear[:, None])
+    impulse = np.cumsum(taken[:-1], axis=0) * H
+    np.testing.assert_allclose(impulse, (inertia * rate + coming)[1:], atol=1e-9)
+    assert np.abs(offset).max() == pytest.approx(0.005)
+    assert np.abs(impulse).max() > 0.05
+    assert np.mean(rate == 0.0) > 0.1
+
+
 def test_an_impact_moves_smoothly_with_the_gap():
     """A fit follows slopes: a little more gap is a little later, not a step later or not at all."""
     command = np.where(np.arange(200) < 50, 4.0, -4.0)[:, None]

@@ -56,6 +56,7 @@ if find_spec("mujoco") is not None:
         Nothing,
         Payload,
         Physics,
+        Play,
         Readings,
         Ripple,
         Spring,
@@ -391,6 +392,22 @@ def test_what_a_mass_leaves_of_impacts_is_no_limit_of_a_drive() -> None:
     diagnosis = diagnose(Predictor(scenario, log), [BodyMass, TorqueSaturation])
     assert [finding.effect for finding in diagnosis.chosen] == ["BodyMass"]
     assert diagnosis.verdict == "effect_found"
+
+
+@needs_mujoco
+def test_play_is_found_by_its_impacts() -> None:
+    """A hip that turns to and fro in a gap, with the encoder on the link: what the motor gathers in
+    the gap hits the leg."""
+    case = random_case(463)
+    assert isinstance(case.physics, Play)
+    scenario, reference = setting(case)
+    log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
+    names = ("Backlash", "TorqueDelay", "TorqueLag", "ReflectedInertia", "TransmissionElasticity")
+    diagnosis = diagnose(Predictor(scenario, log), [library()[name] for name in names])
+    (finding,) = diagnosis.chosen
+    assert (finding.effect, finding.targets) == ("Backlash", (case.physics.joint,))
+    low, high = finding.parameters["gap"].interval
+    assert low < case.physics.gap < high
 
 
 @needs_mujoco

@@ -42,11 +42,15 @@ class JointMotion(NamedTuple):
     memory: np.ndarray | tuple[()] = ()
     # Torque that passes the gear: the command less what was lost just before [Nm].
     load: np.ndarray | float = 0.0
+    # Reflected inertia of the rotor that the model has in the joint [kg m^2].
+    rotor_inertia: np.ndarray | float = 0.0
 
     def of_joints(self, joints: np.ndarray) -> "JointMotion":
-        """Of some joints, of a motion of several that was measured: (N, n) each, time (N, 1)."""
+        """Of some joints, of a motion of several that was measured: (N, n) each, time (N, 1),
+        rotor inertia (n,)."""
         names = ("velocity", "position", "command", "load")
-        return self._replace(**{name: getattr(self, name)[:, joints] for name in names})
+        own = {name: getattr(self, name)[:, joints] for name in names}
+        return self._replace(**own, rotor_inertia=np.asarray(self.rotor_inertia)[joints])
 
 
 class Rise(NamedTuple):
@@ -280,7 +284,7 @@ def basis_over_time(
     columns = [np.broadcast_to(getattr(motion, name), (samples, n)) for name in names]
     result: list[list[np.ndarray]] = []
     for velocity, position, command, time in zip(*columns, strict=True):
-        step = JointMotion(velocity, position, command, time, motion.time_step)
+        step = motion._replace(velocity=velocity, position=position, command=command, time=time)
         if memory is None:
             memory = effect.start(step, nonlinear)
         now = step._replace(memory=memory)

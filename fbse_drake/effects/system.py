@@ -214,6 +214,7 @@ class ExplicitTorque(LeafSystem):
         super().__init__()
         n, torque = len(robot.joint_names), law.torque
         self._law, self._time_step, self._joints = law, time_step, n
+        self._rotor_inertia = robot.rotor_inertias
         self._velocities = robot.plant.num_velocities()
         places = (robot.clamp_index, robot.velocity_index)
         self._solver = _Solver(torque.damping, torque.slope, torque.limit, *places)
@@ -332,7 +333,8 @@ class ExplicitTorque(LeafSystem):
         first, time = math.isnan(before[_VELOCITY, 0]), context.get_time()
         command = now[_COMMAND] = self._torque_command.Eval(context)
         load = command if first else before[_COMMAND] - self._torque_loss.Eval(context)
-        motion = JointMotion(expected, now[_POSITION], command, time, time_step, load=load)
+        known = (now[_POSITION], command, time, time_step)
+        motion = JointMotion(expected, *known, load=load, rotor_inertia=self._rotor_inertia)
         now[self._offsets] = self._law.torque.offset
         moving = {clamps.effect: clamps for clamps in self._law.moving}
         for k, effect, rows in self._others:

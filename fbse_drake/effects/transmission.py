@@ -166,9 +166,11 @@ class Backlash(JointTorqueEffect):
 
     u = rotor_inertia dv/dt, with v the rotor's velocity against the link
 
-    In the gap that is the command, for the link's own motion is left out. At the other side the
-    rotor stays (a plastic impact), and all of its momentum reaches the link within a step from when
-    the gap closes. An encoder on the motor's side shows where the rotor is in the gap.
+    In the gap that is the command, less what the model's own rotor in the joint takes to follow the
+    link (its inertia times the link's acceleration in the step before); of a model without one the
+    link's motion is left out. At the other side the rotor stays (a plastic impact), and all of its
+    momentum reaches the link within a step from when the gap closes. An encoder on the motor's side
+    shows where the rotor is in the gap.
     """
 
     description: ClassVar[str] = (
@@ -181,9 +183,17 @@ class Backlash(JointTorqueEffect):
     experiment: ClassVar[str] = "Swing each joint so that its torque changes sign often."
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "gap": Parameter("rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0, grid=25),
+        # When the gap closes shows in blocks: over some of it more of a gap changes nothing.
+        "gap": Parameter(
+            "rad", linear=False, plausible=(2e-4, 2e-2), neutral=0.0, grid=25, linear_within=0.1
+        ),
         "rotor_inertia": Parameter(
-            "kg m^2", linear=False, plausible=(0.02, 1.0), bounds=(1e-9, np.inf), grid=3
+            "kg m^2",
+            linear=False,
+            plausible=(0.02, 1.0),
+            bounds=(1e-9, np.inf),
+            grid=3,
+            linear_within=0.1,
         ),
     }
     has_memory: ClassVar[bool] = True
@@ -223,33 +233,41 @@ class Backlash(JointTorqueEffect):
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
         gap, _ = nonlinear
-        return np.stack([0.5 * gap * np.sign(motion.command), *np.zeros((2, *gap.shape))])
+        side = 0.5 * gap * np.sign(motion.command)
+        unmoved = np.zeros_like(side)
+        return np.stack([side, unmoved, unmoved, motion.velocity + unmoved, unmoved])
 
     @staticmethod
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        return _cross(motion, nonlinear)[:3]
+        return _cross(motion, nonlinear)[:5]
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        first = Backlash.start(motion._replace(command=motion.command[:1]), nonlinear)
+        at_start = motion._replace(command=motion.command[:1], velocity=motion.velocity[:1])
+        first = Backlash.start(at_start, nonlinear)
         # Time first, all else in one axis.
-        command, *values = np.broadcast_arrays(motion.command, *nonlinear)
+        command, *others = np.broadcast_arrays(*_of_steps(motion, nonlinear))
         steps = [
-            np.ascontiguousarray(np.moveaxis(array, -2, 0)).reshape(array.shape[-2], -1)
-            for array in (command, *values)
+            np.array(np.moveaxis(array, -2, 0), order="C").reshape(array.shape[-2], -1)
+            for array in (command, *others)
         ]
-        start = first.reshape(3, -1)
-        ends = _crossings(*start, *steps, motion.time_step)[:3, :-1]
-        ends = np.moveaxis(ends.reshape(3, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
+        start = first.reshape(5, -1)
+        ends = _crossings(*start, *steps, motion.time_step)[:5, :-1]
+        ends = np.moveaxis(ends.reshape(5, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
         return np.concatenate([first, ends], axis=-2)
 
 
+def _of_steps(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray | float, ...]:
+    """What `_crossings` takes of steps."""
+    return motion.command, motion.velocity, motion.rotor_inertia, *nonlinear
+
+
 def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-    """Result of `_crossings` for one step, (4, ...); the memory is what it begins with."""
-    arrays = np.broadcast_arrays(*motion.memory, motion.command, *nonlinear)
-    flat = [np.ascontiguousarray(array).reshape(1, -1) for array in arrays]
-    start, step = [array[0] for array in flat[:3]], flat[3:]
-    return _crossings(*start, *step, motion.time_step).reshape(4, *arrays[0].shape)
+    """Result of `_crossings` for one step, (6, ...); the memory is what it begins with."""
+    arrays = np.broadcast_arrays(*motion.memory, *_of_steps(motion, nonlinear))
+    flat = [np.array(array, order="C").reshape(1, -1) for array in arrays]
+    start, step = [array[0] for array in flat[:5]], flat[5:]
+    return _crossings(*start, *step, motion.time_step).reshape(6, *arrays[0].shape)
 
 
 @njit(cache=True)
@@ -257,40 +275,52 @@ def _crossings(
     offset: np.ndarray,
     velocity: np.ndarray,
     impact: np.ndarray,
+    link: np.ndarray,
+    acceleration: np.ndarray,
     command: np.ndarray,
+    link_velocity: np.ndarray,
+    attached: np.ndarray,
     gap: np.ndarray,
     inertia: np.ndarray,
     time_step: float,
 ) -> np.ndarray:
     """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step,
-    momentum of an impact that is still to reach the link then [Nm s], and the torque that they take
-    in the step [Nm], (4, N, C).
+    momentum of an impact that is still to reach the link then [Nm s], velocity [rad/s] and
+    acceleration [rad/s^2] of the link, and the torque that the rotors take in the step [Nm],
+    (6, N, C).
 
     An impact lasts for a step from when the gap closes, so that all is smooth in the parameters.
 
     Args:
-        offset, velocity, impact: at the start, (C,); the offset is within half the gap to either
-            side.
-        command, gap, inertia: of each step, (N, C).
+        offset, velocity, impact, link, acceleration: at the start, (C,); the offset is within half
+            the gap to either side.
+        command, link_velocity, attached, gap, inertia: of each step, (N, C): the command, the
+            link's velocity at the end, the inertia of the rotor that the model has, gap and inertia
+            of the one that crosses it.
     """
-    result = np.empty((4, *command.shape))
+    result = np.empty((6, *command.shape))
     for j in range(command.shape[1]):
-        x, v, coming = offset[j], velocity[j], impact[j]
+        x, v, coming, w, a = offset[j], velocity[j], impact[j], link[j], acceleration[j]
         for k in range(command.shape[0]):
-            torque, R = command[k, j], inertia[k, j]
+            R, is_hit = inertia[k, j], coming != 0.0 and attached[k, j] > 0.0
             before, taken, coming = v, -coming / time_step, 0.0
-            v += time_step * torque / R
+            drive = command[k, j] - attached[k, j] * a
+            v += time_step * drive / R
             travel, side = time_step * v, 0.5 * gap[k, j]
             room = side - np.sign(travel) * x
-            if abs(travel) < room:
+            if is_hit:
+                # What the impact adds to the link's velocity it does not add against the rotor.
+                v = 0.0
+            elif abs(travel) < room:
                 x += travel
-                taken += torque
+                taken += drive
             elif travel != 0.0:
                 share = room / abs(travel)
-                momentum = R * before + share * time_step * torque
+                momentum = R * before + share * time_step * drive
                 coming = share * momentum
-                taken += share * torque - (momentum - coming) / time_step
+                taken += share * drive - (momentum - coming) / time_step
                 x, v = side * np.sign(travel), 0.0
+            a, w = (link_velocity[k, j] - w) / time_step, link_velocity[k, j]
             result[0, k, j], result[1, k, j], result[2, k, j] = x, v, coming
-            result[3, k, j] = taken
+            result[3, k, j], result[4, k, j], result[5, k, j] = w, a, taken
     return result

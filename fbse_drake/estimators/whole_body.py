@@ -608,7 +608,7 @@ class WholeBodyFilter(RecursiveEstimator):
             weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
             weight=9.81 * robot.total_mass,
-            rotor_inertia=np.array([robot.rotor_inertia(joint) for joint in robot.joint_names]),
+            rotor_inertia=robot.rotor_inertias,
         )
         self._measurements = self._declare_record_input("measurements", measurements)
         self._model = self._declare_record_input("model_over_step", model_over_step)
@@ -688,7 +688,8 @@ class WholeBodyFilter(RecursiveEstimator):
         # What is no number, a status tells.
         command = np.nan_to_num(self._torque_command.Eval(context))
         start, load = np.nan_to_num(last["time"]), last["link_torque"]
-        return JointMotion(velocity, command=command, time=start, load=load)
+        rotors = self._known["rotor_inertia"]
+        return JointMotion(velocity, command=command, time=start, load=load, rotor_inertia=rotors)
 
     def _remembered_of_effects(self, context: Context) -> np.ndarray:
         """What effects in the joints remember at the end of the tick."""

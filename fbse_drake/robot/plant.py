@@ -187,6 +187,11 @@ class Robot:
         motors = _actuators(self.plant)
         return motors[joint].default_rotor_inertia() if joint in motors else 0.0
 
+    @cached_property
+    def rotor_inertias(self) -> np.ndarray:
+        """That of every joint, (n,) [kg m^2]."""
+        return np.array([self.rotor_inertia(joint) for joint in self.joint_names])
+
     def added_to(self, name: str) -> list[RigidBody]:
         """Bodies that carry the point masses of a body, in its frame."""
         bodies = [

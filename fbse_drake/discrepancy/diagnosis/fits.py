@@ -376,9 +376,10 @@ class Fits:
         # A weak belief in the plausible range keeps values that the data say nothing about from
         # running away.
         ranges = [np.log(parameters[name].plausible) for name in names]
+        near = [parameters[name].linear_within for name in names]
         belief = [
-            1.0 / (0.25 * (high - low) * value) ** 2
-            for (low, high), value in zip(ranges, nonlinear, strict=True)
+            1.0 / (min(0.25 * (high - low), within) * value) ** 2
+            for (low, high), within, value in zip(ranges, near, nonlinear, strict=True)
         ]
         # Nonlinear parameters do not fall far below their plausible range.
         lows = 0.5 * np.array([parameters[name].plausible[0] for name in names])

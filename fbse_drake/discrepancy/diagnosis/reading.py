@@ -115,6 +115,7 @@ class Reading:
             time=time[:, None],
             time_step=motion.period,
             load=at.torque_command - self._loss,
+            rotor_inertia=self.robot.rotor_inertias,
         )
 
     def _without_noise(self, torque: np.ndarray) -> np.ndarray:
