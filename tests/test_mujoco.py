@@ -53,6 +53,7 @@ if find_spec("mujoco") is not None:
         Misalignment,
         MotorBias,
         MotorGain,
+        MovedImu,
         Nothing,
         Payload,
         Physics,
@@ -392,6 +393,20 @@ def test_what_a_mass_leaves_of_impacts_is_no_limit_of_a_drive() -> None:
     diagnosis = diagnose(Predictor(scenario, log), [BodyMass, TorqueSaturation])
     assert [finding.effect for finding in diagnosis.chosen] == ["BodyMass"]
     assert diagnosis.verdict == "effect_found"
+
+
+@needs_mujoco
+def test_noise_of_an_angular_acceleration_moves_no_imu() -> None:
+    """It is in what a moved IMU would read as well as in what is left: a place nearer to the joints
+    seems to explain some of it. Where the IMU has moved, it is found."""
+    decoy = random_case(617)
+    assert isinstance(decoy.physics, Nothing)
+    moved = replace(decoy, physics=MovedImu((-0.03, 0.04, -0.02)))
+    for case, expected in ((decoy, []), (moved, ["ImuPosition"])):
+        scenario, reference = setting(case)
+        log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
+        diagnosis = diagnose(Predictor(scenario, log), [ImuPosition, BodyMass])
+        assert [f.effect for f in diagnosis.chosen] == expected
 
 
 @needs_mujoco

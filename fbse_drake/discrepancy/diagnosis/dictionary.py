@@ -21,6 +21,7 @@ from fbse_drake.discrepancy.residual.evidence import travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.effects.geometry import GeometryEffect
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, basis_over_time
 from fbse_drake.effects.sensor import SensorEffect
@@ -221,7 +222,7 @@ class Dictionary:
         )
         noise = None
         is_noisy = follows_torque(effect) and self._is_torque_noisy
-        if len(raw.rows) and (issubclass(effect, InertiaEffect) or is_noisy):
+        if len(raw.rows) and (issubclass(effect, InertiaEffect | GeometryEffect) or is_noisy):
             noise = self.predictor.noise_in(effect, target, nonlinear, raw)
         return FixedColumns(target, nonlinear, raw, noise)
 

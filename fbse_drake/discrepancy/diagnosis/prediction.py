@@ -442,33 +442,40 @@ class Predictor:
     def _residual_at_blocks(self) -> np.ndarray:
         return self.motion.equation.residual(self._smooth_blocks)
 
-    @cached_property
-    def _blocks_but_for_noise(self) -> Instants:
+    def _but_for_noise(self, blocks: Instants) -> Instants:
         """Averages with accelerations from which only noise is taken: of what smoothing takes off,
         the share is left that noise does not explain, by joint and axis (N. Wiener,
         "Extrapolation, Interpolation, and Smoothing of Stationary Time Series", 1949).
 
         Smoothing would make an impact smaller, and a place larger that is told by impacts.
         """
-        motion, sensors = self.motion, self.motion.sensors
+        smoothed, motion, sensors = self._smoothed(blocks), self.motion, self.motion.sensors
         noise = {
             "joint_acceleration": joint_velocity_noise(sensors),
             "angular_acceleration": sensors.imu.angular_velocity_noise,
         }
         result = {}
         for name, deviation in noise.items():
-            smooth = getattr(self._smooth_blocks, name)
-            rough = getattr(motion.blocks, name) - smooth
+            smooth = getattr(smoothed, name)
+            rough = getattr(blocks, name) - smooth
             # Velocities at both ends of three blocks count 1, -3, 3 and -1 quarters.
             noisy = 1.25 * (deviation / (motion.length * motion.period)) ** 2
             power = np.maximum(np.mean(rough**2, axis=0), noisy)
             share = np.divide(noisy, power, out=np.zeros_like(power), where=power > 0)
             result[name] = smooth + rough * (1.0 - share)
-        return replace(motion.blocks, **result)
+        return replace(blocks, **result)
 
     @cached_property
-    def _residual_but_for_noise(self) -> np.ndarray:
-        return self.motion.equation.residual(self._blocks_but_for_noise)
+    def _with_little_noise(self) -> tuple[Instants, np.ndarray]:
+        """Averages but for noise, and their residual."""
+        blocks = self._but_for_noise(self.motion.blocks)
+        return blocks, self.motion.equation.residual(blocks)
+
+    @cached_property
+    def _with_little_more_noise(self) -> tuple[Instants, np.ndarray]:
+        """The same if the sensors' noise were in the signals once more."""
+        blocks = self._but_for_noise(self._noisier_blocks)
+        return blocks, self.motion.equation.residual(blocks)
 
     @cached_property
     def _noisier_signals(self) -> SensorSignals:
@@ -521,8 +528,7 @@ class Predictor:
         nonlinear: np.ndarray,
         clean: Signature,
     ) -> Signature:
-        """What that noise adds to the signature of an inertia effect, or of one in a sensor:
-        regressors are measured too."""
+        """What that noise adds to the signature of an effect: regressors are measured too."""
         point = self._expansion_point(effect, target)
         if point is not None:
             values, _ = self._slopes(effect, target, point, nonlinear, noisier=True)
@@ -620,8 +626,8 @@ class Predictor:
         *,
         noisier: bool = False,
     ) -> np.ndarray:
-        """What one of these effects with these values adds to the residual, (B, R); one of inertia,
-        or in a sensor, also if the sensors' noise were in its regressors once more."""
+        """What one of these effects with these values adds to the residual, (B, R), also if the
+        sensors' noise were in its regressors once more."""
         names = [name for name, parameter in effect.parameters.items() if parameter.linear]
         fixed = [name for name in effect.parameters if name not in names]
         values = {
@@ -638,8 +644,8 @@ class Predictor:
             here = self._believed_slope
             return self._on_slope(here + linear) - self._on_slope(here)
         if issubclass(effect, GeometryEffect):
-            blocks = self._blocks_but_for_noise
-            return self._residual_but_for_noise - self._with(changed).residual(blocks)
+            blocks, before = self._with_little_more_noise if noisier else self._with_little_noise
+            return before - self._with(changed).residual(blocks)
         # By taking the effect off the signals.
         motion, resolved = self.motion, changed.resolve(self.robot.description)
         if noisier:
