@@ -111,6 +111,24 @@ def test_fits_by_inner_products_are_those_of_plain_least_squares(noise: float) -
     np.testing.assert_allclose(fit.held_out_sse, held_out, rtol=1e-6)
 
 
+def test_what_keeps_a_fit_near_makes_nobody_surer() -> None:
+    """Of two columns that are nearly one the data tell the sum. A step that is kept small says
+    nothing of the difference; a belief does."""
+    rng = np.random.default_rng(8)
+    one = rng.normal(size=(400, 1, 1))
+    columns = np.concatenate([one, one + 1e-4 * rng.normal(size=one.shape)], axis=2)
+    white = white_of(0.1 * rng.normal(size=(400, 1)) + 2.0 * one[:, :, 0])
+    weak, strong = np.full(2, 1.0), np.full(2, 1e4)
+    free, kept, sure = (
+        Regression(white).fit([Signature(np.array([0]), columns, prior=prior, steadying=steadying)])
+        for prior, steadying in ((weak, 0 * weak), (weak, strong), (strong, 0 * weak))
+    )
+    assert np.abs(kept.parameters).max() < 0.2
+    assert free.parameters.sum() == pytest.approx(2.0, abs=0.02)
+    np.testing.assert_allclose(kept.deviation, free.deviation, rtol=0.5)
+    assert np.all(sure.deviation < 0.1 * free.deviation)
+
+
 @pytest.mark.parametrize(("tied", "across"), [(False, False), (True, True), (False, True)])
 def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool, across: bool) -> None:
     """Also beside columns that are in several rows: in one of them alone they would take all."""

@@ -376,11 +376,12 @@ class Fits:
         # A weak belief in the plausible range keeps values that the data say nothing about from
         # running away.
         ranges = [np.log(parameters[name].plausible) for name in names]
-        near = [parameters[name].linear_within for name in names]
         belief = [
-            1.0 / (min(0.25 * (high - low), within) * value) ** 2
-            for (low, high), within, value in zip(ranges, near, nonlinear, strict=True)
+            1.0 / (0.25 * (high - low) * value) ** 2
+            for (low, high), value in zip(ranges, nonlinear, strict=True)
         ]
+        near = np.array([parameters[name].linear_within for name in names])
+        steadying = np.append(np.zeros(len(smallest)), (near * nonlinear) ** -2.0)
         # Nonlinear parameters do not fall far below their plausible range.
         lows = 0.5 * np.array([parameters[name].plausible[0] for name in names])
         lowest = smallest.tolist()
@@ -390,9 +391,9 @@ class Fits:
         def signature(columns: np.ndarray) -> Signature:
             values = linearised(columns)
             if len(smallest):
-                return Signature(places, values, prior=prior, lowest=np.array(lowest))
+                return Signature(places, values, 0.0, prior, steadying, np.array(lowest))
             offset = values[:, :, 0]
-            return Signature(places, values[:, :, 1:], offset, prior=prior, lowest=np.array(lowest))
+            return Signature(places, values[:, :, 1:], offset, prior, steadying, np.array(lowest))
 
         # A candidate must not hold the fits that hold it.
         dictionary = self.dictionary

@@ -405,6 +405,7 @@ def _with_amount(member: Candidate) -> Candidate | None:
             law,
             values=np.concatenate([law.values, np.asarray(law.offset)[..., None]], axis=2),
             prior=np.append(law.prior, 0.0),
+            steadying=np.append(law.steadying, 0.0),
             lowest=np.append(law.lowest, -np.inf),
         )
 

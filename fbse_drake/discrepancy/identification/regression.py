@@ -49,6 +49,9 @@ class Signature:
     # What is believed of the parameters beforehand: that they are 0, with this inverse variance,
     # shape (p,) or 0.
     prior: np.ndarray | float = 0.0
+    # The same of what is not believed, but keeps them where the columns hold: it moves a fit, and
+    # makes nobody surer.
+    steadying: np.ndarray | float = 0.0
     # Smallest value that each parameter can have, shape (p,) or -inf.
     lowest: np.ndarray | float = -np.inf
 
@@ -479,16 +482,16 @@ class Regression:
             [np.arange(self.target(s).shape[2]) < s.values.shape[2] for s in signatures]
         )
         amounts = np.where(fitted, 0.0, 1.0)
-        prior, lowest = (
+        prior, steadying, lowest = (
             np.concatenate(
                 [np.broadcast_to(getattr(s, name), s.values.shape[2]) for s in signatures]
             )
-            for name in ("prior", "lowest")
+            for name in ("prior", "steadying", "lowest")
         )
         # Units must not decide what counts as singular.
         norm = np.sqrt(np.einsum("rqq->q", together.whole[0]))[fitted]
         norm[norm == 0] = 1.0
-        held = np.diag(prior / norm**2)
+        held = np.diag((prior + steadying) / norm**2)
 
         def weighted(fold: int | None) -> tuple[np.ndarray, np.ndarray]:
             gram, target = together.of(fold)
@@ -523,7 +526,7 @@ class Regression:
             white,
             signatures,
             rows,
-            gram * np.outer(norm, norm),
+            gram * np.outer(norm, norm) - np.diag(steadying),
             scale,
             parameters,
             sse,
