@@ -371,6 +371,8 @@ def test_far_more_than_noise_is_not_acquitted_for_telling_nothing(
     is_noisy = verdict == "not_visible"
     assert diagnosis.noisy == ((PENDULUM.joints[0],) if is_noisy else ())
     assert ("follows nothing that was measured" in diagnosis_outcome(diagnosis)) == is_noisy
+    expected = "not_visible" if is_noisy else "absent"
+    assert {status.verdict for status in diagnosis.effects.values()} == {expected}
 
 
 def test_what_follows_the_angle_is_no_drift_in_time(pendulum: Course) -> None:

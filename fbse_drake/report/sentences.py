@@ -429,10 +429,11 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[St
                     "scenario (recording.torque_noise), and play is felt when the machine is off."
                 )
             )
-        hidden = {
-            name: status for name, status in statuses.items() if status.verdict == "not_visible"
-        }
-        steps += _experiments("Record a motion that shows more:", hidden)
+        else:
+            hidden = {
+                name: status for name, status in statuses.items() if status.verdict == "not_visible"
+            }
+            steps += _experiments("Record a motion that shows more:", hidden)
     return steps
 
 
@@ -527,7 +528,7 @@ def what_else(found: Sequence[Finding], *, partial: bool) -> str:
         return " ".join(told)
     if not found:
         return (
-            "Nothing else in the library: an effect smaller than the sizes "
+            "No effect of the library is seen in this log; one that is smaller than the sizes "
             "below would not have shown."
         )
     return "No other effect of the library explains this log as well."

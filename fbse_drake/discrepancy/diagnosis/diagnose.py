@@ -114,6 +114,14 @@ class EffectStatus:
             for target, size in self.smallest_detectable.items()
         }
 
+    def hidden_in(self, rows: Sequence[str]) -> "EffectStatus":
+        """The same, where what is left in some rows is no noise that is known: there an effect may
+        hide, however large it is."""
+        if self.verdict != "absent" or not self.smallest_detectable.keys() & set(rows):
+            return self
+        sizes = {t: np.inf if t in rows else s for t, s in self.smallest_detectable.items()}
+        return replace(self, verdict="not_visible", smallest_detectable=sizes)
+
     @property
     def command(self) -> str | None:
         """The command that makes that experiment, in simulation."""
@@ -245,7 +253,8 @@ def diagnose(
                 experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
-                statuses[effect.__name__] = _status(fits, final, effect, equal, experiments)
+                status = _status(fits, final, effect, equal, experiments)
+                statuses[effect.__name__] = status.hidden_in(search.noisy)
     except Interrupted as stop:
         partial = str(stop)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
