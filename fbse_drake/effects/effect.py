@@ -87,7 +87,7 @@ class Parameter:
     bounds: tuple[float, float] = (0.0, np.inf)
     # For a nonlinear one: at how many points of its plausible range a search for it starts.
     grid: int = 9
-    # Share of a nonlinear parameter's value within which slopes over it hold.
+    # For a nonlinear one: share of its value within which slopes over it hold.
     linear_within: float = np.inf
     # For a nonlinear one: the value with which there is no effect; targets that are not named get
     # it.

@@ -217,7 +217,7 @@ class Backlash(JointTorqueEffect):
     def basis(
         motion: JointMotion, nonlinear: np.ndarray
     ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
-        *_, taken = _cross(motion, nonlinear)
+        _, taken = _cross(motion, nonlinear)
         return (taken,), (0.0,)
 
     @classmethod
@@ -239,7 +239,8 @@ class Backlash(JointTorqueEffect):
 
     @staticmethod
     def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        return _cross(motion, nonlinear)[:5]
+        memory, _ = _cross(motion, nonlinear)
+        return memory
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
@@ -251,9 +252,10 @@ class Backlash(JointTorqueEffect):
             np.array(np.moveaxis(array, -2, 0), order="C").reshape(array.shape[-2], -1)
             for array in (command, *others)
         ]
-        start = first.reshape(5, -1)
-        ends = _crossings(*start, *steps, motion.time_step)[:5, :-1]
-        ends = np.moveaxis(ends.reshape(5, -1, *command.shape[:-2], command.shape[-1]), 1, -2)
+        rows = len(first)
+        memory, _ = _crossings(first.reshape(rows, -1), *steps, motion.time_step)
+        of_joints = (*command.shape[:-2], command.shape[-1])
+        ends = np.moveaxis(memory[:, :-1].reshape(rows, -1, *of_joints), 1, -2)
         return np.concatenate([first, ends], axis=-2)
 
 
@@ -262,45 +264,44 @@ def _of_steps(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray | 
     return motion.command, motion.velocity, motion.rotor_inertia, *nonlinear
 
 
-def _cross(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-    """Result of `_crossings` for one step, (6, ...); the memory is what it begins with."""
+def _cross(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Result of `_crossings` for one step, (rows, ...) and (...); the memory is what it begins
+    with."""
     arrays = np.broadcast_arrays(*motion.memory, *_of_steps(motion, nonlinear))
+    rows, shape = len(motion.memory), arrays[0].shape
     flat = [np.array(array, order="C").reshape(1, -1) for array in arrays]
-    start, step = [array[0] for array in flat[:5]], flat[5:]
-    return _crossings(*start, *step, motion.time_step).reshape(6, *arrays[0].shape)
+    memory, taken = _crossings(np.concatenate(flat[:rows]), *flat[rows:], motion.time_step)
+    return memory.reshape(rows, *shape), taken.reshape(shape)
 
 
 @njit(cache=True)
 def _crossings(
-    offset: np.ndarray,
-    velocity: np.ndarray,
-    impact: np.ndarray,
-    link: np.ndarray,
-    acceleration: np.ndarray,
+    start: np.ndarray,
     command: np.ndarray,
     link_velocity: np.ndarray,
     attached: np.ndarray,
     gap: np.ndarray,
     inertia: np.ndarray,
     time_step: float,
-) -> np.ndarray:
-    """Offset [rad] and velocity [rad/s] of rotors against their links at the end of each step,
-    momentum of an impact that is still to reach the link then [Nm s], velocity [rad/s] and
-    acceleration [rad/s^2] of the link, and the torque that the rotors take in the step [Nm],
-    (6, N, C).
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is remembered at the end of each step, (5, N, C), and the torque that rotors take in it
+    [Nm], (N, C).
+
+    Remembered are offset [rad] and velocity [rad/s] of a rotor against its link, the offset within
+    half the gap to either side; the momentum of an impact that is still to reach the link [Nm s];
+    and velocity [rad/s] and acceleration [rad/s^2] of the link.
 
     An impact lasts for a step from when the gap closes, so that all is smooth in the parameters.
 
     Args:
-        offset, velocity, impact, link, acceleration: at the start, (C,); the offset is within half
-            the gap to either side.
+        start: what is remembered at the start, (5, C).
         command, link_velocity, attached, gap, inertia: of each step, (N, C): the command, the
             link's velocity at the end, the inertia of the rotor that the model has, gap and inertia
             of the one that crosses it.
     """
-    result = np.empty((6, *command.shape))
+    memory, torque = np.empty((len(start), *command.shape)), np.empty(command.shape)
     for j in range(command.shape[1]):
-        x, v, coming, w, a = offset[j], velocity[j], impact[j], link[j], acceleration[j]
+        x, v, coming, w, a = start[:, j]
         for k in range(command.shape[0]):
             R, is_hit = inertia[k, j], coming != 0.0 and attached[k, j] > 0.0
             before, taken, coming = v, -coming / time_step, 0.0
@@ -321,6 +322,7 @@ def _crossings(
                 taken += share * drive - (momentum - coming) / time_step
                 x, v = side * np.sign(travel), 0.0
             a, w = (link_velocity[k, j] - w) / time_step, link_velocity[k, j]
-            result[0, k, j], result[1, k, j], result[2, k, j] = x, v, coming
-            result[3, k, j], result[4, k, j], result[5, k, j] = w, a, taken
-    return result
+            for row, value in enumerate((x, v, coming, w, a)):
+                memory[row, k, j] = value
+            torque[k, j] = taken
+    return memory, torque

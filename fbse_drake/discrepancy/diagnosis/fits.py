@@ -211,7 +211,7 @@ class Fits:
     @cached_property
     def _tests(self) -> int:
         """How many additions a search tries."""
-        tests = len(self.fixed_candidates)
+        tests = sum(map(len, self.dictionary.fixed.values()))
         for effect in self.dictionary.joint_effects:
             sets = self.dictionary.points(effect).shape[1]
             tests += len(self.dictionary.groups_of(effect)) * max(1, sets // 4)

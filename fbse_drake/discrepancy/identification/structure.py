@@ -106,18 +106,8 @@ def untested_rows(
         white, left: see `leftover_structure`.
         structures: what that found.
     """
-    if motion.robot.has_floating_base:
-        left = _without_impacts(left, white.residual.known)
-    usual = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    told = {structure.index for structure in structures}
-    return tuple(
-        row.name
-        for k, row in enumerate(white.residual.rows)
-        if row.kind != "kinematic"
-        and k not in told
-        and 0 < white.count[k] < _TELLING
-        and usual[k] > _tolerated(white, k)
-    )
+    louder = _louder_than_tolerated(motion, white, left, structures)
+    return tuple(white.residual.rows[k].name for k in louder if white.count[k] < _TELLING)
 
 
 def noisy_rows(
@@ -135,18 +125,29 @@ def noisy_rows(
         white, left: see `leftover_structure`.
         structures: what that found.
     """
+    louder = _louder_than_tolerated(motion, white, left, structures)
+    return [k for k, times in louder.items() if times > _LOUD and white.count[k] >= _FEWEST]
+
+
+def _louder_than_tolerated(
+    motion: RecordedMotion,
+    white: WhitenedResidual,
+    left: np.ndarray,
+    structures: Sequence[Structure],
+) -> dict[int, float]:
+    """By place of a row in which no structure was found, soles left out: how many times what is
+    tolerated is left there, but for feet's impacts, where that is more than once."""
     if motion.robot.has_floating_base:
         left = _without_impacts(left, white.residual.known)
-    usual = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
     told = {structure.index for structure in structures}
-    return [
-        k
-        for k, row in enumerate(white.residual.rows)
-        if row.kind != "kinematic"
-        and k not in told
-        and white.count[k] >= _FEWEST
-        and usual[k] > _LOUD * _tolerated(white, k)
-    ]
+    result = {}
+    for k, row in enumerate(white.residual.rows):
+        if row.kind == "kinematic" or k in told or not white.count[k]:
+            continue
+        times = np.sqrt((left[:, k] ** 2).sum() / white.count[k]) / _tolerated(white, k)
+        if times > 1.0:
+            result[k] = float(times)
+    return result
 
 
 def _tolerated(white: WhitenedResidual, row: int) -> float:
