@@ -23,7 +23,12 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import beside_model, converged, polished
-from fbse_drake.discrepancy.diagnosis.selection import MISFIT, is_shown, is_significant
+from fbse_drake.discrepancy.diagnosis.selection import (
+    MISFIT,
+    best_additions,
+    is_shown,
+    is_significant,
+)
 from fbse_drake.discrepancy.diagnosis.spread import recordings
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.effects.effect import Effect
@@ -46,6 +51,8 @@ _LEAST_OF_REST = 0.1
 _WORSE = 0.01
 # What a smaller law is without is a small part of what it has, if it is no more than this share.
 _SMALL_PART = 0.1
+# So many effects are tried beside the smaller laws that a larger one consists of.
+_ADDITIONS = 3
 # Share of the noise's power below which what is left is no noise but rounding: of exact sensors, or
 # of two that round alike.
 _ROUNDING = 1e-3
@@ -502,7 +509,9 @@ def _simpler(
     *,
     if_needless: bool = False,
 ) -> Iterator[Explanation]:
-    """With the simplest laws in the place of a member that contains them and is no better.
+    """With the simplest laws in the place of a member that contains them and is no better; or with
+    these and another effect, which explain more together with no more parameters, where nothing
+    shows what only the member has.
 
     Args:
         if_needless: only where it brings less than its parameters cost.
@@ -524,6 +533,22 @@ def _simpler(
         # What takes its place has to stay.
         if is_smaller and judge.all_pay(smaller, reduction.effects, member.targets):
             yield smaller
+        elif _may_be_without(explanation, member, reduction):
+            yield from _with_another(proposals, explanation, smaller, member)
+
+
+def _with_another(
+    proposals: Proposals, explanation: Explanation, smaller: Explanation, member: Candidate
+) -> Iterator[Explanation]:
+    """With one more effect beside the laws that were put into a member's place, where the two
+    explain more than the member with no more parameters."""
+    most = len(explanation.solved.parameters)
+    wider = best_additions(proposals, smaller, member.signature.rows, smaller.deviance)
+    # The laws are where they fit without it.
+    for found in [e for e in wider if len(e.solved.parameters) <= most][:_ADDITIONS]:
+        better = converged(proposals.fits, found)
+        if better.deviance < explanation.deviance:
+            yield better
 
 
 def _may_be_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:
