@@ -40,6 +40,7 @@ from fbse_drake.discrepancy.identification.structure import (
     noisy_rows,
     untested_rows,
 )
+from fbse_drake.discrepancy.residual.noise import Noise, likeliest_noise
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -232,6 +233,9 @@ def diagnose(
     if disturbed:
         predictor = predictor.without([(one.start, one.end) for one in disturbed])
         search = _searched(Dictionary(predictor, tried, progress), tried)
+    if search.more_noise is not None:
+        predictor = predictor.noisier(search.more_noise)
+        search = _searched(Dictionary(predictor, tried, progress), tried)
     proposals, path, alternatives = search.proposals, search.path, search.alternatives
     before, inertia, unexplained = search.before, search.inertia, search.unexplained
     partial, final, fits = search.partial, path[-1], proposals.fits
@@ -308,6 +312,8 @@ class _Search:
     untested: tuple[str, ...]
     # Rows in which what is left is far more than noise, and follows nothing.
     noisy: tuple[str, ...]
+    # That nobody believed in, by what is left; None where there is none.
+    more_noise: Noise | None
     partial: str | None
 
 
@@ -352,8 +358,20 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         disturbed,
         untested_rows(predictor.motion, remaining, left, structures),
         tuple(remaining.residual.rows[row].name for row in noisy if matters(row)),
+        _more_noise(predictor, remaining, left, [s.index for s in unexplained]),
         partial,
     )
+
+
+def _more_noise(
+    predictor: Predictor, remaining: WhitenedResidual, left: np.ndarray, rows: Sequence[int]
+) -> Noise | None:
+    """White noise of sampled torques that shows only in what is left, whitened, (B, R); None if
+    these rows have none."""
+    if predictor.scenario.recording.rows != "instantaneous" or not rows:
+        return None
+    residual = replace(remaining.residual, value=remaining.coloured(left))
+    return likeliest_noise(residual, predictor.motion.length, rows)
 
 
 def _with_trust(

@@ -73,6 +73,7 @@ class Predictor:
         noise: Noise | None = None,
         left_out: Sequence[tuple[float, float]] = (),
         reading: Reading | None = None,
+        more_noise: Noise | None = None,
     ):
         """Reads the log.
 
@@ -81,6 +82,7 @@ class Predictor:
             left_out: start and end [s] of stretches of which nothing is said.
             reading: of this log without these stretches; read again if it does not serve the
                 scenario.
+            more_noise: of the rows, beyond that.
 
         Raises:
             InputError: a log that does not fit the model.
@@ -93,7 +95,7 @@ class Predictor:
             effect.resolve(self.robot.description, key=f"model.effects.{key}")
             for key, effect in scenario.believed.effects.items()
         ]
-        self._given_noise = noise
+        self._given_noise, self._more_noise = noise, more_noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
         self._regressors: dict[tuple[str, bool], np.ndarray] = {}
         self._motions_of_joint: dict[tuple[int, int, bool], JointMotion] = {}
@@ -103,7 +105,11 @@ class Predictor:
         noise is measured anew."""
         if scenario == self.scenario and self._given_noise is None:
             return self
-        return Predictor(scenario, self.log, None, self.left_out, self.reading)
+        return Predictor(scenario, self.log, None, self.left_out, self.reading, self._more_noise)
+
+    def noisier(self, more: Noise) -> "Predictor":
+        """The same with noise beyond what was measured of it."""
+        return Predictor(self.scenario, self.log, self.noise, self.left_out, self.reading, more)
 
     def is_like(self, other: "Predictor") -> bool:
         """Does another one predict the same?"""
@@ -111,19 +117,24 @@ class Predictor:
             self.log is other.log
             and self.scenario == other.scenario
             and self.left_out == other.left_out
-            and self._given_noise == other._given_noise
+            and self._given_noise is other._given_noise
+            and self._more_noise is other._more_noise
         )
 
     def without(self, stretches: Sequence[tuple[float, float]]) -> "Predictor":
         """The same without some stretches [s] of the log."""
         left_out = (*self.left_out, *stretches)
-        return Predictor(self.scenario, self.log, self._given_noise, left_out)
+        return Predictor(
+            self.scenario, self.log, self._given_noise, left_out, more_noise=self._more_noise
+        )
 
     def trusting_inertia(self) -> "Predictor":
         """The same where the inertia of all bodies is trusted."""
         identify = replace(self.scenario.identify, inertia=[])
         scenario = replace(self.scenario, identify=identify)
-        return Predictor(scenario, self.log, self._given_noise, self.left_out, self.reading)
+        return Predictor(
+            scenario, self.log, self._given_noise, self.left_out, self.reading, self._more_noise
+        )
 
     def believed_amount(self, effect: type[JointTorqueEffect], name: str, joint: str) -> float:
         """How much of a linear parameter of an effect the model's effects have in a joint, see
@@ -143,15 +154,21 @@ class Predictor:
     def residual(self) -> Residual:
         """What the model, with its effects, leaves over; with the noise that the log shows where
         that is more than is believed."""
-        residual = self._believed_residual
-        return replace(residual, variance=residual.variance + self.noise.white / self.motion.length)
+        residual, noise = self._believed_residual, self.noise
+        return replace(
+            residual,
+            variance=noise.sensors * residual.variance + noise.white / self.motion.length,
+            covariance=noise.sensors * residual.covariance,
+        )
 
     @cached_property
     def noise(self) -> Noise:
         """Of the rows, beyond what is believed."""
-        if self._given_noise is not None:
-            return self._given_noise
-        return measured_noise(self.motion, self._believed_residual, self.reading.noisier_channels)
+        noise = self._given_noise
+        if noise is None:
+            channels = self.reading.noisier_channels
+            noise = measured_noise(self.motion, self._believed_residual, channels)
+        return noise if self._more_noise is None else noise.with_more(self._more_noise)
 
     @cached_property
     def _believed_residual(self) -> Residual:

@@ -152,6 +152,17 @@ class WhitenedResidual:
         _divide_by_bidiagonal(result, flat, index, diagonal, below)
         return result.reshape(values.shape)
 
+    def coloured(self, values: np.ndarray) -> np.ndarray:
+        """What gives these values (B, R) when it is whitened; 0 where a row is not known."""
+        result = np.zeros(values.shape)
+        for row, (index, (diagonal, below)) in enumerate(
+            zip(self._index, self._factor, strict=True)
+        ):
+            known = values[index, row]
+            result[index, row] = diagonal * known
+            result[index[1:], row] += below[:-1] * known[:-1]
+        return result
+
     def whiten_back(self, row: int, values: np.ndarray) -> np.ndarray:
         """The transpose of `whiten`: inner products of what is whitened with values (B, ...) are
         those of what is not with this."""

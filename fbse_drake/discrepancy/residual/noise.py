@@ -1,15 +1,23 @@
 """How noisy the rows of a residual are: white noise shows in differences of neighbours, of which
 what is missing in a model has next to nothing."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import toeplitz
+from scipy.linalg import cholesky_banded, solve_banded, toeplitz
+from scipy.optimize import minimize
 from scipy.special import comb
-from scipy.stats import chi2
+from scipy.stats import chi2, kstwobign
 
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
-from fbse_drake.discrepancy.residual.residual import RecordedMotion, Residual, rms
+from fbse_drake.discrepancy.residual.residual import (
+    RecordedMotion,
+    Residual,
+    block_means,
+    differences_angles,
+    rms,
+)
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.motor_encoders import MotorEncoderConfig
@@ -25,8 +33,14 @@ _ORDERS, _WHITE = (3, 6), 1.1
 # Smallest factor of a row's noise that is worth a word, and probability of saying so of any by
 # chance.
 _LEAST, _FALSE_ALARM = 1.15, 1e-3
+# Averages over so many blocks show noise, and how many deviations more it may be at each.
+_SCALES, _SURE = (1, 2, 4, 8), 2.0
 # The same of a channel, in which motion that is as fast as noise may be most of the excess.
 _LEAST_OF_CHANNEL = 1.3
+# White noise beside that of the sensors, as a share of its variance: none, and a guess.
+_NO_SHARE, _SHARE = 1e-9, 1e-2
+# Logarithm of more noise than there is in any log, in place of what is believed.
+_MOST = 30.0
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 # Share of the torque below which noise that nobody believes in is not worth a word.
@@ -39,11 +53,22 @@ class Noise:
 
     # Channels of sensors that are noisier.
     channels: tuple[NoiseLevel, ...]
-    # Variance of a step's white noise to be added in each of R rows to that of the sensors, (R,).
+    # Variance of a step's white noise to be added in each of R rows to that of the sensors, (R,),
+    # and by what that is larger than believed, (R,).
     white: np.ndarray
+    sensors: np.ndarray
     # What averages over blocks differ from their neighbours, over what is believed; 1 where that
     # may be right, (R,).
     factor: np.ndarray
+
+    def with_more(self, other: "Noise") -> "Noise":
+        """With what is more than this."""
+        return Noise(
+            self.channels,
+            self.white * other.sensors + other.white,
+            self.sensors * other.sensors,
+            self.factor * other.factor,
+        )
 
 
 @dataclass(frozen=True)
@@ -98,6 +123,7 @@ def measured_sensors(
     """Sensors with the noise that their channels have where it is more than is believed, and these
     channels. Torques are left out: they answer the noise of sensors, and are none for that."""
     encoders, imu, feet = sensors.encoders, sensors.imu, sensors.foot_force
+    differenced = differences_angles(recording, log)
     usual = ("joint/velocity", "imu/linear_acceleration", "imu/angular_velocity")
     believed = dict(
         zip(
@@ -109,14 +135,13 @@ def measured_sensors(
     for name in log.channels:
         if name.startswith("foot/") and name.endswith(("/pad_force", "/wrench")):
             believed[name] = feet.noise
-    if encoders.velocity != "exact" or recording.velocity != "measured":
+    if encoders.velocity != "exact" or differenced:
         del believed["joint/velocity"]
     second = sensors.motor_encoders or MotorEncoderConfig(encoders.resolution, encoders.noise)
     if "joint/motor_position" in log:
-        believed |= {
-            "joint/position": encoders.angle_noise,
-            "joint/motor_position": second.angle_noise,
-        }
+        believed["joint/motor_position"] = second.angle_noise
+    if "joint/motor_position" in log or differenced:
+        believed["joint/position"] = encoders.angle_noise
     noisier = []
     for name, expected in believed.items():
         level = channel_noise(log, name) if name in log else np.nan
@@ -124,15 +149,19 @@ def measured_sensors(
             noisier.append(NoiseLevel(name, level, log.unit(name), expected))
     level_of = believed | {noise.channel: noise.level for noise in noisier}
     feet_level = max((v for name, v in level_of.items() if name.startswith("foot/")), default=0.0)
-    velocity = level_of.get("joint/velocity", encoders.velocity_noise)
     # Beside the rounding.
     of_link, of_motor = (
         float(np.sqrt(max(level_of.get(name, 0.0) ** 2 - encoder.resolution**2 / 12.0, 0.0)))
         for name, encoder in (("joint/position", encoders), ("joint/motor_position", second))
     )
+    read = replace(encoders, noise=max(of_link, encoders.noise))
+    velocity = level_of.get("joint/velocity", encoders.velocity_noise)
+    if differenced and recording.cutoff == 0:
+        of_angles = read.angle_noise / (np.sqrt(2) * float(log.meta["period"]))
+        read, velocity = replace(read, velocity="exact"), max(velocity, of_angles)
     measured = replace(
         sensors,
-        encoders=replace(encoders, velocity_noise=velocity, noise=max(of_link, encoders.noise)),
+        encoders=replace(read, velocity_noise=velocity),
         motor_encoders=replace(second, noise=max(of_motor, second.noise)),
         imu=replace(
             imu,
@@ -158,11 +187,60 @@ def channel_noise(log: Log, name: str) -> float:
     return float(np.quantile(high[white], _QUIET)) if white.any() else np.nan
 
 
+@dataclass(frozen=True)
+class _Level:
+    """What a residual's averages over some blocks show of white noise, (R,) each."""
+
+    power: Power
+    # Mean square of a difference that is believed, normalised for white noise.
+    typical: np.ndarray
+    # Variance of a block's white noise beyond that, and what it is at most.
+    excess: np.ndarray
+    bound: np.ndarray
+    # More than this ratio is neither chance nor too little to matter.
+    least: np.ndarray
+
+    @property
+    def is_shown(self) -> np.ndarray:
+        """Does it show any?"""
+        return self.power.ratio > self.least
+
+
+def _level(residual: Residual, blocks: int) -> _Level:
+    """Of averages over so many blocks.
+
+    What the noise of angles and velocities makes of accelerations ends in the longer ones, where
+    that of the torques is left.
+    """
+    known = block_means(residual.known, blocks) == 1.0
+    variance, covariance = (
+        block_means(values, blocks) for values in (residual.variance, residual.covariance)
+    )
+    variance = variance / blocks + 2 * (blocks - 1) / blocks**2 * covariance
+    between = 2 * _ORDER / (_ORDER + 1) * covariance / blocks**2
+    believed = np.maximum(variance - between, _ROUNDING)
+    value = block_means(np.where(residual.known, residual.value, 0.0), blocks)
+    power = noise_power(value, known, believed)
+    typical = np.nan_to_num(rms(np.sqrt(believed), known)) ** 2
+    doubt = _SURE * np.sqrt(2 / power.freedom) * power.ratio
+    least = chi2.isf(_FALSE_ALARM / known.shape[1], power.freedom) / power.freedom
+    return _Level(
+        power,
+        typical,
+        (power.ratio - 1) * typical * blocks,
+        (power.ratio - 1 + doubt) * typical * blocks,
+        np.maximum(least, _LEAST**2),
+    )
+
+
 def measured_noise(
-    motion: RecordedMotion, residual: Residual, channels: tuple[NoiseLevel, ...]
+    motion: RecordedMotion,
+    residual: Residual,
+    channels: tuple[NoiseLevel, ...],
 ) -> Noise:
     """Noise of rows whose averages over blocks differ more from their neighbours than is believed.
 
+    Torques that are sampled have noise that nobody may know, which shows best in longer averages.
     What the torques of some joints have more than is believed, those of others are taken to have,
     too, if it would not show in them.
 
@@ -173,18 +251,24 @@ def measured_noise(
     length, rows = motion.length, residual.value.shape[1]
     missed = np.zeros(rows)
     missed[: len(motion.robot.joint_names)] = missed_torque(motion)
-    believed = np.maximum(
-        residual.variance + missed / length - 2 * _ORDER / (_ORDER + 1) * residual.covariance,
-        _ROUNDING,
-    )
-    power = noise_power(residual.value, residual.known, believed)
-    least = chi2.isf(_FALSE_ALARM / rows, power.freedom) / power.freedom
+    believed = replace(residual, variance=residual.variance + missed / length)
+    is_sampled = motion.recording.rows == "instantaneous"
+    levels = [_level(believed, blocks) for blocks in (_SCALES if is_sampled else (1,))]
+    # White noise is no more than what any of them shows.
+    bounds = np.nan_to_num([level.bound for level in levels], nan=np.inf)
+    shown = np.array([level.is_shown for level in levels])
+    tightest = np.argmin(np.where(shown, bounds, np.inf), axis=0)
+    excess = np.array([level.excess for level in levels])[tightest, np.arange(rows)]
     # A rotor that goes to and fro in its gap is no noise: that of encoders their channels tell.
-    turned = np.array([row.kind == "transmission" for row in residual.rows])
-    noisy = (power.ratio > np.maximum(least, _LEAST**2)) & ~turned
-    typical = np.nan_to_num(rms(np.sqrt(believed), residual.known)) ** 2
-    ratio = np.where(noisy, power.ratio, 1.0)
-    white = missed + (ratio - 1) * typical * length
+    turns = np.array([row.kind == "transmission" for row in residual.rows])
+    noisy = shown.any(axis=0) & ~turns
+    more = np.where(noisy, np.minimum(excess, bounds.min(axis=0)).clip(min=0.0), 0.0)
+    white = missed + more * length
+    # What neighbours differ by beside that is the sensors'.
+    power, typical = levels[0].power, levels[0].typical
+    beside = power.ratio - np.divide(more, typical, out=np.zeros(rows), where=typical > 0)
+    sensors = np.where(noisy & (beside > levels[0].least), beside, 1.0)
+    ratio = sensors + np.divide(more, typical, out=np.zeros(rows), where=typical > 0)
 
     torque = motion.torque_variance(motion.blocks.torque_command)
     n = torque.shape[1]
@@ -192,11 +276,82 @@ def measured_noise(
     telling = noisy[:n] & (torque > 0)
     if telling.any():
         share = float(np.median(white[:n][telling] / torque[telling]))
-        for row in np.flatnonzero(~noisy[:n]):
-            more = 1 + share * torque[row] / length / typical[row]
-            if np.log(more / power.ratio[row]) < 2 * np.sqrt(2 / power.freedom[row]):
-                white[row], ratio[row] = missed[row] + share * torque[row], more
-    return Noise(channels, white, np.sqrt(ratio))
+        for row in np.flatnonzero(~noisy[:n] & (typical[:n] > 0)):
+            likely = 1 + share * torque[row] / length / typical[row]
+            if np.log(likely / power.ratio[row]) < 2 * np.sqrt(2 / power.freedom[row]):
+                white[row], ratio[row] = missed[row] + share * torque[row], likely
+    return Noise(channels, white, sensors, np.sqrt(ratio))
+
+
+def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
+    """Noise of rows in which nothing but noise is left, by maximum likelihood: how much more there
+    is of that of the sensors, and how much white noise beside; None if none of these rows has more
+    than is believed, or what is left is not such noise.
+
+    Args:
+        length: of a block [steps].
+    """
+    count = residual.value.shape[1]
+    white, sensors, factor = np.zeros(count), np.ones(count), np.ones(count)
+    least = chi2.isf(_FALSE_ALARM / max(1, len(rows)), 2)
+    for row in rows:
+        left = _Left.of(residual, row)
+        more, beside = left.likeliest()
+        gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
+        if gained > least and is_white(left.whitened(more, beside)):
+            sensors[row], white[row] = more, beside * length
+            factor[row] = np.sqrt(more + beside / left.variance.mean())
+    return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
+
+
+def is_white(values: np.ndarray) -> bool:
+    """May values (B,) be white noise? By their cumulative periodogram (Bartlett 1955, "An
+    Introduction to Stochastic Processes", 9.2)."""
+    power = np.abs(np.fft.rfft(values - values.mean()))[1:-1] ** 2
+    count = len(power)
+    even = np.abs(np.cumsum(power) / power.sum() - np.arange(1, count + 1) / count).max()
+    return bool(kstwobign.sf(even * np.sqrt(count)) > _FALSE_ALARM)
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What is left in a row where it is known, and its noise as it is believed, (B,)."""
+
+    value: np.ndarray
+    variance: np.ndarray
+    # With the next value.
+    covariance: np.ndarray
+
+    @staticmethod
+    def of(residual: Residual, row: int) -> "_Left":
+        index = np.flatnonzero(residual.known[:, row])
+        adjacent = np.append(np.diff(index) == 1, False)
+        covariance = np.where(adjacent, residual.covariance[index, row], 0.0)
+        return _Left(residual.value[index, row], residual.variance[index, row], covariance)
+
+    def _factor(self, more: float, beside: float) -> np.ndarray:
+        """Of Cholesky, of so many times that noise and white noise of a variance beside."""
+        band = np.stack([more * self.variance + beside, more * self.covariance])
+        return cholesky_banded(band, lower=True)
+
+    def whitened(self, more: float, beside: float) -> np.ndarray:
+        return solve_banded((1, 0), self._factor(more, beside), self.value)
+
+    def deviance(self, more: float, beside: float) -> float:
+        """With that noise."""
+        spread = 2 * np.log(self._factor(more, beside)[0]).sum()
+        return float(spread + (self.whitened(more, beside) ** 2).sum())
+
+    def likeliest(self) -> tuple[float, float]:
+        """How many times the noise, and the variance of white noise beside."""
+        typical = float(self.variance.mean())
+        found = minimize(
+            lambda x: self.deviance(np.exp(x[0]), typical * np.exp(x[1])),
+            np.log([1.0, _SHARE]),
+            bounds=[(0.0, _MOST), (np.log(_NO_SHARE), _MOST)],
+            method="L-BFGS-B",
+        )
+        return float(np.exp(found.x[0])), typical * float(np.exp(found.x[1]))
 
 
 def missed_torque(motion: RecordedMotion) -> np.ndarray:

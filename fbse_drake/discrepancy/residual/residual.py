@@ -205,7 +205,7 @@ def read_signals(
         )
         pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
-    measured = "joint/velocity" in log and recording.velocity == "measured"
+    measured = not differences_angles(recording, log)
     torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
     torque = np.where(robot.description.has_motor, torque, 0.0)
     signals = SensorSignals(
@@ -218,6 +218,11 @@ def read_signals(
         motor_position=on_grid(log.get("joint/motor_position", np.zeros((len(log.time), 0)))),
     )
     return signals, known
+
+
+def differences_angles(recording: RecordingConfig, log: Log) -> bool:
+    """Are velocities had from the angles, by central differences?"""
+    return recording.velocity == "differenced" or "joint/velocity" not in log
 
 
 def _low_passed(
