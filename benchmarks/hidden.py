@@ -143,7 +143,11 @@ class Case:
 
 def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
     """All cases but those at the smallest size that can be found, see `threshold_cases`."""
-    effects = {name: effect for name, effect in library().items() if not effect.composite}
+    effects = {
+        name: effect
+        for name, effect in library().items()
+        if not (effect.composite or effect.needs_sampled_torque)
+    }
     result = [
         Case(f"decoy-{seed}", "decoy", "decoy", rollout=seed < _ROLLED_DECOYS)
         for seed in range(4 if quick else 30)

@@ -167,6 +167,55 @@ class TorqueLag(JointTorqueEffect):
         return affine_recursion(motion.command[0], keep, (1.0 - keep) * motion.command)[None]
 
 
+@in_library
+@dataclass(frozen=True)
+class TorqueReadingLag(JointTorqueEffect):
+    """The torque that a log has follows the one that is given like a low-pass of first order:
+    u = -time_constant d(command)/dt.
+
+    The given torque is the one that is read, plus time_constant times its rate: in steps, so that a
+    log shows the time constant linearly. In a simulation the command is what is read, and the motor
+    is ahead of it.
+    """
+
+    description: ClassVar[str] = (
+        "The recorded torque comes late, as a motor current behind a filter or by another clock."
+    )
+    signature: ClassVar[str] = (
+        "Torque against the rate of the command: of inertia like damping, of friction like play."
+    )
+    experiment: ClassVar[str] = "Move fast and slowly; record the torques as they are commanded."
+    shows_at_rest: ClassVar[bool] = True
+    needs_motor: ClassVar[bool] = True
+    needs_sampled_torque: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        "time_constant": Parameter("s", linear=True, plausible=(0.0, 2e-2)),
+    }
+    has_memory: ClassVar[bool] = True
+
+    time_constant: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def basis(
+        motion: JointMotion,
+        nonlinear: np.ndarray,  # noqa: ARG004
+    ) -> tuple[Sequence[np.ndarray], Sequence[float]]:
+        # Memory: the last command.
+        return ((motion.memory[0] - motion.command) / motion.time_step,), (0.0,)
+
+    @staticmethod
+    def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(motion.command, (1, *nonlinear.shape[1:]))
+
+    @staticmethod
+    def advance(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(motion.command, (1, *nonlinear.shape[1:]))
+
+    @staticmethod
+    def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
+        return np.concatenate([motion.command[:1], motion.command[:-1]])[None]
+
+
 def _kept(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
     """How much of a deviation a low-pass keeps over the step."""
     return np.exp(-motion.time_step / np.maximum(nonlinear[0], 1e-9))

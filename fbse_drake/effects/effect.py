@@ -152,6 +152,8 @@ class Effect(ABC):
     needs_motor: ClassVar[bool] = False
     # It is of a joint's second encoder, on the motor's side.
     needs_motor_encoder: ClassVar[bool] = False
+    # It is of torques that were measured: those that a controller commands are known as they are.
+    needs_sampled_torque: ClassVar[bool] = False
     # Its linear parameters enter linearly only about some values: a search makes it linear about
     # those that fit.
     linear_nearby: ClassVar[bool] = False

@@ -255,6 +255,8 @@ class Dictionary:
         driven, motion = self.predictor.is_driven, self.predictor.motion
         if effect.needs_motor_encoder and not motion.signals.motor_position.shape[1]:
             return []
+        if effect.needs_sampled_torque and self.per_step:
+            return []
         return {
             "joint": [
                 joint

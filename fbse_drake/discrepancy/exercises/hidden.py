@@ -110,6 +110,7 @@ _RECIPES = {
     "TorqueBias": Recipe((1.0, 10.0), _signed("bias")),
     "TorqueDelay": Recipe((5e-4, 3e-3), _one("delay")),
     "TorqueLag": Recipe((5e-4, 3e-3), _one("time_constant")),
+    "TorqueReadingLag": Recipe((5e-4, 3e-3), _one("time_constant")),
     # Size: the share of the joint's largest torque that is cut off.
     "TorqueSaturation": Recipe(
         (0.03, 0.2), lambda draw, size: {"limit": (1 - size) * float(np.abs(draw.torque).max())}
@@ -393,9 +394,12 @@ def _hidden_effect(
 
 
 def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
-    """Can the robot have it? In a gantry, only in its joints; feet creep only if the contact solver
-    lets them, and few robots have second encoders."""
+    """Can the robot have it, and its log show it? In a gantry, only in its joints; feet creep only
+    if the contact solver lets them, few robots have second encoders, and commands are no
+    measurements."""
     if effect.needs_motor_encoder and scenario.sensors.motor_encoders is None:
+        return False
+    if effect.needs_sampled_torque and scenario.recording.rows == "per_step":
         return False
     if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in (
         "lagged",
