@@ -1,9 +1,11 @@
 """Work in processes of its own, beside what this one does."""
 
+import math
 import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import CancelledError
@@ -19,6 +21,8 @@ from fbse_drake.progress import Interrupted, Progress, silent
 T = TypeVar("T")
 # How often processes are looked at while nothing else is done [s].
 _LOOK_PERIOD = 0.2
+# And while something else is done, at most [s].
+_LEAST_PERIOD = 0.02
 
 
 def usual_jobs() -> int:
@@ -97,8 +101,14 @@ class Processes:
         """A progress of other work at which it is also seen to it that tasks go on; all are
         cancelled where it interrupts that work."""
 
+        looked = -math.inf
+
         def told(text: str, share: float = 0.0) -> None:
-            self._look(self._jobs - 1)
+            nonlocal looked
+            # Told a thousand times in a second, looking would take much of it.
+            if (now := time.monotonic()) - looked > _LEAST_PERIOD:
+                self._look(self._jobs - 1)
+                looked = now
             self._tell(progress, text, share)
 
         return told

@@ -16,6 +16,7 @@ from fbse_drake.effects.actuation import (
     TorqueDelay,
     TorqueGain,
     TorqueLag,
+    TorqueReadingLag,
     TorqueSaturation,
 )
 from fbse_drake.effects.counterbalance import Counterbalance
@@ -154,6 +155,16 @@ def test_lag_is_a_low_pass(time_constant: float):
         rtol=1e-9,
         atol=1e-12,
     )
+
+
+def test_a_reading_that_lags_is_a_low_pass_of_what_is_given():
+    """The command is what is read: what the joint gets, low-passed in steps, is the command."""
+    time_constant = 5e-3
+    given = M.command - law(TorqueReadingLag(time_constant={"all": time_constant}), M)
+    kept = time_constant / (time_constant + H)
+    start = kept * M.command[0]
+    read, _ = lfilter([1 - kept], [1, -kept], given, axis=0, zi=start[None])
+    np.testing.assert_allclose(read, M.command, rtol=1e-9, atol=1e-9)
 
 
 def test_bristles_bend_like_a_spring_and_slip_like_coulomb_friction():
@@ -349,6 +360,7 @@ def test_simulated_torque_is_the_law_where_it_does_not_depend_on_velocity():
         TorqueBias,
         TorqueDelay,
         TorqueLag,
+        TorqueReadingLag,
         TorqueSaturation,
         TorqueRipple,
         JointSpring,

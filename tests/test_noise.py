@@ -6,13 +6,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from recorded_arm import ARM
 
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
-from fbse_drake.discrepancy.residual.noise import channel_noise, noise_power
+from fbse_drake.discrepancy.residual.noise import channel_noise, likeliest_noise, noise_power
+from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.log import Log
@@ -182,3 +185,103 @@ def test_a_joint_that_rings_is_said_to_and_is_no_noise(ringing: int) -> None:
         said = [f.where for f in hygiene.untrustworthy if f.kind == "ringing"]
         assert said == ([(log.joints[0],)] if drowned else [])
         assert (log.joints[0] in hygiene.untrusted_joints()) == drowned
+
+
+def arm(torque_noise: float, bits: int = 0, seed: int = 1) -> tuple[Predictor, np.ndarray]:
+    """An arm of which nobody says how it was recorded, with a torque bias in its fifth axis, and
+    the deviations of its torques' noise; with rounded angles and no velocities if so wished."""
+    machine = replace(ARM, period=2e-3, duration=10.0)
+    deviations = torque_noise * np.array(ARM.torque_noise)
+    course = machine.course(seed)
+    given = course.torque + 0.6 * np.eye(6)[4]
+    noise = deviations * np.random.default_rng(seed).standard_normal(given.shape)
+    log = machine.log(course, seed=seed, read=lambda _: given + noise)
+    channels = dict(log.channels)
+    if bits:
+        step = 2 * np.pi / 2**bits
+        channels["joint/position"] = step * np.round(log["joint/position"] / step)
+        del channels["joint/velocity"]
+    scenario = replace(
+        machine.scenario, sensors=SensorsConfig(), recording=RecordingConfig(rows="instantaneous")
+    )
+    return Predictor(scenario, replace(log, channels=channels)), deviations
+
+
+def test_noise_of_torques_shows_beside_that_of_accelerations() -> None:
+    """Accelerations of noisy velocities hide it in differences of neighbouring averages, and
+    everything that is slow would be many times the noise."""
+    predictor, deviations = arm(1.0)
+    residual = predictor.residual
+    hidden = slice(0, 3)
+    assert (-residual.covariance[:-1, hidden] > 0.2 * residual.variance[:-1, hidden]).all()
+    measured = np.sqrt(predictor.noise.white)
+    assert (measured > 0.7 * deviations).sum() >= 5
+    assert (measured < 1.6 * deviations).all()
+    diagnosis = diagnose(predictor, [library()[name] for name in TRIED])
+    (found,) = diagnosis.chosen
+    assert (diagnosis.verdict, found.effect, found.targets) == (
+        "effect_found",
+        "TorqueBias",
+        ("axis_5",),
+    )
+
+
+def test_noise_that_only_what_is_left_shows_is_used() -> None:
+    predictor, _ = arm(0.3, bits=20)
+    diagnosis = diagnose(predictor, [library()[name] for name in TRIED])
+    assert (diagnosis.verdict, diagnosis.unexplained) == ("effect_found", ())
+    assert [finding.effect for finding in diagnosis.chosen] == ["TorqueBias"]
+    assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("bits", [14, 17])
+def test_angles_that_are_differenced_have_the_noise_of_their_steps(bits: int) -> None:
+    predictor, _ = arm(0.0, bits=bits)
+    encoders = predictor.motion.sensors.encoders
+    step = 2 * np.pi / 2**bits
+    assert encoders.angle_noise == pytest.approx(step / np.sqrt(12), rel=0.15)
+    of_velocity = encoders.angle_noise / (np.sqrt(2) * 2e-3)
+    assert encoders.velocity_noise == pytest.approx(of_velocity)
+    # Of joints that move over many steps from one sample to the next.
+    residual = predictor.residual
+    whitened = WhitenedResidual(residual)
+    spread = np.median(np.abs(whitened.y), axis=0)[:2] / 0.6745
+    np.testing.assert_allclose(spread, 1.0, atol=0.3)
+
+
+def left_in_a_row(white: float, wave: float, seed: int) -> Residual:
+    """Noise as of differenced velocities, of variance 1, with white noise and a wave beside."""
+    residual, random = arm(0.0)[0].motion.residual, np.random.default_rng(seed)
+    blocks = len(residual.time)
+    steps = np.sqrt(0.5) * np.diff(random.standard_normal(blocks + 1))
+    value = np.zeros_like(residual.value)
+    value[:, 0] = steps + np.sqrt(white) * random.standard_normal(blocks)
+    value[:, 0] += wave * np.sin(0.7 * np.arange(blocks))
+    variance, covariance = np.ones_like(value), np.full_like(value, -0.5)
+    return replace(residual, value=value, variance=variance, covariance=covariance)
+
+
+def test_the_likeliest_noise_is_that_which_is_there() -> None:
+    found = [likeliest_noise(left_in_a_row(0.05, 0.0, seed), 5, [0]) for seed in range(10)]
+    white = [noise.white[0] / 5 for noise in found if noise is not None]
+    assert len(white) == 10
+    assert np.mean(white) == pytest.approx(0.05, rel=0.1)
+    assert all(noise.white[1:].max() == 0.0 for noise in found if noise is not None)
+
+
+@pytest.mark.parametrize(("white", "wave"), [(0.0, 0.0), (0.0, 0.5), (0.05, 0.5)])
+def test_what_is_as_believed_or_no_noise_is_not_taken_for_more_noise(
+    white: float, wave: float
+) -> None:
+    assert likeliest_noise(left_in_a_row(white, wave, 3), 5, [0]) is None
+    assert likeliest_noise(left_in_a_row(0.05, 0.0, 3), 5, []) is None
+
+
+def test_coloured_undoes_whitening() -> None:
+    residual = left_in_a_row(0.3, 0.0, 1)
+    known = residual.known.copy()
+    known[50:60, 0] = False
+    gappy = replace(residual, known=known)
+    white = WhitenedResidual(gappy)
+    np.testing.assert_allclose(white.coloured(white.y)[known], gappy.value[known], atol=1e-12)
+    assert not white.coloured(white.y)[~known].any()

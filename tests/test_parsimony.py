@@ -6,6 +6,7 @@ file.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -318,3 +319,25 @@ def test_a_row_in_which_a_mass_hardly_shows_is_no_worse_for_the_noise_that_it_br
     assert finding.targets == hidden.targets
     low, high = finding.parameters["mass"].interval
     assert low < hidden.size < high
+
+
+@pytest.mark.parametrize("seed", [2, 5, 8])
+def test_drag_beside_plain_friction_is_no_hump(seed: int):
+    """A hump that nothing tells from zero bends the law as drag does."""
+    machine = replace(ARM, duration=10.0)
+    course = machine.course(seed)
+    v, size = course.velocity, np.sqrt((course.torque**2).mean(axis=0))
+    speed = np.sqrt((v**2).mean(axis=0))
+    given = course.torque + size * (0.1 * np.tanh(v / 0.01) + 0.15 * v / speed)
+    axis = np.eye(6)[1]
+    given += axis * 0.25 * size * v * np.abs(v) / np.sqrt((v**4).mean(axis=0))
+    names = ("CoulombFriction", "ViscousFriction", "StribeckFriction", "QuadraticDrag")
+    diagnosis = diagnose(
+        machine.predictor(machine.log(course, given)), [library()[name] for name in names]
+    )
+    found: dict[str, set[str]] = {}
+    for finding in diagnosis.chosen:
+        found.setdefault(finding.effect, set()).update(finding.targets)
+    assert diagnosis.verdict == "effect_found"
+    assert found.keys() == set(names) - {"StribeckFriction"}
+    assert found["QuadraticDrag"] == {"axis_2"}

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fbse_drake.effects.effect import Parameter, in_library
+from fbse_drake.effects.effect import Effect, Parameter, in_library
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect, Rise, affine_recursion
 
 
@@ -188,6 +188,7 @@ class TorqueReadingLag(JointTorqueEffect):
     shows_at_rest: ClassVar[bool] = True
     needs_motor: ClassVar[bool] = True
     needs_sampled_torque: ClassVar[bool] = True
+    opposites: ClassVar[tuple[type[Effect], ...]] = (TorqueDelay, TorqueLag)
     parameters: ClassVar[dict[str, Parameter]] = {
         "time_constant": Parameter("s", linear=True, plausible=(0.0, 2e-2)),
     }

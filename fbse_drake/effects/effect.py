@@ -154,6 +154,8 @@ class Effect(ABC):
     needs_motor_encoder: ClassVar[bool] = False
     # It is of torques that were measured: those that a controller commands are known as they are.
     needs_sampled_torque: ClassVar[bool] = False
+    # What these do it does with the other sign: where both are, only the difference shows.
+    opposites: ClassVar[tuple[type["Effect"], ...]] = ()
     # Its linear parameters enter linearly only about some values: a search makes it linear about
     # those that fit.
     linear_nearby: ClassVar[bool] = False

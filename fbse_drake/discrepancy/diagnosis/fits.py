@@ -215,7 +215,7 @@ class Fits:
         for effect in self.dictionary.joint_effects:
             sets = self.dictionary.points(effect).shape[1]
             tests += len(self.dictionary.groups_of(effect)) * max(1, sets // 4)
-        return tests
+        return max(1, tests)
 
     def explain(self, candidates: Sequence[Candidate]) -> Explanation:
         """Fits candidates together."""

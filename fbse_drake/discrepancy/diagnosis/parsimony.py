@@ -519,12 +519,29 @@ def _simpler(
     if not issubclass(member.effect, JointTorqueEffect):
         return
     tried = set(proposals.fits.dictionary.effects)
-    for reduction in member.effect.reductions:
-        if not tried.issuperset(reduction.effects) or (
-            if_needless and not _may_be_without(explanation, member, reduction)
-        ):
-            continue
-        smaller = _with_laws(proposals, explanation, member, reduction.effects)
+    reductions = [
+        reduction
+        for reduction in member.effect.reductions
+        if tried.issuperset(reduction.effects)
+        and not (
+            if_needless
+            and not _shared(explanation, member, reduction)
+            and not _may_be_without(explanation, member, reduction)
+        )
+    ]
+
+    def reduced(reduction: Reduction) -> Explanation:
+        shared = _shared(explanation, member, reduction)
+        alone = [explanation, *_apart(proposals, explanation, member, shared)]
+        found = (_with_laws(proposals, one, member, reduction.effects) for one in alone)
+        return min(found, key=lambda e: e.deviance)
+
+    # What is better and smaller comes before what is worse by no more than chance.
+    for largest in reductions[-1:]:
+        if _may_be_without(explanation, member, largest):
+            yield from _with_another(proposals, explanation, reduced(largest), member)
+    for reduction in reductions:
+        smaller = reduced(reduction)
         is_needless = smaller.deviance <= explanation.deviance or (
             _is_without(explanation, member, reduction)
             and judge.is_nearly_as_good(smaller, explanation, member)
@@ -533,8 +550,6 @@ def _simpler(
         # What takes its place has to stay.
         if is_smaller and judge.all_pay(smaller, reduction.effects, member.targets):
             yield smaller
-        elif _may_be_without(explanation, member, reduction):
-            yield from _with_another(proposals, explanation, smaller, member)
 
 
 def _with_another(
@@ -549,6 +564,30 @@ def _with_another(
         better = converged(proposals.fits, found)
         if better.deviance < explanation.deviance:
             yield better
+
+
+def _shared(explanation: Explanation, member: Candidate, reduction: Reduction) -> list[Candidate]:
+    """Laws of a reduction whose values a member's joints share with others."""
+    targets = set(member.targets)
+    return [
+        c
+        for c in explanation.candidates
+        if c.effect in reduction.effects and targets < set(c.targets)
+    ]
+
+
+def _apart(
+    proposals: Proposals, explanation: Explanation, member: Candidate, shared: list[Candidate]
+) -> Iterator[Explanation]:
+    """With shared laws left to the other joints: what takes the member's place has values of its
+    own."""
+    if not shared:
+        return
+    result = proposals.fits.explain([c for c in explanation.candidates if c not in shared])
+    for c in shared:
+        others = tuple(t for t in c.targets if t not in member.targets)
+        result = proposals.beside(result, c.effect, others)
+    yield result
 
 
 def _may_be_without(explanation: Explanation, member: Candidate, reduction: Reduction) -> bool:

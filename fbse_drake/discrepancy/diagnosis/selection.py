@@ -103,7 +103,7 @@ def best_additions(
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
         everything = [*base.candidates, *added]
-        if _loses_scale(fits, everything):
+        if _loses_scale(fits, everything) or _cancel(base.candidates, added):
             continue
         wider = fits.explain(everything)
         if wider.deviance >= most:
@@ -152,6 +152,16 @@ def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
         and not torques
         and gained == set(names.sides)
         and any(c.effect is BodyMass for c in candidates)
+    )
+
+
+def _cancel(members: Sequence[Candidate], added: Sequence[Candidate]) -> bool:
+    """Would effects undo what others do in the same place?"""
+    return any(
+        set(one.targets) & set(other.targets)
+        and (one.effect in other.effect.opposites or other.effect in one.effect.opposites)
+        for one in members
+        for other in added
     )
 
 

@@ -1,0 +1,101 @@
+"""Torques that were measured, as motor currents are, come late: behind a filter, or by another
+clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded_arm import ARM, Course
+from scipy.signal import lfilter
+
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.effects.actuation import TorqueReadingLag
+from fbse_drake.effects.effect import library
+from fbse_drake.scenario import RecordingConfig
+
+TRIED = (
+    "CoulombFriction",
+    "ViscousFriction",
+    "StribeckFriction",
+    "PreslidingHysteresis",
+    "ReflectedInertia",
+    "TorqueGain",
+    "TorqueBias",
+    "TorqueLag",
+    "TorqueDelay",
+    "TorqueReadingLag",
+)
+MACHINE = replace(ARM, duration=12.0)
+
+
+def course_of(seed: int) -> Course:
+    """At 1 kHz, as the drive runs."""
+    return replace(MACHINE, period=1e-3).course(seed)
+
+
+def diagnosis_of(seed: int, late: float, friction: float, *, by_clock: bool = False) -> Diagnosis:
+    """Of torques that are recorded so late [s], at 250 Hz, of an arm with so much friction."""
+    course = course_of(seed)
+    size = np.sqrt((course.torque**2).mean(axis=0))
+    given = course.torque + friction * size * np.tanh(course.velocity / 0.02)
+    if by_clock:
+        samples = round(late * 1e3)
+        read = np.concatenate([given[:1].repeat(samples, axis=0), given[: len(given) - samples]])
+    else:
+        kept = np.exp(-1e-3 / late) if late else 0.0
+        read, _ = lfilter([1 - kept], [1, -kept], given, axis=0, zi=kept * given[:1])
+    every = slice(None, None, 4)
+    rare = Course(*(values[every] for values in vars(course).values()))
+    log = MACHINE.log(rare, read[every], seed)
+    return diagnose(MACHINE.predictor(log), [library()[name] for name in TRIED])
+
+
+def found(diagnosis: Diagnosis) -> dict[str, set[str]]:
+    result: dict[str, set[str]] = {}
+    for finding in diagnosis.chosen:
+        result.setdefault(finding.effect, set()).update(finding.targets)
+    return result
+
+
+@pytest.mark.parametrize(("late", "by_clock"), [(0.004, False), (0.006, False), (0.004, True)])
+def test_late_torques_are_no_friction(late: float, by_clock: bool):
+    diagnosis = diagnosis_of(3, late, 0.0, by_clock=by_clock)
+    assert diagnosis.verdict == "effect_found"
+    assert found(diagnosis) == {"TorqueReadingLag": set(MACHINE.joints)}
+    (finding,) = diagnosis.chosen
+    assert finding.parameters["time_constant"].value == pytest.approx(late, rel=0.15)
+
+
+def test_friction_is_found_beside_late_torques():
+    diagnosis = diagnosis_of(4, 0.004, 0.2)
+    assert diagnosis.verdict == "effect_found"
+    named = found(diagnosis)
+    assert named.keys() == {"CoulombFriction", "TorqueReadingLag"}
+    assert named["CoulombFriction"] == set(MACHINE.joints)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2])
+def test_torques_in_time_are_not_late(friction: float):
+    named = found(diagnosis_of(5, 0.0, friction))
+    assert named.keys() == ({"CoulombFriction"} if friction else set())
+
+
+def test_commands_are_not_read():
+    """Of a controller's own commands it is not tried."""
+    course = MACHINE.course(1)
+    scenario = replace(MACHINE.scenario, recording=RecordingConfig())
+    predictor = Predictor(scenario, MACHINE.log(course))
+    dictionary = Dictionary(predictor, [TorqueReadingLag], lambda *_: None)
+    assert not dictionary.groups_of(TorqueReadingLag)
+    sampled = Dictionary(
+        MACHINE.predictor(MACHINE.log(course)), [TorqueReadingLag], lambda *_: None
+    )
+    assert tuple(MACHINE.joints) in sampled.groups_of(TorqueReadingLag)
+
+
+def test_a_lag_of_the_drive_and_one_of_the_reading_are_not_both_named():
+    """Only their difference shows."""
+    for finding in diagnosis_of(6, 0.006, 0.2).chosen:
+        assert finding.effect not in ("TorqueLag", "TorqueDelay")
