@@ -101,6 +101,7 @@ from .effects.actuation import TorqueBias as TorqueBias
 from .effects.actuation import TorqueDelay as TorqueDelay
 from .effects.actuation import TorqueGain as TorqueGain
 from .effects.actuation import TorqueLag as TorqueLag
+from .effects.actuation import TorqueReadingLag as TorqueReadingLag
 from .effects.actuation import TorqueRollOff as TorqueRollOff
 from .effects.actuation import TorqueSaturation as TorqueSaturation
 from .effects.friction import CoulombFriction as CoulombFriction

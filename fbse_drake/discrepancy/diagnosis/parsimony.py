@@ -585,6 +585,7 @@ def _apart(
         return
     result = proposals.fits.explain([c for c in explanation.candidates if c not in shared])
     for c in shared:
+        assert issubclass(c.effect, JointTorqueEffect)
         others = tuple(t for t in c.targets if t not in member.targets)
         result = proposals.beside(result, c.effect, others)
     yield result
