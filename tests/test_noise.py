@@ -285,3 +285,23 @@ def test_coloured_undoes_whitening() -> None:
     white = WhitenedResidual(gappy)
     np.testing.assert_allclose(white.coloured(white.y)[known], gappy.value[known], atol=1e-12)
     assert not white.coloured(white.y)[~known].any()
+
+
+def test_blocks_of_differenced_angles_share_none() -> None:
+    """A velocity is had from the angles before and after it: at 100 Hz a block of 10 ms would share
+    them with its neighbours, and their noise would not be what is believed."""
+    machine = replace(ARM, period=1e-2, duration=20.0, torque_noise=(0.0,) * 6)
+    log = machine.log(machine.course(1))
+    step = 2 * np.pi / 2**14
+    position = step * np.round(log["joint/position"] / step)
+    channels = {name: log[name] for name in ("time", "joint/torque_command")}
+    recording = RecordingConfig(rows="instantaneous")
+    scenario = replace(machine.scenario, sensors=SensorsConfig(), recording=recording)
+    motion = Predictor(
+        scenario, replace(log, channels=channels | {"joint/position": position})
+    ).motion
+    assert motion.length == 3
+    left = motion.residual
+    np.testing.assert_allclose(left.value.std(axis=0), left.noise_floor, rtol=0.12)
+    neighbours = (left.value[1:] * left.value[:-1]).mean(axis=0) / (left.value**2).mean(axis=0)
+    np.testing.assert_allclose(neighbours, -0.5, atol=0.1)

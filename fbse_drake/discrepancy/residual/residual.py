@@ -64,6 +64,8 @@ _AXES = ("x", "y", "z")
 # at once: Jacobians take room.
 _REMEMBERED = 3
 _MOST_INSTANTS = 20_000
+# Blocks of fewer samples share angles that their velocities are differenced from.
+_DIFFERENCED = 3
 # The noise of so many blocks is calculated at a time, which bounds the matrices that are kept.
 _AT_A_TIME = 500
 
@@ -764,7 +766,8 @@ class RecordedMotion:
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period
         self.signals, self.measured = read_signals(robot, log, recording)
-        self.length = max(1, round(recording.block / self.period))
+        least = _DIFFERENCED if differences_angles(recording, log) else 1
+        self.length = max(least, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(
                 f"the log is too short: {len(log.time)} samples, at least "
