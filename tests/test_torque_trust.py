@@ -86,6 +86,23 @@ def test_a_lost_sign_is_noticed_in_every_joint(arm: Course, pendulum: Course) ->
                 check_sensors(machine.predictor(log).motion)
 
 
+def test_a_filter_that_settles_loses_no_sign() -> None:
+    """Velocities behind a filter begin with a jump, for which the model needs a torque of the other
+    sign than that which carries the arm at all other times."""
+    machine = replace(ARM, posture=(0.0, 1.2, 0.2, 0.0, 0.3, 0.0), amplitude=(1.2, 0.2, 0.2) * 2)
+    course = machine.course(2)
+    log = machine.log(course)
+    kept = np.exp(-1.0)
+    settling = lfilter([1 - kept], [1, -kept], log["joint/velocity"] + 1.0, axis=0) - 1.0
+    log = replace(log, channels=log.channels | {"joint/velocity": settling})
+    motion = machine.predictor(log).motion
+    needed = motion.blocks.torque_command[:, AXIS] - motion.residual.value[:, AXIS]
+    assert (log["joint/torque_command"][:, AXIS] < 0).all()
+    assert 0 < (needed > 0).sum() < 10
+    assert "torque_sign" not in {finding.kind for finding in said(machine, log)}
+    check_sensors(motion)
+
+
 def test_a_reversed_sign_is_told_from_a_lost_one(arm: Course, pendulum: Course) -> None:
     for machine, course, joint in ((ARM, arm, AXIS), (PENDULUM, pendulum, 0)):
         log = machine.log(course, of_one(course, np.negative, joint))

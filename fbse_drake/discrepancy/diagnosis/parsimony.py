@@ -539,7 +539,7 @@ def _simpler(
     # What is better and smaller comes before what is worse by no more than chance.
     for largest in reductions[-1:]:
         if _may_be_without(explanation, member, largest):
-            yield from _with_another(proposals, explanation, reduced(largest), member)
+            yield from _with_another(proposals, judge, explanation, reduced(largest), member)
     for reduction in reductions:
         smaller = reduced(reduction)
         is_needless = smaller.deviance <= explanation.deviance or (
@@ -553,16 +553,25 @@ def _simpler(
 
 
 def _with_another(
-    proposals: Proposals, explanation: Explanation, smaller: Explanation, member: Candidate
+    proposals: Proposals,
+    judge: Judge,
+    explanation: Explanation,
+    smaller: Explanation,
+    member: Candidate,
 ) -> Iterator[Explanation]:
-    """With one more effect beside the laws that were put into a member's place, where the two
-    explain more than the member with no more parameters."""
-    most = len(explanation.solved.parameters)
+    """With one more effect beside the laws that were put into a member's place, where it pays and
+    the two explain more than the member with no more parameters."""
+    fits, most = proposals.fits, len(explanation.solved.parameters)
     wider = best_additions(proposals, smaller, member.signature.rows, smaller.deviance)
     # The laws are where they fit without it.
     for found in [e for e in wider if len(e.solved.parameters) <= most][:_ADDITIONS]:
-        better = converged(proposals.fits, found)
-        if better.deviance < explanation.deviance:
+        better = converged(fits, found)
+        if better.deviance >= explanation.deviance:
+            continue
+        key = found.candidates[-1].key
+        (added,) = (c for c in better.candidates if c.key == key)
+        rest = fits.explain([c for c in better.candidates if c is not added])
+        if judge.after(better).pays(rest, better, added):
             yield better
 
 

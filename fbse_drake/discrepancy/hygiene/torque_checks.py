@@ -103,7 +103,11 @@ def _test(evidence: Evidence, torques: JointTorques, k: int, found: _Found) -> N
         shown = turned.amounts[-1] * needed > _DEAD * torque.std()
         if shown and is_better(turned, scaled):
             return "reversed"
-        if _has_one_sign(raw) and is_better(torques.without_sign(k, columns), scaled):
+        if (
+            _has_one_sign(raw)
+            and torques.needs_both_signs(k)
+            and is_better(torques.without_sign(k, columns), scaled)
+        ):
             return "lost"
         return ""
 

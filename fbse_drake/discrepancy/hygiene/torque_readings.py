@@ -150,6 +150,15 @@ class JointTorques:
         """Stretch of time of each known block of a joint."""
         return self._stretch[self.known[:, k]]
 
+    def needs_both_signs(self, k: int) -> bool:
+        """Does what the model needs of a joint have either sign, and that often enough to test it?
+        Some blocks, as of a filter that settles, may have any."""
+        needed, stretch = self.needed[self.known[:, k], k], self.stretches(k)
+        return all(
+            len(np.unique(stretch[of_sign])) >= FEWEST_STRETCHES
+            for of_sign in (needed > 0, needed < 0)
+        )
+
     @cached_property
     def _rotor_inertia(self) -> dict[str, float]:
         """What the model believes of each joint's reflected inertia."""
