@@ -22,6 +22,7 @@ from fbse_drake.discrepancy.hygiene.torque_readings import (
     gain,
 )
 from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding, remark, remarks
+from fbse_drake.effects.actuation import TorqueReadingLag
 
 CHANNEL = "joint/torque_command"
 # Tests of each joint: its sign is reversed or lost, it is dead, its unit or its clock is wrong.
@@ -237,7 +238,14 @@ def _clock(
             "the motion that it makes, by its clock or by a filter before it was recorded, for no "
             "mechanism does that; accelerations will look like friction and the other way round"
         )
-        yield remark("clock_offset", "untrustworthy", CHANNEL, seconds, "s", text, where)
+        # A short one is looked for as an effect.
+        motion = evidence.motion
+        is_sampled = motion.recording.rows == "instantaneous"
+        if is_sampled and seconds <= motion.length * motion.period:
+            text += f"; {TorqueReadingLag.__name__} allows for it"
+            yield remark("clock_offset", "warning", CHANNEL, seconds, "s", text, where)
+        else:
+            yield remark("clock_offset", "untrustworthy", CHANNEL, seconds, "s", text, where)
     if early:
         seconds = float(np.median(early))
         text = (
