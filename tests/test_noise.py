@@ -9,7 +9,7 @@ import pytest
 from recorded_arm import ARM
 
 from fbse_drake.control.position_loop import PositionLoopConfig
-from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
+from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
@@ -19,6 +19,7 @@ from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.log import Log
+from fbse_drake.report.sentences import diagnosis_outcome
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.simulation import simulate
@@ -232,6 +233,9 @@ def test_noise_that_only_what_is_left_shows_is_used() -> None:
     assert (diagnosis.verdict, diagnosis.unexplained) == ("effect_found", ())
     assert [finding.effect for finding in diagnosis.chosen] == ["TorqueBias"]
     assert diagnosis.held_out_after == pytest.approx(1.0, abs=0.15)
+    assert diagnosis.noisier
+    assert "it was taken for noise" in diagnosis_outcome(diagnosis)
+    assert diagnosis_json(diagnosis)["noisier"] == list(diagnosis.noisier)
 
 
 @pytest.mark.parametrize("bits", [14, 17])

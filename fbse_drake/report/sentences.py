@@ -92,6 +92,11 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
         parts.append(_refuted(diagnosis.refuted))
     if _disagreement(diagnosis.chosen):
         parts.append(_disagreement(diagnosis.chosen))
+    if diagnosis.noisier:
+        parts.append(
+            f"What is left in {_rows(diagnosis.noisier)} is white and more than is believed of "
+            "the sensors' noise: it was taken for noise."
+        )
     if diagnosis.averaging is not None and diagnosis.averaging.text:
         parts.append(diagnosis.averaging.text)
     return _headline(" ".join(parts), diagnosis.set_aside)

@@ -176,6 +176,8 @@ class Diagnosis:
     untested: tuple[str, ...] = ()
     # Rows in which far more than the sensors' noise is left, and follows nothing.
     noisy: tuple[str, ...] = ()
+    # Rows in which what was left is white, and was taken for noise that nobody believed in.
+    noisier: tuple[str, ...] = ()
     # What explains the log and raises the error of data that was set aside: it is not named.
     refuted: tuple[Finding, ...] = ()
 
@@ -233,7 +235,10 @@ def diagnose(
     if disturbed:
         predictor = predictor.without([(one.start, one.end) for one in disturbed])
         search = _searched(Dictionary(predictor, tried, progress), tried)
+    noisier: tuple[str, ...] = ()
     if search.more_noise is not None:
+        rows = predictor.residual.rows
+        noisier = tuple(rows[k].name for k in np.flatnonzero(search.more_noise.factor > 1.0))
         predictor = predictor.noisier(search.more_noise)
         search = _searched(Dictionary(predictor, tried, progress), tried)
     proposals, path, alternatives = search.proposals, search.path, search.alternatives
@@ -289,6 +294,7 @@ def diagnose(
         disturbances=disturbed,
         untested=search.untested,
         noisy=search.noisy,
+        noisier=noisier,
     )
 
 
@@ -358,7 +364,9 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Searc
         disturbed,
         untested_rows(predictor.motion, remaining, left, structures),
         tuple(remaining.residual.rows[row].name for row in noisy if matters(row)),
-        _more_noise(predictor, remaining, left, [s.index for s in unexplained]),
+        None
+        if partial is not None
+        else _more_noise(predictor, remaining, left, [s.index for s in unexplained]),
         partial,
     )
 
@@ -682,6 +690,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "untested": list(diagnosis.untested),
         "noisy": list(diagnosis.noisy),
+        "noisier": list(diagnosis.noisier),
         "refuted": [{"effect": f.effect, "joints": list(f.targets)} for f in diagnosis.refuted],
         "left_out": [
             {"start": d.start, "end": d.end, "rows": list(d.rows)} for d in diagnosis.disturbances
