@@ -10,7 +10,10 @@ from recorded_arm import ARM
 
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.selection import is_shown
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
@@ -18,6 +21,7 @@ from fbse_drake.discrepancy.residual.noise import channel_noise, likeliest_noise
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.effects.transmission import Backlash
 from fbse_drake.log import Log
 from fbse_drake.report.sentences import diagnosis_outcome
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
@@ -309,3 +313,17 @@ def test_blocks_of_differenced_angles_share_none() -> None:
     np.testing.assert_allclose(left.value.std(axis=0), left.noise_floor, rtol=0.12)
     neighbours = (left.value[1:] * left.value[:-1]).mean(axis=0) / (left.value**2).mean(axis=0)
     np.testing.assert_allclose(neighbours, -0.5, atol=0.1)
+
+
+@pytest.mark.parametrize("bits", [0, 12])
+def test_play_finer_than_the_steps_of_an_encoder_does_not_show(bits: int) -> None:
+    predictor, _ = arm(1.0, bits=bits)
+    fits = Fits(Dictionary(predictor, [Backlash]))
+    rest = fits.remainder(fits.explain([]))
+
+    def shows(gap: float) -> bool:
+        nonlinear = np.array([gap, 0.2])
+        return is_shown(fits, fits.candidate(Backlash, ("axis_4",), nonlinear, rest))
+
+    assert shows(5e-3)
+    assert shows(5e-4) == (bits == 0)

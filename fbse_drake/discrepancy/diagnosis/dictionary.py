@@ -17,7 +17,7 @@ from fbse_drake.discrepancy.identification.inertial import (
     untrusted_inertia,
 )
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual.evidence import travel_of
+from fbse_drake.discrepancy.residual.evidence import step_of, travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
@@ -69,6 +69,8 @@ class Dictionary:
         self.per_step = predictor.scenario.recording.rows == "per_step"
         self.joints = predictor.robot.joint_names
         self.travel = travel_of(predictor.motion.signals.joint_position)
+        # In which each joint's angle is read, (n,) [rad]; 0 if in none.
+        self.steps = np.array([step_of(q) for q in predictor.log["joint/position"].T])
         # The largest of each joint, (n,) [rad/s].
         self.speed = np.abs(predictor.motion.signals.joint_velocity).max(axis=0)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))

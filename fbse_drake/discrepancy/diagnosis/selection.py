@@ -182,15 +182,17 @@ def _shows_within(fits: Fits, candidate: Candidate) -> bool:
     if not issubclass(effect, JointTorqueEffect):
         return True
     joints = dictionary.predictor.joints_of(candidate.signature.rows)
-    reached = _REACH * float(dictionary.speed[joints].max())
-    levels_off = (
-        value
-        for name, value in zip(candidate.nonlinear_names, candidate.nonlinear, strict=True)
-        if candidate.parameters[name].unit in ("rad/s", "m/s")
-    )
+    reached, least = _REACH * float(dictionary.speed[joints].max()), dictionary.steps[joints].max()
+
+    def values(*units: str) -> np.ndarray:
+        of = [candidate.parameters[name].unit in units for name in candidate.nonlinear_names]
+        return candidate.nonlinear[of]
+
+    # What is finer than the encoder's steps is not told from them.
     return bool(
         np.any(effect.shows_within(dictionary.travel[joints], candidate.nonlinear))
-        and all(speed <= reached for speed in levels_off)
+        and np.all(values("rad/s", "m/s") <= reached)
+        and np.all(values("rad", "m") >= least)
     )
 
 
