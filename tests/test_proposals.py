@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from recorded_arm import ARM
 from test_regression import white_of
 
-from fbse_drake.discrepancy.diagnosis.proposals import fixed_gain, largest_drop
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals, fixed_gain, largest_drop
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Regression, Signature
+from fbse_drake.effects.friction import ViscousFriction
 
 BLOCKS, ROWS = 400, 3
 
@@ -55,3 +59,21 @@ def test_a_row_that_gains_much_is_not_weighed_down_by_one_that_does_not() -> Non
     residual[:, 0] += 10.0 * columns[:, 0, 0]
     bound, drop = bound_and_drop(residual, columns)
     assert 500 < drop <= bound
+
+
+def test_rivals_may_be_on_those_joints_of_a_group_that_are_free() -> None:
+    """An effect of all joints may stand for another one that some of them have already."""
+    course = ARM.course(1)
+    viscous = np.array([30.0, 20.0, 10.0, 0.5, 0.5, 0.5])
+    log = ARM.log(course, course.torque + viscous * course.velocity)
+    proposals = Proposals(Fits(Dictionary(ARM.predictor(log), [ViscousFriction])))
+    base = proposals.fits.explain([])
+    for joint in ARM.joints[:3]:
+        base = proposals.beside(base, ViscousFriction, (joint,))
+    free = tuple(ARM.joints[3:])
+
+    def targets(*, in_part: bool) -> set[tuple[str, ...]]:
+        return {c.targets for c in proposals.promising(base, None, in_part=in_part)}
+
+    assert targets(in_part=False) == {(joint,) for joint in free}
+    assert targets(in_part=True) == {free, *((joint,) for joint in free)}

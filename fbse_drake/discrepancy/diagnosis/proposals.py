@@ -59,6 +59,8 @@ class Proposals:
         rows: np.ndarray | None,
         wanted: float = 0.0,
         share: float = _ENOUGH,
+        *,
+        in_part: bool = False,
     ) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over.
 
@@ -67,6 +69,7 @@ class Proposals:
             wanted: drop of the deviance; what is far from it, with values of its grid or linear
                 about no effect at all, is left out.
             share: so much of what is required is enough.
+            in_part: of groups of joints some of which have an effect already also the others.
         """
         fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
         # First, for the other effects are being predicted beside.
@@ -89,13 +92,10 @@ class Proposals:
         for k, effect in enumerate(dictionary.joint_effects):
             dictionary.progress(LOOKING, 0.3 * k / len(dictionary.joint_effects))
             taken = {joint for c in base.candidates if c.effect is effect for joint in c.targets}
-            for group in dictionary.groups_of(effect):
+            groups = dictionary.groups_of(effect)
+            for group in _free(groups, taken, in_part=in_part):
                 places = dictionary.rows_of(effect, group)
-                if (
-                    taken & set(group)
-                    or (effect, group) in self._barred
-                    or not changed[places].any()
-                ):
+                if (effect, group) in self._barred or not changed[places].any():
                     continue
                 moments = self._grid_moments(effect, places, beside)
                 parameters = dictionary.parameters(effect, *group)
@@ -103,7 +103,7 @@ class Proposals:
                 best = int(gain.argmax())
                 alone = [float(grid_gain(parameters, *of_row).max()) for of_row in moments]
                 if self._may_reach(wanted, base, places, alone):
-                    coarse[group].append((float(gain[best]), effect, best))
+                    coarse.setdefault(group, []).append((float(gain[best]), effect, best))
         for group, found in coarse.items():
             # What the grid shows far behind the best does not catch up between its points.
             # (A share of measured torque seems to explain more than it does.)
@@ -327,6 +327,18 @@ def largest_drop(
 def fixed_gain(gram: np.ndarray, right: np.ndarray) -> float:
     """Drop of the sum of squares by columns with these inner products, roughly."""
     return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+
+
+def _free(
+    groups: Sequence[tuple[str, ...]], taken: Set[str], *, in_part: bool
+) -> list[tuple[str, ...]]:
+    """Groups of joints of which none is taken, and of the others what is left if that is wished and
+    several are."""
+    whole = [group for group in groups if not taken & set(group)]
+    if not in_part:
+        return whole
+    left = (tuple(joint for joint in group if joint not in taken) for group in groups)
+    return list(dict.fromkeys([*whole, *(group for group in left if len(group) > 1)]))
 
 
 def grid_gain(

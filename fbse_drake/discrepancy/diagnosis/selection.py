@@ -95,7 +95,7 @@ def best_additions(
         in_part: also what the log shows too little of to be named, see `could_be`.
     """
     fits = proposals.fits
-    promising, found = proposals.promising(base, rows, base.deviance - most), []
+    promising, found = proposals.promising(base, rows, base.deviance - most, in_part=in_part), []
     tried = [
         *([candidate] for candidate in promising),
         *proposals.together(base, promising),
