@@ -17,7 +17,12 @@ from fbse_drake.discrepancy.diagnosis.selection import is_shown
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
-from fbse_drake.discrepancy.residual.noise import channel_noise, likeliest_noise, noise_power
+from fbse_drake.discrepancy.residual.noise import (
+    channel_noise,
+    is_white,
+    likeliest_noise,
+    noise_power,
+)
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
@@ -283,6 +288,15 @@ def test_what_is_as_believed_or_no_noise_is_not_taken_for_more_noise(
 ) -> None:
     assert likeliest_noise(left_in_a_row(white, wave, 3), 5, [0]) is None
     assert likeliest_noise(left_in_a_row(0.05, 0.0, 3), 5, []) is None
+
+
+def test_nothing_is_no_noise() -> None:
+    residual = left_in_a_row(0.0, 0.0, 1)
+    nothing = np.zeros_like(residual.value)
+    silent = replace(residual, value=nothing, variance=nothing, covariance=nothing)
+    assert likeliest_noise(silent, 5, [0]) is None
+    assert not is_white(np.ones(50))
+    assert not is_white(np.ones(2))
 
 
 def test_coloured_undoes_whitening() -> None:

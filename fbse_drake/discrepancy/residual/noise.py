@@ -309,6 +309,8 @@ def is_white(values: np.ndarray) -> bool:
     Introduction to Stochastic Processes", 9.2)."""
     power = np.abs(np.fft.rfft(values - values.mean()))[1:-1] ** 2
     count = len(power)
+    if count == 0 or power.sum() == 0.0:
+        return False
     even = np.abs(np.cumsum(power) / power.sum() - np.arange(1, count + 1) / count).max()
     return bool(kstwobign.sf(even * np.sqrt(count)) > _FALSE_ALARM)
 
@@ -327,7 +329,8 @@ class _Left:
         index = np.flatnonzero(residual.known[:, row])
         adjacent = np.append(np.diff(index) == 1, False)
         covariance = np.where(adjacent, residual.covariance[index, row], 0.0)
-        return _Left(residual.value[index, row], residual.variance[index, row], covariance)
+        variance = np.maximum(residual.variance[index, row], _ROUNDING)
+        return _Left(residual.value[index, row], variance, covariance)
 
     def _factor(self, more: float, beside: float) -> np.ndarray:
         """Of Cholesky, of so many times that noise and white noise of a variance beside."""
