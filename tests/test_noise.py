@@ -16,13 +16,9 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.selection import is_shown
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
-from fbse_drake.discrepancy.residual.noise import (
-    channel_noise,
-    is_white,
-    likeliest_noise,
-    noise_power,
-)
+from fbse_drake.discrepancy.residual.noise import channel_noise, noise_power
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
@@ -295,8 +291,6 @@ def test_nothing_is_no_noise() -> None:
     nothing = np.zeros_like(residual.value)
     silent = replace(residual, value=nothing, variance=nothing, covariance=nothing)
     assert likeliest_noise(silent, 5, [0]) is None
-    assert not is_white(np.ones(50))
-    assert not is_white(np.ones(2))
 
 
 def test_coloured_undoes_whitening() -> None:

@@ -40,7 +40,8 @@ from fbse_drake.discrepancy.identification.structure import (
     noisy_rows,
     untested_rows,
 )
-from fbse_drake.discrepancy.residual.noise import Noise, likeliest_noise
+from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
+from fbse_drake.discrepancy.residual.noise import Noise
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect

@@ -530,18 +530,20 @@ def _simpler(
         )
     ]
 
-    def reduced(reduction: Reduction) -> Explanation:
+    @cache
+    def reduced(k: int) -> Explanation:
+        reduction = reductions[k]
         shared = _shared(explanation, member, reduction)
         alone = [explanation, *_apart(proposals, explanation, member, shared)]
         found = (_with_laws(proposals, one, member, reduction.effects) for one in alone)
         return min(found, key=lambda e: e.deviance)
 
     # What is better and smaller comes before what is worse by no more than chance.
-    for largest in reductions[-1:]:
-        if _may_be_without(explanation, member, largest):
-            yield from _with_another(proposals, judge, explanation, reduced(largest), member)
-    for reduction in reductions:
-        smaller = reduced(reduction)
+    last = len(reductions) - 1
+    if reductions and _may_be_without(explanation, member, reductions[last]):
+        yield from _with_another(proposals, judge, explanation, reduced(last), member)
+    for k, reduction in enumerate(reductions):
+        smaller = reduced(k)
         is_needless = smaller.deviance <= explanation.deviance or (
             _is_without(explanation, member, reduction)
             and judge.is_nearly_as_good(smaller, explanation, member)

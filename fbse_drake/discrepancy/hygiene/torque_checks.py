@@ -21,7 +21,13 @@ from fbse_drake.discrepancy.hygiene.torque_readings import (
     chance,
     gain,
 )
-from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding, remark, remarks
+from fbse_drake.discrepancy.residual.evidence import (
+    Evidence,
+    HygieneFinding,
+    Severity,
+    remark,
+    remarks,
+)
 from fbse_drake.effects.actuation import TorqueReadingLag
 
 CHANNEL = "joint/torque_command"
@@ -240,12 +246,12 @@ def _clock(
         )
         # A short one is looked for as an effect.
         motion = evidence.motion
+        severity: Severity = "untrustworthy"
         is_sampled = motion.recording.rows == "instantaneous"
         if is_sampled and seconds <= motion.length * motion.period:
+            severity = "warning"
             text += f"; {TorqueReadingLag.__name__} allows for it"
-            yield remark("clock_offset", "warning", CHANNEL, seconds, "s", text, where)
-        else:
-            yield remark("clock_offset", "untrustworthy", CHANNEL, seconds, "s", text, where)
+        yield remark("clock_offset", severity, CHANNEL, seconds, "s", text, where)
     if early:
         seconds = float(np.median(early))
         text = (

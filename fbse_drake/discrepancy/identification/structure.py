@@ -80,7 +80,7 @@ def leftover_structure(
                 continue
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
-            is_noise = usual < _tolerated(white, k) or _is_white(left[:, k], int(white.count[k]))
+            is_noise = usual < _tolerated(white, k) or is_white(left[:, k], int(white.count[k]))
             if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
@@ -165,7 +165,7 @@ def _without_impacts(left: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.clip(left, -largest, largest)
 
 
-def _is_white(left: np.ndarray, count: int) -> bool:
+def is_white(left: np.ndarray, count: int) -> bool:
     """Does what is left of a row (B,) tell nothing of what comes later? (G. M. Ljung and G. E. P.
     Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.)
 

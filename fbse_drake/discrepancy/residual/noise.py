@@ -1,14 +1,12 @@
 """How noisy the rows of a residual are: white noise shows in differences of neighbours, of which
 what is missing in a model has next to nothing."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_banded, toeplitz
-from scipy.optimize import minimize
+from scipy.linalg import toeplitz
 from scipy.special import comb
-from scipy.stats import chi2, kstwobign
+from scipy.stats import chi2
 
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
 from fbse_drake.discrepancy.residual.residual import (
@@ -37,10 +35,6 @@ _LEAST, _FALSE_ALARM = 1.15, 1e-3
 _SCALES, _SURE = (1, 2, 4, 8), 2.0
 # The same of a channel, in which motion that is as fast as noise may be most of the excess.
 _LEAST_OF_CHANNEL = 1.3
-# White noise beside that of the sensors, as a share of its variance: none, and a guess.
-_NO_SHARE, _SHARE = 1e-9, 1e-2
-# Logarithm of more noise than there is in any log, in place of what is believed.
-_MOST = 30.0
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 # Share of the torque below which noise that nobody believes in is not worth a word.
@@ -266,9 +260,10 @@ def measured_noise(
     white = missed + more * length
     # What neighbours differ by beside that is the sensors'.
     power, typical = levels[0].power, levels[0].typical
-    beside = power.ratio - np.divide(more, typical, out=np.zeros(rows), where=typical > 0)
+    added = np.divide(more, typical, out=np.zeros(rows), where=typical > 0)
+    beside = power.ratio - added
     sensors = np.where(noisy & (beside > levels[0].least), beside, 1.0)
-    ratio = sensors + np.divide(more, typical, out=np.zeros(rows), where=typical > 0)
+    ratio = sensors + added
 
     torque = motion.torque_variance(motion.blocks.torque_command)
     n = torque.shape[1]
@@ -281,80 +276,6 @@ def measured_noise(
             if np.log(likely / power.ratio[row]) < 2 * np.sqrt(2 / power.freedom[row]):
                 white[row], ratio[row] = missed[row] + share * torque[row], likely
     return Noise(channels, white, sensors, np.sqrt(ratio))
-
-
-def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
-    """Noise of rows in which nothing but noise is left, by maximum likelihood: how much more there
-    is of that of the sensors, and how much white noise beside; None if none of these rows has more
-    than is believed, or what is left is not such noise.
-
-    Args:
-        length: of a block [steps].
-    """
-    count = residual.value.shape[1]
-    white, sensors, factor = np.zeros(count), np.ones(count), np.ones(count)
-    least = chi2.isf(_FALSE_ALARM / max(1, len(rows)), 2)
-    for row in rows:
-        left = _Left.of(residual, row)
-        more, beside = left.likeliest()
-        gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
-        if gained > least and is_white(left.whitened(more, beside)):
-            sensors[row], white[row] = more, beside * length
-            factor[row] = np.sqrt(more + beside / left.variance.mean())
-    return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
-
-
-def is_white(values: np.ndarray) -> bool:
-    """May values (B,) be white noise? By their cumulative periodogram (Bartlett 1955, "An
-    Introduction to Stochastic Processes", 9.2)."""
-    power = np.abs(np.fft.rfft(values - values.mean()))[1:-1] ** 2
-    count = len(power)
-    if count == 0 or power.sum() == 0.0:
-        return False
-    even = np.abs(np.cumsum(power) / power.sum() - np.arange(1, count + 1) / count).max()
-    return bool(kstwobign.sf(even * np.sqrt(count)) > _FALSE_ALARM)
-
-
-@dataclass(frozen=True)
-class _Left:
-    """What is left in a row where it is known, and its noise as it is believed, (B,)."""
-
-    value: np.ndarray
-    variance: np.ndarray
-    # With the next value.
-    covariance: np.ndarray
-
-    @staticmethod
-    def of(residual: Residual, row: int) -> "_Left":
-        index = np.flatnonzero(residual.known[:, row])
-        adjacent = np.append(np.diff(index) == 1, False)
-        covariance = np.where(adjacent, residual.covariance[index, row], 0.0)
-        variance = np.maximum(residual.variance[index, row], _ROUNDING)
-        return _Left(residual.value[index, row], variance, covariance)
-
-    def _factor(self, more: float, beside: float) -> np.ndarray:
-        """Of Cholesky, of so many times that noise and white noise of a variance beside."""
-        band = np.stack([more * self.variance + beside, more * self.covariance])
-        return cholesky_banded(band, lower=True)
-
-    def whitened(self, more: float, beside: float) -> np.ndarray:
-        return solve_banded((1, 0), self._factor(more, beside), self.value)
-
-    def deviance(self, more: float, beside: float) -> float:
-        """With that noise."""
-        spread = 2 * np.log(self._factor(more, beside)[0]).sum()
-        return float(spread + (self.whitened(more, beside) ** 2).sum())
-
-    def likeliest(self) -> tuple[float, float]:
-        """How many times the noise, and the variance of white noise beside."""
-        typical = float(self.variance.mean())
-        found = minimize(
-            lambda x: self.deviance(np.exp(x[0]), typical * np.exp(x[1])),
-            np.log([1.0, _SHARE]),
-            bounds=[(0.0, _MOST), (np.log(_NO_SHARE), _MOST)],
-            method="L-BFGS-B",
-        )
-        return float(np.exp(found.x[0])), typical * float(np.exp(found.x[1]))
 
 
 def missed_torque(motion: RecordedMotion) -> np.ndarray:

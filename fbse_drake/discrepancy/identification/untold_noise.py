@@ -1,0 +1,89 @@
+"""Noise that nobody told of and that shows only in what is left when everything is explained."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky_banded, solve_banded
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from fbse_drake.discrepancy.identification.structure import is_white
+from fbse_drake.discrepancy.residual.noise import Noise
+from fbse_drake.discrepancy.residual.residual import Residual
+
+# Probability of calling any noise larger than believed by chance.
+_FALSE_ALARM = 1e-3
+# White noise beside that of the sensors, as a share of its variance: none, and a guess.
+_NO_SHARE, _SHARE = 1e-9, 1e-2
+# Logarithm of more noise than there is in any log, in place of what is believed.
+_MOST = 30.0
+# Variance below which a row without any noise is rounding.
+_ROUNDING = 1e-18
+
+
+def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
+    """Noise of rows in which nothing but noise is left, by maximum likelihood: how much more there
+    is of that of the sensors, and how much white noise beside; None if none of these rows has more
+    than is believed, or what is left is not such noise.
+
+    Args:
+        length: of a block [steps].
+    """
+    count = residual.value.shape[1]
+    white, sensors, factor = np.zeros(count), np.ones(count), np.ones(count)
+    least = chi2.isf(_FALSE_ALARM / max(1, len(rows)), 2)
+    for row in rows:
+        left = _Left.of(residual, row)
+        more, beside = left.likeliest()
+        gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
+        if gained > least and left.is_noise(more, beside):
+            sensors[row], white[row] = more, beside * length
+            factor[row] = np.sqrt(more + beside / left.variance.mean())
+    return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What is left in a row where it is known, and its noise as it is believed, (B,)."""
+
+    value: np.ndarray
+    variance: np.ndarray
+    # With the next value.
+    covariance: np.ndarray
+
+    @staticmethod
+    def of(residual: Residual, row: int) -> "_Left":
+        index = np.flatnonzero(residual.known[:, row])
+        adjacent = np.append(np.diff(index) == 1, False)
+        covariance = np.where(adjacent, residual.covariance[index, row], 0.0)
+        variance = np.maximum(residual.variance[index, row], _ROUNDING)
+        return _Left(residual.value[index, row], variance, covariance)
+
+    def _factor(self, more: float, beside: float) -> np.ndarray:
+        """Of Cholesky, of so many times that noise and white noise of a variance beside."""
+        band = np.stack([more * self.variance + beside, more * self.covariance])
+        return cholesky_banded(band, lower=True)
+
+    def whitened(self, more: float, beside: float) -> np.ndarray:
+        return solve_banded((1, 0), self._factor(more, beside), self.value)
+
+    def is_noise(self, more: float, beside: float) -> bool:
+        """Is nothing but that noise left?"""
+        return is_white(self.whitened(more, beside), len(self.value))
+
+    def deviance(self, more: float, beside: float) -> float:
+        """With that noise."""
+        spread = 2 * np.log(self._factor(more, beside)[0]).sum()
+        return float(spread + (self.whitened(more, beside) ** 2).sum())
+
+    def likeliest(self) -> tuple[float, float]:
+        """How many times the noise, and the variance of white noise beside."""
+        typical = float(self.variance.mean())
+        found = minimize(
+            lambda x: self.deviance(np.exp(x[0]), typical * np.exp(x[1])),
+            np.log([1.0, _SHARE]),
+            bounds=[(0.0, _MOST), (np.log(_NO_SHARE), _MOST)],
+            method="L-BFGS-B",
+        )
+        return float(np.exp(found.x[0])), typical * float(np.exp(found.x[1]))
