@@ -89,6 +89,8 @@ def test_commands_are_not_read():
     predictor = Predictor(scenario, MACHINE.log(course))
     dictionary = Dictionary(predictor, [TorqueReadingLag], lambda *_: None)
     assert not dictionary.groups_of(TorqueReadingLag)
+    status = diagnose(predictor, [TorqueReadingLag]).effects["TorqueReadingLag"]
+    assert (status.verdict, status.smallest_detectable) == ("not_visible", {})
     sampled = Dictionary(
         MACHINE.predictor(MACHINE.log(course)), [TorqueReadingLag], lambda *_: None
     )

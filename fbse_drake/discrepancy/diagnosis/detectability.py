@@ -56,6 +56,9 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
                 )
             )
         return result
+    if not fits.dictionary.groups_of(effect):
+        # It is not looked for.
+        return {}
     grid = fits.grid(effect)
     has_linear = any(parameter.linear for parameter in effect.parameters.values())
     for row, joint in enumerate(fits.dictionary.joints):
