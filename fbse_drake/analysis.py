@@ -287,7 +287,7 @@ class DiagnosisResult(Diagnosis, AnalysisResult):
         return figures.ranking(self.ranking)
 
     def further_tables(self) -> list[Table]:
-        return spread_tables(self.chosen)
+        return spread_tables(self.completing)
 
     def _json(self) -> dict[str, Any]:
         return diagnosing.diagnosis_json(self)
@@ -457,8 +457,8 @@ def diagnose(
             processes.begin(lambda _: [*map(drawn, how_it_falls(diagnosis, trusted.robot))]),
         ]
         set_aside = {}
-        if diagnosis.chosen:
-            completed = addition.add(case.trusted, diagnosis.chosen)
+        if diagnosis.completing:
+            completed = addition.add(case.trusted, diagnosis.completing)
             set_aside = {
                 test: validated(other, other.of(completed)) for test, other in tested.items()
             }
@@ -536,13 +536,14 @@ def add(scenario: Scenario, found: Diagnosis | Iterable[Finding]) -> Scenario:
     """The scenario with what was found in its model.
 
     Args:
-        found: a diagnosis, of which everything that it chose is added; or findings, as some of its
-            `ranking`.
+        found: a diagnosis, of which everything that it chose is added, and what is tentative; or
+            findings, as some of its `ranking`.
 
     Raises:
         InputError: an effect that the library does not have.
     """
-    return addition.add(scenario, found.chosen if isinstance(found, Diagnosis) else list(found))
+    findings = found.completing if isinstance(found, Diagnosis) else list(found)
+    return addition.add(scenario, findings)
 
 
 def hide(

@@ -291,6 +291,23 @@ def test_a_joint_at_rest_does_not_tell_which_of_its_bodies_carries_a_load(tmp_pa
     assert found.parameters["mass"].value == pytest.approx(load.mass, rel=0.02)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_load_whose_mass_does_not_show_is_none_that_is_ruled_out(seed: int, tmp_path: Path):
+    """Of one near the axis that bears it only the first moment shows, as of a centre of mass."""
+    load = Load("link_2", 2.0, (0.05, 0.1, 0.0))
+    scenario, log = swung(tmp_path, "arm", load, seed=seed)
+    diagnosis = diagnose(Predictor(scenario, log), EFFECTS)
+    assert diagnosis.verdict == "effect_found"
+    (found,) = diagnosis.chosen
+    assert "Payload" in found.confusable_with
+    (rival,) = (f for f in diagnosis.ranking if (f.effect, f.targets) == ("Payload", ("link_2",)))
+    # What it has of a mass is one that it can have at its place.
+    mass = rival.parameters["mass"].value
+    place = np.array([rival.parameters[axis].value for axis in "xyz"])
+    assert 0.0 < mass < 20.0
+    assert np.linalg.norm(place) < 0.5
+
+
 def test_identification_is_not_held_back_by_the_model(tmp_path: Path) -> None:
     """A load of 25 times the hand's own mass: as least squares on the same rows, whose columns
     nobody believes anything of."""

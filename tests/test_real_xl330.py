@@ -64,7 +64,7 @@ def diagnosis(train: Log, believed: Scenario) -> Diagnosis:
 
 @pytest.fixture(scope="module")
 def found(diagnosis: Diagnosis, believed: Scenario) -> Scenario:
-    return add(believed, diagnosis.chosen)
+    return add(believed, diagnosis.completing)
 
 
 def mean_error(error: RolloutError | None) -> float:
@@ -93,7 +93,10 @@ def test_the_firmware_commands_what_the_model_of_it_says(train: Log, believed: S
 
 def test_friction_that_grows_with_the_load_is_found(diagnosis: Diagnosis):
     chosen = {finding.effect: finding for finding in diagnosis.chosen}
-    assert set(chosen) >= {"LoadDependentFriction", "TorqueRollOff", "ReflectedInertia"}
+    assert set(chosen) >= {"LoadDependentFriction", "ReflectedInertia"}
+    # That torque rolls off takes less than what nobody explains.
+    assert "TorqueRollOff" in {finding.effect for finding in diagnosis.completing}
+    assert len(chosen) <= 4
     low, high = chosen["LoadDependentFriction"].parameters["coefficient"].interval
     assert 0.25 < low < high < 0.6
     # What the published models say of the rotor: 0.0016 to 0.0021 kg m^2.

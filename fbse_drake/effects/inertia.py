@@ -46,6 +46,17 @@ class InertiaEffect(Effect):
         return None
 
     @staticmethod
+    def nearby(about: np.ndarray, values: np.ndarray) -> np.ndarray:  # noqa: ARG004
+        """Values about which to be linear next, where a fit that is linear about some values found
+        others, (parameters,)."""
+        return values
+
+    @staticmethod
+    def lowest_nearby(about: np.ndarray) -> np.ndarray | float:  # noqa: ARG004
+        """Smallest values for which what is linear about some values holds, (parameters,)."""
+        return -np.inf
+
+    @staticmethod
     def rotor_inertia(values: np.ndarray) -> np.ndarray:
         """What is added to the rotor inertia of each joint, shape (n,) [kg m^2].
 
@@ -196,8 +207,9 @@ class BodyCentreOfMass(InertiaEffect):
 # Half the distance of the masses that stand for a second moment [m]; what they add does not depend
 # on it.
 _ARM = 0.1
-# Mass of the payload about which a search for one begins [kg].
-_SOME_MASS = 1.0
+# Mass of the payload about which a search for one begins [kg]; and the smallest one, as a share of
+# it, for which what is linear about a mass says where it is.
+_SOME_MASS, _LEAST_SHARE = 1.0, 0.25
 
 
 @in_library
@@ -262,6 +274,18 @@ class Payload(InertiaEffect):
     @staticmethod
     def expansion_point(body: RigidBody) -> np.ndarray:
         return np.array([_SOME_MASS, *body.default_com(), 0.0, 0.0, 0.0])
+
+    @staticmethod
+    def nearby(about: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """With no less than a share of the mass, where the first moment is the one that was fitted:
+        what has no mass has no place."""
+        mass, place = max(values[0], _LEAST_SHARE * about[0]), values[1:4]
+        first_moment = about[0] * place + (values[0] - about[0]) * about[1:4]
+        return np.array([mass, *first_moment / mass, *values[4:]])
+
+    @staticmethod
+    def lowest_nearby(about: np.ndarray) -> np.ndarray:
+        return np.append(_LEAST_SHARE * about[0], np.full(6, -np.inf))
 
     @staticmethod
     def point_masses(body: RigidBody, values: np.ndarray) -> list[PointMass]:

@@ -183,7 +183,7 @@ def write_diagnosis_report(
         (
             "How sure",
             how_sure(
-                diagnosis.chosen,
+                diagnosis.completing,
                 diagnosis.held_out_before,
                 diagnosis.held_out_after,
                 diagnosis.train_after,
@@ -192,7 +192,7 @@ def write_diagnosis_report(
         ),
         (
             "What else it could be",
-            what_else(diagnosis.chosen, partial=diagnosis.partial is not None),
+            what_else(diagnosis.completing, partial=diagnosis.partial is not None),
         ),
         *too_small_rows(diagnosis.too_small),
         ("What was looked for", verdicts_text(statuses)),
@@ -349,7 +349,7 @@ def _worst(comparison: Comparison) -> list[Channel]:
 
 def why_it_fails(diagnosis: Diagnosis) -> list[Section]:
     """What was found, with its values and the alternatives, and what is left."""
-    return _why([diagnosis.chosen], diagnosis.ranking, diagnosis.unexplained)
+    return _why([diagnosis.completing], diagnosis.ranking, diagnosis.unexplained)
 
 
 def _why(
@@ -360,7 +360,7 @@ def _why(
     """What was found in each round, with its values and the alternatives, and what is left without
     an explanation."""
     chosen = [finding for found in rounds for finding in found]
-    others = [finding for finding in alternatives if not finding.chosen][:_ALTERNATIVES]
+    others = [f for f in alternatives if not (f.chosen or f.tentative)][:_ALTERNATIVES]
     of_round = [f", round {k}" * (k > 1) for k, found in enumerate(rounds, start=1) for _ in found]
     tables, blocks = value_tables(rounds), []
     if unexplained:

@@ -69,6 +69,11 @@ VERDICT_COLORS = {
     "absent": ESTIMATE,
     "not_visible": "#a9b0b7",
 }
+_ROLE_COLORS = {
+    "part of the explanation": ESTIMATE,
+    "part of the explanation, tentative": "#7fb2e5",
+    "an alternative": VERDICT_COLORS["confusable"],
+}
 
 
 def robot_errors(robot: Robot, comparison: Comparison, posture: np.ndarray) -> Figure:
@@ -553,13 +558,8 @@ def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
         [getattr(finding, name) for finding in findings]
         for name in ("held_out_before", "held_out_after")
     ]
-    labels = [
-        "with the effect: part of the explanation"
-        if f.chosen
-        else "with the effect: an alternative"
-        for f in findings
-    ]
-    colors = [ESTIMATE if finding.chosen else VERDICT_COLORS["confusable"] for finding in findings]
+    labels = [f"with the effect: {_role(finding)}" for finding in findings]
+    colors = [_ROLE_COLORS[_role(finding)] for finding in findings]
     _draw_falls(
         axes,
         names or [finding_name(finding) for finding in findings],
@@ -573,6 +573,12 @@ def ranking(findings: Sequence[Finding], names: Sequence[str] = ()) -> Figure:
     )
     add_legend(figure)
     return figure
+
+
+def _role(finding: Finding) -> str:
+    if finding.tentative:
+        return "part of the explanation, tentative"
+    return "part of the explanation" if finding.chosen else "an alternative"
 
 
 def finding_name(finding: Finding) -> str:

@@ -43,7 +43,7 @@ def failures_table(comparison: Comparison) -> Table:
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
-    """Findings with their values; what was not chosen stands in brackets.
+    """Findings with their values; what is not part of the explanation stands in brackets.
 
     One effect that was found in several places is one row, with the values of each, or, where
     these are many, with their range.
@@ -51,7 +51,9 @@ def findings_table(findings: Sequence[Finding]) -> Table:
     header = ("effect", "in", "held-out error before", "after", "values (95 % interval)")
     groups: dict[object, list[Finding]] = {}
     for k, finding in enumerate(findings):
-        groups.setdefault(finding.effect if finding.chosen else k, []).append(finding)
+        is_alternative = not (finding.chosen or finding.tentative)
+        key = k if is_alternative else (finding.effect, finding.tentative)
+        groups.setdefault(key, []).append(finding)
     shown = list(groups.values())[:_FAILURES]
     return Table(header, tuple(_findings_row(group) for group in shown))
 
@@ -67,7 +69,7 @@ def _findings_row(group: Sequence[Finding]) -> tuple[str, ...]:
         places = (targets_text(finding.targets, effect) for finding in group)
         values = [f"{place}: {text}" for place, text in zip(places, values, strict=True) if text]
     return (
-        spaced(effect) if group[0].chosen else f"({spaced(effect)})",
+        _with_role(spaced(effect), group[0]),
         targets_text(targets, effect),
         *(
             _span([getattr(finding, name) for finding in group])
@@ -75,6 +77,13 @@ def _findings_row(group: Sequence[Finding]) -> tuple[str, ...]:
         ),
         "; ".join(values),
     )
+
+
+def _with_role(name: str, finding: Finding) -> str:
+    """The name of an effect with what it is of the explanation."""
+    if finding.tentative:
+        return f"{name}, tentative"
+    return name if finding.chosen else f"({name})"
 
 
 def _spans_of_values(group: Sequence[Finding]) -> list[str]:
@@ -222,9 +231,7 @@ def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
             values = map(_value_text, finding.parameters.values())
             errors = (finding.held_out_before, finding.held_out_after)
             place = (targets_text(finding.targets, effect), *([str(number_of)] * several))
-            rows.append(
-                (*place, *values, *errors, either_effect(finding.confusable_with) or "no other")
-            )
+            rows.append((*place, *values, *errors, _explaining_as_much(finding)))
         units = [
             f"{words(name)} [{estimate.unit}]"
             for name, estimate in findings[0][1].parameters.items()
@@ -244,6 +251,13 @@ def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
                 says.append(meanings)
         tables.append(Table(header, tuple(rows), f"{' '.join(says)} Values with 95 % intervals."))
     return tables
+
+
+def _explaining_as_much(finding: Finding) -> str:
+    others = either_effect(finding.confusable_with)
+    if finding.tentative:
+        return f"{others}, or something else" if others else "maybe something else"
+    return others or "no other"
 
 
 def parameters_explained(effect: type[Effect]) -> str:

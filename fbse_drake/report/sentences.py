@@ -90,8 +90,8 @@ def diagnosis_outcome(diagnosis: Diagnosis) -> str:
     parts += [_disturbed(one) for one in diagnosis.disturbances]
     if diagnosis.refuted:
         parts.append(_refuted(diagnosis.refuted))
-    if _disagreement(diagnosis.chosen):
-        parts.append(_disagreement(diagnosis.chosen))
+    if _disagreement(diagnosis.completing):
+        parts.append(_disagreement(diagnosis.completing))
     if diagnosis.noisier:
         parts.append(
             f"What is left in {_rows(diagnosis.noisier)} is white and more than is believed of "
@@ -202,10 +202,10 @@ def too_small_rows(findings: Sequence[Finding]) -> list[tuple[str, str]]:
 
 def _partly(diagnosis: Diagnosis) -> str:
     """What is known of a search that ended early."""
-    if not diagnosis.chosen:
+    if not diagnosis.completing:
         return "Nothing was found until then; that rules nothing out."
     return (
-        f"Until then it seems that the model lacks {listed_effects(diagnosis.chosen)}; "
+        f"Until then it seems that the model lacks {listed_effects(diagnosis.completing)}; "
         "rivals were not compared."
     )
 
@@ -229,8 +229,9 @@ def _verdict(diagnosis: Diagnosis) -> str:
         )
         doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
         if is_refuted(diagnosis.set_aside):
-            return f"{_suggested(found)}{doubt}."
-        return f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}{_open(diagnosis)}"
+            return f"{_suggested(found)}{doubt}.{_tentative(diagnosis.tentative)}"
+        text = f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}"
+        return f"{text}{_tentative(diagnosis.tentative)}{_open(diagnosis)}"
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
@@ -268,7 +269,18 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if found:
         refuted = is_refuted(diagnosis.set_aside)
         known = f" {_suggested(found)}." if refuted else f" The model also lacks {found}."
-    return f"{_unexplained(diagnosis)}{known}"
+    return f"{_unexplained(diagnosis)}{known}{_tentative(diagnosis.tentative)}"
+
+
+def _tentative(findings: Sequence[Finding]) -> str:
+    """Says what explains something and may stand for something else; empty if nothing does."""
+    if not findings:
+        return ""
+    each = "it takes" if len(findings) == 1 else "each of them takes"
+    return (
+        f" {as_sentence(listed_effects(findings))[:-1]} would explain more, but more is left there "
+        f"than {each} off: that is tentative, for it may stand for something else."
+    )
 
 
 def _open(diagnosis: Diagnosis) -> str:
@@ -293,7 +305,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     places = ", ".join(
         f"{words(left.row)} (follows {left.variable})" if left.share > _FOLLOWS else words(left.row)
         for left in diagnosis.unexplained
-    )
+    ) or _enumerated([targets_text(f.targets, f.effect) for f in diagnosis.tentative])
     return f"Something is missing that no effect of the library explains, in {places}."
 
 
@@ -312,11 +324,13 @@ def study_outcome(study: Study) -> str:
 def _study_result(study: Study) -> str:
     ended = study.diagnoses[-1]
     if not study.found:
-        refused = ended.chosen and ended.partial is None
+        refused = ended.completing and ended.partial is None
         return _not_added(ended) if refused else diagnosis_outcome(ended)
-    found = listed_effects(study.found)
+    found = listed_effects([f for f in study.found if not f.tentative])
     refuted = is_refuted(study.set_aside)
     result = f"{_suggested(found)}." if refuted else f"The model lacked {found}."
+    result = f"{result if found else ''}{_tentative([f for f in study.found if f.tentative])}"
+    result = result.strip()
     if study.set_aside:
         result = _headline(result, study.set_aside)
     else:
@@ -337,8 +351,8 @@ def _study_result(study: Study) -> str:
 def _not_added(diagnosis: Diagnosis) -> str:
     """Of what a study found and did not add."""
     result = (
-        f"Nothing was added: {listed_effects(diagnosis.chosen)} would not lower the held-out error "
-        f"({number(diagnosis.held_out_before)} times the sensors' noise, with it "
+        f"Nothing was added: {listed_effects(diagnosis.completing)} would not lower the held-out "
+        f"error ({number(diagnosis.held_out_before)} times the sensors' noise, with it "
         f"{number(diagnosis.held_out_after)})."
     )
     if diagnosis.verdict == "unknown_effect":
@@ -381,14 +395,14 @@ def steps_after_compare(comparison: Comparison, inputs: Inputs) -> tuple[Step, .
 def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, ...]:
     """What to do after a diagnosis, the most important first."""
     steps = []
-    if diagnosis.chosen and not is_refuted(diagnosis.set_aside):
+    if diagnosis.completing and not is_refuted(diagnosis.set_aside):
         completed = f"{inputs.name}_completed.yaml"
         command = f"fbse add {inputs.scenario} {inputs.out} --out {completed}"
         steps.append(Step("Add it to the model:", command))
-    elif diagnosis.chosen:
+    elif diagnosis.completing:
         command = f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)} --test ANOTHER_LOG"
         steps.append(Step("See whether another log confirms it, before it is added:", command))
-    return (*steps, *_experiments_next(diagnosis, diagnosis.chosen)) or (_NOTHING,)
+    return (*steps, *_experiments_next(diagnosis, diagnosis.completing)) or (_NOTHING,)
 
 
 def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
@@ -577,8 +591,8 @@ def applicable(statuses: Mapping[str, EffectStatus]) -> dict[str, EffectStatus]:
 def statuses_of(study: Study) -> dict[str, EffectStatus]:
     """What all rounds together say of every effect: the last one, but for what was found before and
     what stood for it as well."""
-    found = {finding.effect for finding in study.found}
-    equal = {name for finding in study.found for name in finding.confusable_with}
+    found = {finding.effect for finding in study.found if not finding.tentative}
+    equal = {name for finding in study.found for name in (finding.effect, *finding.confusable_with)}
     return {
         name: replace(
             status,

@@ -23,7 +23,7 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
     Args:
         diagnosis: its contents.
         effect: which effect of the ranking, on the targets where it explains most; by default all
-            that the diagnosis chose.
+            that the diagnosis chose, and what is tentative.
 
     Raises:
         InputError: these are not such contents, the ranking has no such effect, or there is nothing
@@ -41,11 +41,13 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
             },
             tuple(entry.confusable_with),
             entry.chosen,
+            entry.tentative,
         )
         for entry in written_diagnosis(diagnosis).ranking
     ]
     named = [finding for finding in ranking if effect in (None, finding.effect)]
-    findings = [finding for finding in named if finding.chosen] or (named[:1] if effect else [])
+    completing = [finding for finding in named if finding.chosen or finding.tentative]
+    findings = completing or (named[:1] if effect else [])
     if not findings:
         names = ", ".join(dict.fromkeys(finding.effect for finding in ranking)) or "none"
         wanted = f"no effect {effect}" if effect else "no effect to add"

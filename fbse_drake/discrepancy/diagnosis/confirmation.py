@@ -53,7 +53,7 @@ def diagnose_confirmed(
     statuses: dict[str, EffectStatus] = {}
     for _ in range(_MOST_SEARCHES):
         try:
-            found = refuted_by(diagnosis.chosen, tests or {}, progress)
+            found = refuted_by(diagnosis.completing, tests or {}, progress)
         except Interrupted as stop:
             return replace(diagnosis, partial=str(stop))
         if diagnosis.partial is not None or not found:

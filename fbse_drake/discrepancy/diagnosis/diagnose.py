@@ -1,7 +1,7 @@
 """Which physical effect does a model lack? Verdicts from what each effect explains of the held-out
 residual."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -38,6 +38,7 @@ from fbse_drake.discrepancy.identification.structure import (
     Structure,
     leftover_structure,
     noisy_rows,
+    tolerated,
     untested_rows,
 )
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
@@ -53,6 +54,9 @@ EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
 # there, and leaves no more than this many times the noise.
 _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
+# A member that takes less than this share of what exceeds the noise in its rows without it is
+# tentative: it leaves more than it takes.
+_MOSTLY = 0.5
 # A search is tried again, so often in all, if less than this share of what it explained pays.
 _HOLDS, _MOST_WAYS = 0.5, 3
 
@@ -80,8 +84,12 @@ class Finding:
     parameters: dict[str, Estimate]
     # Other effects that explain the residual as well.
     confusable_with: tuple[str, ...]
-    # Is it part of the explanation, or only an alternative, or too small to matter?
+    # Is it named, or only an alternative, tentative, or too small to matter?
     chosen: bool
+    # Is it part of the explanation, but takes less off its rows than what is left there? It may
+    # stand for what the library does not have: the completed model gets it, nobody is told that it
+    # is there.
+    tentative: bool = False
     # Of the explanation, but smaller than `IdentifyConfig.tolerance`; and its size as that is
     # measured, NaN where it is not known.
     too_small: bool = False
@@ -187,6 +195,16 @@ class Diagnosis:
         return [finding for finding in self.ranking if finding.chosen]
 
     @property
+    def tentative(self) -> list[Finding]:
+        """What explains something, but may stand for something else."""
+        return [finding for finding in self.ranking if finding.tentative]
+
+    @property
+    def completing(self) -> list[Finding]:
+        """What the completed model gets: what was chosen, and what is tentative."""
+        return [finding for finding in self.ranking if finding.chosen or finding.tentative]
+
+    @property
     def too_small(self) -> list[Finding]:
         """What is there, but too small to matter."""
         return [finding for finding in self.ranking if finding.too_small]
@@ -248,6 +266,13 @@ def diagnose(
     white, dictionary = fits.white, fits.dictionary
     significance, tolerance = dictionary.significance, predictor.scenario.identify.tolerance
     shares = {c: significance.share(final, c) for c in final.candidates}
+    matters = [c for c, share in shares.items() if not share < tolerance]
+    without = {
+        c: fits.explain([other for other in final.candidates if other is not c])
+        for c in final.candidates
+    }
+    named = [c for c in matters if _takes_most(white, without[c], final, c)]
+    tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
     guesses: list[Explanation] = []
@@ -263,25 +288,36 @@ def diagnose(
                 experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):
                 progress("finding what would have been seen", k / len(dictionary.effects))
-                status = _status(fits, final, effect, equal, experiments)
+                status = _status(fits, final, tentative, effect, equal, experiments)
                 statuses[effect.__name__] = status.hidden_in(search.noisy)
     except Interrupted as stop:
         partial = str(stop)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif any(not share < tolerance for share in shares.values()) or (
-        inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
-    ):
+    elif named or (inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN):
         verdict = "effect_found"
+    elif matters:
+        verdict = "unknown_effect"
     elif partial is not None or hidden > 0.5 * len(statuses) or search.untested or search.noisy:
         verdict = "not_visible"
     else:
         verdict = "nothing_missing"
+    members = [
+        replace(
+            finding,
+            tentative=member in tentative,
+            too_small=member not in matters,
+            share=shares[member],
+        )
+        for member, finding in _members(fits, final, without, equal, named)
+    ]
+    others = (e for of_member in alternatives.values() for e in of_member)
     return Diagnosis(
         verdict,
         (
-            *(_sized(f, tolerance) for f in _ranking(fits, path[-1], alternatives, equal, shares)),
+            *members,
+            *_ranked(fits, sorted(others, key=lambda e: e.deviance), members),
             *_ranked(fits, guesses, ()),
             *inertia_findings(white, before, path[0], inertia),
         ),
@@ -466,12 +502,6 @@ def _steps(path: Sequence[Explanation], before: float) -> tuple[SelectionStep, .
     )
 
 
-def _sized(finding: Finding, tolerance: float) -> Finding:
-    """A finding that is chosen only if it is large enough to matter."""
-    small = finding.chosen and finding.share < tolerance
-    return replace(finding, chosen=finding.chosen and not small, too_small=small)
-
-
 def root_mean_square(
     white: WhitenedResidual, sse: np.ndarray, rows: np.ndarray | slice = slice(None)
 ) -> float:
@@ -479,33 +509,47 @@ def root_mean_square(
     return float(np.sqrt(sse[rows].sum() / max(1, white.count[rows].sum())))
 
 
-def _ranking(
+def _takes_most(
+    white: WhitenedResidual, without: Explanation, final: Explanation, member: Candidate
+) -> bool:
+    """Does a member take most of what exceeds the noise in its rows without it?
+
+    Rows count by what it takes there; in one with no more than what the noise may be wrong by
+    nothing is left.
+    """
+    rows = member.signature.rows[white.count[member.signature.rows] > 0]
+    before, after, count = without.held_out_sse[rows], final.held_out_sse[rows], white.count[rows]
+    most = np.array([tolerated(white, row) for row in rows])
+    left = np.where(after > most**2 * count, after - count, 0.0)
+    taken = np.maximum(before - after, 0.0)
+    if not left.any():
+        return True
+    share = taken / np.maximum(taken + left, 1e-30)
+    return bool(taken.any() and np.average(share, weights=taken) >= _MOSTLY)
+
+
+def _members(
     fits: Fits,
     final: Explanation,
-    alternatives: Mapping[int, Sequence[Explanation]],
+    without: Mapping[Candidate, Explanation],
     equal: Mapping[int, Sequence[Explanation]],
-    shares: Mapping[Candidate, float],
-) -> list[Finding]:
-    """What was chosen, then its rivals.
+    named: Collection[Candidate],
+) -> Iterator[tuple[Candidate, Finding]]:
+    """Members of the explanation with what they bring, those that explain most first.
 
     Args:
-        alternatives, equal: by member, rivals and those that explain as much.
+        without: the explanation without each of them.
+        equal: by place of a member, rivals that explain as much.
     """
-    white, spread = fits.white, spreads(fits, final)
-    without = [
-        fits.explain([c for c in final.candidates if c is not member])
-        for member in final.candidates
-    ]
-    findings = []
-    for k in sorted(range(len(without)), key=lambda k: -without[k].deviance):
-        member, rest = final.candidates[k], without[k]
+    spread = spreads(fits, final)
+    places = range(len(final.candidates))
+    for k in sorted(places, key=lambda k: -without[final.candidates[k]].deviance):
+        member = final.candidates[k]
         names = tuple(dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ())))
-        finding = finding_of(white, rest, final, member, names, chosen=True)
-        findings.append(replace(finding, share=shares[member], spread=spread.get(member, {})))
-    others = sorted(
-        (e for of_member in alternatives.values() for e in of_member), key=lambda e: e.deviance
-    )
-    return [*findings, *_ranked(fits, others, findings)]
+        finding = finding_of(
+            fits.white, without[member], final, member, names, chosen=member in named
+        )
+        yield member, replace(finding, spread=spread.get(member, {}))
 
 
 def _ranked(
@@ -611,6 +655,7 @@ def _well_explained(
 def _status(
     fits: Fits,
     final: Explanation,
+    tentative: Collection[Candidate],
     effect: type[Effect],
     equal: Mapping[int, Sequence[Explanation]],
     experiments: Experiments,
@@ -623,8 +668,10 @@ def _status(
         for k, of_member in equal.items()
         if any(e.candidates[-1].effect is effect for e in of_member)
     ]
-    if any(c.effect is effect for c in final.candidates):
+    if any(c.effect is effect and c not in tentative for c in final.candidates):
         verdict: EffectVerdict = "present"
+    elif any(c.effect is effect for c in tentative):
+        verdict = "confusable"
     elif mistaken_for:
         verdict = "confusable"
         member = mistaken_for[0]
@@ -667,6 +714,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 },
                 "confusable_with": list(f.confusable_with),
                 "chosen": f.chosen,
+                "tentative": f.tentative,
                 "too_small": f.too_small,
                 "share": f.share,
                 **spreads_json(f.spread),

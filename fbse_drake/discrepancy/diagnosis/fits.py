@@ -24,6 +24,7 @@ from fbse_drake.discrepancy.identification.regression import (
 )
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # Probability of any false alarm on a log that hides nothing.
@@ -421,6 +422,9 @@ class Fits:
         Raises:
             InputError: no body has these values.
         """
+        if issubclass(candidate.effect, InertiaEffect):
+            about = np.broadcast_to(candidate.raw.about, values.shape)
+            values = candidate.effect.nearby(about, values)
         raw = self.dictionary.predictor.signature_near(
             candidate.effect,
             candidate.targets[0],

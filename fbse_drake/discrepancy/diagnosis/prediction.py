@@ -421,7 +421,7 @@ class Predictor:
             if point is not None:
                 values, offset = self._slopes(effect, target, point, nonlinear)
                 rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
-                return Signature(rows, values[:, rows], offset[:, rows])
+                return Signature(rows, values[:, rows], offset[:, rows], about=point)
             values = _without_rounding(self._per_unit(effect, target, nonlinear))
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
@@ -609,8 +609,16 @@ class Predictor:
         if issubclass(effect, _PROPORTIONAL):
             return elsewhere
         values, offset = self._slopes(effect, target, linear, nonlinear)
-        rows = elsewhere.rows
-        return replace(elsewhere, values=values[:, rows], offset=offset[:, rows])
+        rows, lowest = elsewhere.rows, elsewhere.lowest
+        if issubclass(effect, InertiaEffect):
+            lowest = np.maximum(lowest, effect.lowest_nearby(linear))
+        return replace(
+            elsewhere,
+            values=values[:, rows],
+            offset=offset[:, rows],
+            lowest=lowest,
+            about=linear,
+        )
 
     def _slopes(
         self,

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
-from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import converged
@@ -80,7 +80,8 @@ def indistinguishable(
     One with fewer parameters does also if chance may have brought what the final explanation has
     more; and one that shifts the torque in time as a member does, if it takes off all of what that
     takes off but for what a law of unknown shape may be wrong by. Rivals that take a share of the
-    torque are given the benefit of the doubt, see `Fits.if_left_is_noise`.
+    torque are given the benefit of the doubt, see `Fits.if_left_is_noise`; and what stands at its
+    bound is no parameter of a rival: a payload without extent is a weight at a place.
     """
     judge = Judge(fits, final)
 
@@ -89,16 +90,26 @@ def indistinguishable(
             return False
         return judge.is_nearly_as_good(rival, final, member)
 
-    def equals(rival: Explanation) -> bool:
-        more = len(final.solved.parameters) - len(rival.solved.parameters)
+    def equals(member: Candidate, rival: Explanation) -> bool:
+        is_larger_law = _contains(rival.candidates[-1].effect, member.effect)
+        bound = 0 if is_larger_law else _at_bounds(rival)
+        more = len(final.solved.parameters) - (len(rival.solved.parameters) - bound)
         least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-        lost = fits.if_left_is_noise(rival) - final.deviance
+        lost = fits.if_left_is_noise(rival) - COMPLEXITY * bound - final.deviance
         return lost < least or judge.independent_share(rival, final) * lost < least
 
     return {
-        k: [e for e in found if equals(e) or shifts_alike(final.candidates[k], e)]
+        k: [e for e in found if equals(member, e) or shifts_alike(member, e)]
         for k, found in of_members.items()
+        for member in (final.candidates[k],)
     }
+
+
+def _at_bounds(explanation: Explanation) -> int:
+    """How many amounts of the last member are the smallest that there can be."""
+    member = explanation.candidates[-1]
+    values, _ = explanation.values(member)
+    return sum(values[name] <= member.parameters[name].bounds[0] for name in member.linear_names)
 
 
 def settled(

@@ -173,9 +173,10 @@ def _study(
             diagnosis.held_out_after
             < (1.0 - least_gain * (len(diagnoses) > 1)) * diagnosis.held_out_before
         )
-        if not diagnosis.chosen or not worthwhile:
+        if not diagnosis.completing or not worthwhile:
             break
-        found, completed = diagnosis.chosen, add(scenario, diagnosis.chosen)
+        found = diagnosis.completing
+        completed = add(scenario, found)
         errors = diagnosis.held_out_after, diagnosis.train_after
         believed = predictor.of(completed)
         if len(diagnoses) == 1 and scenario.identify.inertia and interrupted is None:
@@ -260,7 +261,7 @@ def is_better(model: Predictor, other: Predictor) -> bool:
 
 def _reason(diagnoses: list[Diagnosis]) -> str:
     last = diagnoses[-1]
-    if last.chosen and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > 1.0:
+    if last.completing and len(diagnoses) == _MOST_ROUNDS and last.held_out_before > 1.0:
         return (
             f"{len(diagnoses)} rounds were made and each found something: the library "
             "does not fit this robot well"

@@ -38,6 +38,7 @@ class WrittenFinding:
     parameters: dict[str, WrittenParameter]
     confusable_with: list[str]
     chosen: bool
+    tentative: bool = False
     too_small: bool = False
     # Null where it is not known.
     held_out_before: float | None = None

@@ -54,6 +54,8 @@ class Signature:
     steadying: np.ndarray | float = 0.0
     # Smallest value that each parameter can have, shape (p,) or -inf.
     lowest: np.ndarray | float = -np.inf
+    # Values about which it is linear, shape (p,), or 0.
+    about: np.ndarray | float = 0.0
 
 
 # Places of the rows that two signatures share in each of them, and inner products of their columns.

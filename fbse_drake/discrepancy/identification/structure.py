@@ -80,7 +80,7 @@ def leftover_structure(
                 continue
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
-            is_noise = usual < _tolerated(white, k) or is_white(left[:, k], int(white.count[k]))
+            is_noise = usual < tolerated(white, k) or is_white(left[:, k], int(white.count[k]))
             if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
                 continue
         excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
@@ -106,7 +106,7 @@ def untested_rows(
         white, left: see `leftover_structure`.
         structures: what that found.
     """
-    louder = _louder_than_tolerated(motion, white, left, structures)
+    louder = _louder_thantolerated(motion, white, left, structures)
     return tuple(white.residual.rows[k].name for k in louder if white.count[k] < _TELLING)
 
 
@@ -125,11 +125,11 @@ def noisy_rows(
         white, left: see `leftover_structure`.
         structures: what that found.
     """
-    louder = _louder_than_tolerated(motion, white, left, structures)
+    louder = _louder_thantolerated(motion, white, left, structures)
     return [k for k, times in louder.items() if times > _LOUD and white.count[k] >= _FEWEST]
 
 
-def _louder_than_tolerated(
+def _louder_thantolerated(
     motion: RecordedMotion,
     white: WhitenedResidual,
     left: np.ndarray,
@@ -144,13 +144,13 @@ def _louder_than_tolerated(
     for k, row in enumerate(white.residual.rows):
         if row.kind == "kinematic" or k in told or not white.count[k]:
             continue
-        times = np.sqrt((left[:, k] ** 2).sum() / white.count[k]) / _tolerated(white, k)
+        times = np.sqrt((left[:, k] ** 2).sum() / white.count[k]) / tolerated(white, k)
         if times > 1.0:
             result[k] = float(times)
     return result
 
 
-def _tolerated(white: WhitenedResidual, row: int) -> float:
+def tolerated(white: WhitenedResidual, row: int) -> float:
     """Root mean square of what may be left in a row, in multiples of the sensors' noise."""
     return float(np.sqrt(EXCESS**2 + _DOUBT * white.doubt[row] / white.count[row]))
 
