@@ -128,7 +128,7 @@ def _inputs(
 
 def _reading_time(scenario: Scenario, log: Log) -> float:
     """What a log's reading of accelerometer or foot force is the mean over [s]."""
-    if scenario.recording.rows == "instantaneous":
+    if scenario.recording.is_sampled:
         return 0.0
     said = log.meta.get("reading_time")
     return scenario.plant.time_step if said is None else said

@@ -189,6 +189,11 @@ class RecordingConfig:
     # Models are fitted to this first share of the log; the rest is set aside to test them.
     train_share: float = 0.8
 
+    @property
+    def is_sampled(self) -> bool:
+        """Does a row hold what was so at its instant?"""
+        return self.rows == "instantaneous"
+
     def __post_init__(self) -> None:
         require_positive(self, "block")
         require_not_negative(self, "cutoff", "recorded_cutoff")

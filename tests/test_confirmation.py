@@ -42,7 +42,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
 
 
 @cache
-def log(*, spring: bool, seed: int, duration: float = 20.0) -> Log:
+def log(*, spring: bool, seed: int, duration: float = 20.0, noise: float = NOISE) -> Log:
     """In closed form, with Coulomb friction."""
     t = np.arange(round(duration / PERIOD)) * PERIOD
     sizes, speeds = np.array([0.9, 0.4]), np.array([2.1 + 0.3 * seed, 5.3])
@@ -51,7 +51,7 @@ def log(*, spring: bool, seed: int, duration: float = 20.0) -> Log:
         for k in range(3)
     )
     tau = INERTIA * a + MASS * ARM * G * np.sin(q) + COULOMB * np.tanh(v / 0.01)
-    tau += spring * STIFFNESS * q + NOISE * np.random.default_rng(seed).standard_normal(len(t))
+    tau += spring * STIFFNESS * q + noise * np.random.default_rng(seed).standard_normal(len(t))
     channels = {"position": q, "velocity": v, "torque_command": tau}
     return Log(
         {"time": t} | {f"joint/{name}": values[:, None] for name, values in channels.items()},
@@ -90,7 +90,11 @@ def test_what_data_set_aside_bears_out_is_named(scenario: Scenario) -> None:
     assert not diagnosis.refuted
 
 
-def test_data_too_short_for_an_interval_refutes_nothing(scenario: Scenario) -> None:
-    diagnosis = found(scenario, log(spring=False, seed=2, duration=1.05))
+def test_data_too_short_to_tell_refutes_nothing(scenario: Scenario) -> None:
+    """Of torques with as much noise as the spring has torque."""
+    loud = 20 * NOISE
+    diagnosis = found(scenario, log(spring=False, seed=2, duration=1.05, noise=loud))
     assert not diagnosis.refuted
     assert "JointSpring" in {f.effect for f in diagnosis.chosen}
+    longer = found(scenario, log(spring=False, seed=2, noise=loud))
+    assert [f.effect for f in longer.refuted] == ["JointSpring"]

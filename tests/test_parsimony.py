@@ -341,3 +341,36 @@ def test_drag_beside_plain_friction_is_no_hump(seed: int):
     assert diagnosis.verdict == "effect_found"
     assert found.keys() == set(names) - {"StribeckFriction"}
     assert found["QuadraticDrag"] == {"axis_2"}
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_hump_that_bends_the_law_as_drag_does_is_drag(seed: int):
+    """Long enough to tell that hump from zero, which drag explains with fewer parameters."""
+    machine = replace(ARM, duration=20.0)
+    course = machine.course(seed)
+    v, size = course.velocity, np.sqrt((course.torque**2).mean(axis=0))
+    speed = np.sqrt((v**2).mean(axis=0))
+    given = course.torque + size * (0.1 * np.tanh(v / 0.01) + 0.15 * v / speed)
+    axis = np.eye(6)[1]
+    given += axis * 0.06 * size * v * np.abs(v) / np.sqrt((v**4).mean(axis=0))
+    names = ("CoulombFriction", "ViscousFriction", "StribeckFriction", "QuadraticDrag")
+    log = machine.log(course, given, seed)
+    found = diagnose(machine.predictor(log), [library()[name] for name in names]).chosen
+    assert {f.effect for f in found} == set(names) - {"StribeckFriction"}
+    assert [f.targets for f in found if f.effect == "QuadraticDrag"] == [("axis_2",)]
+
+
+@pytest.mark.parametrize("seed", [19, 27, 40])
+def test_a_real_hump_beside_makes_none_that_costs_more_than_it_brings(seed: int):
+    """Also where the interval of one that is not there leaves zero out."""
+    machine = replace(ARM, duration=20.0)
+    course = machine.course(seed)
+    v, size = course.velocity, np.sqrt((course.torque**2).mean(axis=0))
+    speed = np.sqrt((v**2).mean(axis=0))
+    given = course.torque + size * (0.12 * np.tanh(v / 0.01) + 0.1 * v / speed)
+    hump = np.tanh(v[:, 1] / 0.02) - np.tanh(v[:, 1] / (0.3 * speed[1]))
+    given[:, 1] += 0.15 * size[1] * hump
+    log = machine.log(course, given, seed)
+    names = ("CoulombFriction", "ViscousFriction", "StribeckFriction")
+    found = diagnose(machine.predictor(log), [library()[name] for name in names]).chosen
+    assert [f.targets for f in found if f.effect == "StribeckFriction"] == [("axis_2",)]

@@ -106,6 +106,8 @@ class JointTorqueEffect(Effect):
     """
 
     has_memory: ClassVar[bool] = False
+    # Does it differ from its reductions only right after a joint turned?
+    is_after_turns: ClassVar[bool] = False
     # Does it let the motor turn against the link, so that encoders on both sides show it? Such an
     # effect also gives `deflection` and `memory_over_time`.
     deflects: ClassVar[bool] = False

@@ -119,6 +119,7 @@ class PreslidingHysteresis(JointTorqueEffect):
         ),
     }
     has_memory: ClassVar[bool] = True
+    is_after_turns: ClassVar[bool] = True
     reductions: ClassVar[tuple[Reduction, ...]] = (
         Reduction({"displacement": 0.0}, (CoulombFriction,)),
     )

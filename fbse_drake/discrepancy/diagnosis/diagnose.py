@@ -413,7 +413,7 @@ def _more_noise(
 ) -> Noise | None:
     """White noise of sampled torques that shows only in what is left, whitened, (B, R); None if
     these rows have none."""
-    if predictor.scenario.recording.rows != "instantaneous" or not rows:
+    if not predictor.scenario.recording.is_sampled or not rows:
         return None
     residual = replace(remaining.residual, value=remaining.coloured(left))
     return likeliest_noise(residual, predictor.motion.length, rows)

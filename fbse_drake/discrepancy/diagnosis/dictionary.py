@@ -19,6 +19,7 @@ from fbse_drake.discrepancy.identification.inertial import (
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import step_of, travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.discrepancy.residual.residual import RecordedMotion
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.geometry import GeometryEffect
@@ -66,11 +67,13 @@ class Dictionary:
         self.effects = [effect for effect in effects if not effect.composite]
         # In a log per step it is not known at which velocity within the step a law holds: what such
         # a law leaves is weak evidence.
-        self.per_step = predictor.scenario.recording.rows == "per_step"
+        self.per_step = not predictor.scenario.recording.is_sampled
         self.joints = predictor.robot.joint_names
         self.travel = travel_of(predictor.motion.signals.joint_position)
         # In which each joint's angle is read, (n,) [rad]; 0 if in none.
         self.steps = np.array([step_of(q) for q in predictor.log["joint/position"].T])
+        # How far each joint comes right after it turned, (n,) [rad].
+        self.turning = _turning(predictor.motion)
         # The largest of each joint, (n,) [rad/s].
         self.speed = np.abs(predictor.motion.signals.joint_velocity).max(axis=0)
         self.unit = dict(zip(self.joints, predictor.robot.torque_units, strict=True))
@@ -399,6 +402,18 @@ def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
     )
     usual, changed = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
     return not np.array_equal(usual, changed)
+
+
+def _turning(motion: RecordedMotion) -> np.ndarray:
+    """How far joints come within two averages after they turned, (n,) [rad]; 0 for those that did
+    not turn: a torque that is late by less than one has followed by then."""
+    velocity, acceleration = motion.blocks.joint_velocity, motion.blocks.joint_acceleration
+    turned = (velocity[1:] * velocity[:-1] < 0) & (motion.known[1:, : velocity.shape[1]] > 0)
+    at_turns = np.where(turned, np.abs(acceleration[1:]), np.nan)
+    usual = np.array(
+        [np.nanmedian(a) if of.any() else 0.0 for a, of in zip(at_turns.T, turned.T, strict=True)]
+    )
+    return 0.5 * usual * (2 * motion.length * motion.period) ** 2
 
 
 def follows_torque(effect: type[Effect]) -> bool:

@@ -510,8 +510,7 @@ def _simpler(
     if_needless: bool = False,
 ) -> Iterator[Explanation]:
     """With the simplest laws in the place of a member that contains them and is no better; or with
-    these and another effect, which explain more together with no more parameters, where nothing
-    shows what only the member has.
+    these and another effect, which explain more together with no more parameters.
 
     Args:
         if_needless: only where it brings less than its parameters cost.
@@ -520,14 +519,7 @@ def _simpler(
         return
     tried = set(proposals.fits.dictionary.effects)
     reductions = [
-        reduction
-        for reduction in member.effect.reductions
-        if tried.issuperset(reduction.effects)
-        and not (
-            if_needless
-            and not _shared(explanation, member, reduction)
-            and not _may_be_without(explanation, member, reduction)
-        )
+        reduction for reduction in member.effect.reductions if tried.issuperset(reduction.effects)
     ]
 
     @cache
@@ -538,9 +530,12 @@ def _simpler(
         found = (_with_laws(proposals, one, member, reduction.effects) for one in alone)
         return min(found, key=lambda e: e.deviance)
 
-    # What is better and smaller comes before what is worse by no more than chance.
+    if not reductions:
+        return
     last = len(reductions) - 1
-    if reductions and _may_be_without(explanation, member, reductions[last]):
+    is_doubtful = _may_be_without(explanation, member, reductions[last])
+    # What is better and smaller comes before what is worse by no more than chance.
+    if is_doubtful:
         yield from _with_another(proposals, judge, explanation, reduced(last), member)
     for k, reduction in enumerate(reductions):
         smaller = reduced(k)
@@ -552,6 +547,8 @@ def _simpler(
         # What takes its place has to stay.
         if is_smaller and judge.all_pay(smaller, reduction.effects, member.targets):
             yield smaller
+    if not is_doubtful:
+        yield from _with_another(proposals, judge, explanation, reduced(last), member)
 
 
 def _with_another(
@@ -562,13 +559,14 @@ def _with_another(
     member: Candidate,
 ) -> Iterator[Explanation]:
     """With one more effect beside the laws that were put into a member's place, where it pays and
-    the two explain more than the member with no more parameters."""
+    the two explain more than the member with fewer parameters, or far more with as many."""
     fits, most = proposals.fits, len(explanation.solved.parameters)
     wider = best_additions(proposals, smaller, member.signature.rows, smaller.deviance)
     # The laws are where they fit without it.
     for found in [e for e in wider if len(e.solved.parameters) <= most][:_ADDITIONS]:
         better = converged(fits, found)
-        if better.deviance >= explanation.deviance:
+        margin = MARGIN if len(better.solved.parameters) == most else 0.0
+        if better.deviance >= explanation.deviance - margin:
             continue
         key = found.candidates[-1].key
         (added,) = (c for c in better.candidates if c.key == key)
@@ -638,8 +636,10 @@ def _with_laws(
         targets = tuple(t for t in member.targets if t not in there)
         missing += [(law, targets)] if targets else []
     result = fits.explain(others)
+    # The others stay where they fit beside all of it: beside a part they would be moved far away.
     for law, targets in missing:
-        result = converged(fits, proposals.beside(result, law, targets))
+        result = proposals.beside(result, law, targets)
+    result = converged(fits, result)
     # The first ones were fitted where the last ones lacked.
     for law, targets in missing[:-1]:
         rest = [c for c in result.candidates if c.key != (law, targets)]

@@ -23,6 +23,7 @@ from fbse_drake.discrepancy.residual.residual import (
     foot_pairs,
     joint_velocity_noise,
     rms,
+    within_steps,
 )
 from fbse_drake.effects.contact import (
     ContactEffect,
@@ -47,7 +48,7 @@ from fbse_drake.effects.sensor import SensorEffect, SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import gravity_on_slope
-from fbse_drake.scenario import Scenario, build_robot
+from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 from fbse_drake.sensors.foot_force import force_noise
 
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change
@@ -238,7 +239,7 @@ class Predictor:
         sticking joint trembles. Of rows that are sampled at an instant nothing is doubted.
         """
         motion, joint_motion = self.motion, self.joint_motion
-        if motion.recording.rows == "instantaneous":
+        if motion.recording.is_sampled:
             return np.zeros(motion.blocks.joint_position.shape)
         slope = np.zeros(joint_motion.velocity.shape)
         for law in laws:
@@ -266,19 +267,19 @@ class Predictor:
 
     @cached_property
     def joint_motion(self) -> JointMotion:
-        """What joint torque effects depend on, step by step: (N - 1, n) each."""
+        """What joint torque effects depend on, see `Reading.joint_motion`."""
         return self._loaded(self.reading.joint_motion)
 
     @cached_property
     def _joint_motions(self) -> Callable[[int], JointMotion]:
         """The same averaged over so many steps."""
-        return cache(partial(_joined, self.joint_motion))
+        return cache(partial(_joined, self.motion.recording, self.joint_motion))
 
     @cached_property
     def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
         """The same if the sensors' noise were in it once more."""
         noisier = self.reading.joint_motion_of(self._noisier_signals)
-        return cache(partial(_joined, self._loaded(noisier)))
+        return cache(partial(_joined, self.motion.recording, self._loaded(noisier)))
 
     def _loaded(self, motion: JointMotion) -> JointMotion:
         """With the load as far as it is known: a model whose inertia is not trusted does not know
@@ -341,8 +342,12 @@ class Predictor:
     ) -> np.ndarray:
         """Of the deflections of these joints."""
         motion = self._motion_of(joints, 1, noisier=noisier)
-        motion = motion._replace(command=self.motion.steps.torque_command[:, joints])
+        is_sampled = self.motion.recording.is_sampled
+        read = self.motion.signals if is_sampled else self.motion.steps
+        motion = motion._replace(command=read.torque_command[:, joints])
         begin = deflection_over_time(effect, motion, nonlinear)
+        if is_sampled:
+            return self.is_driven[joints] * self._averages(begin[None], 1)
         end = np.concatenate([begin[..., 1:, :], begin[..., -1:, :]], axis=-2)
         share = self.motion.timing.motion_share
         amid = (1.0 - share) * begin + share * end
@@ -388,7 +393,7 @@ class Predictor:
         first = np.moveaxis(columns, -2, 0)
         if step > 1:
             return np.moveaxis(block_means(first, self.motion.length // step), 0, -2)
-        return np.moveaxis(self.motion.averages(first), 0, -2)
+        return np.moveaxis(self.motion.averages(_in_steps(self.motion.recording, first)), 0, -2)
 
     @property
     def _joined_steps(self) -> int:
@@ -848,15 +853,21 @@ class Predictor:
         return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
 
 
-def _joined(motion: JointMotion, steps: int) -> JointMotion:
-    """Averages over so many steps."""
+def _joined(recording: RecordingConfig, motion: JointMotion, steps: int) -> JointMotion:
+    """Averages over so many steps; as it is for one."""
     if steps == 1:
         return motion
     joined = {
-        name: block_means(getattr(motion, name), steps)
+        name: block_means(_in_steps(recording, getattr(motion, name)), steps)
         for name in ("velocity", "position", "command", "time", "load")
     }
     return motion._replace(**joined, time_step=steps * motion.time_step)
+
+
+def _in_steps(recording: RecordingConfig, values: np.ndarray) -> np.ndarray:
+    """Values (N - 1, ...) of every step: those of samples (N, ...) are averaged between neighbours,
+    as torques that are sampled."""
+    return within_steps(values, 0.5) if recording.is_sampled else values
 
 
 def _later(values: np.ndarray, samples: float) -> np.ndarray:

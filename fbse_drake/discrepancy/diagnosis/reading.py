@@ -7,10 +7,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter, welch
 
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
-from fbse_drake.discrepancy.residual.residual import RecordedMotion, within_steps
+from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.contact import GroundEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
@@ -22,6 +23,8 @@ from fbse_drake.scenario import Scenario, build_robot
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take
 # them.
 _SMOOTHING = 9
+# The torque that links get is smoothed over so many blocks.
+_LOAD_BLOCKS = 5
 # Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
 # it.
 _SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
@@ -98,23 +101,32 @@ class Reading:
 
     @cached_property
     def joint_motion(self) -> JointMotion:
-        """What joint torque effects depend on, step by step: (N - 1, n) each."""
+        """What joint torque effects depend on, step by step, (N - 1, n) each; of rows that are
+        sampled at an instant sample by sample, (N, n), for their torques are those of the samples.
+        """
         return self.joint_motion_of(self.motion.signals)
 
     def joint_motion_of(self, signals: SensorSignals) -> JointMotion:
         """The same of other signals."""
         motion = self.motion
         velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
-        time = motion.start + np.arange(len(velocity) - 1) * motion.period
         torque = self._without_noise(signals.torque_command)
-        at = motion.steps_of(replace(signals, joint_velocity=velocity, torque_command=torque))
+        smooth = replace(signals, joint_velocity=velocity, torque_command=torque)
+        at: SensorSignals | Instants = smooth
+        middle = time = motion.start + np.arange(len(velocity)) * motion.period
+        if not motion.recording.is_sampled:
+            at, velocity = (
+                motion.steps_of(smooth),
+                within_steps(velocity, motion.timing.law_share),
+            )
+            time, middle = time[:-1], time[:-1] + 0.5 * motion.period
         return JointMotion(
-            velocity=within_steps(velocity, motion.timing.law_share),
+            velocity=velocity,
             position=at.joint_position,
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
-            load=at.torque_command - self._loss,
+            load=self._load_at(middle, at.torque_command),
             rotor_inertia=self.robot.rotor_inertias,
         )
 
@@ -145,16 +157,24 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
-    @cached_property
-    def _loss(self) -> np.ndarray:
-        """What the links do not get of the command by the rigid model, smoothed over three blocks,
-        step by step, (N - 1, n)."""
+    def _load_at(self, time: np.ndarray, command: np.ndarray) -> np.ndarray:
+        """Torque that links get by the rigid model at times (M,), (M, n).
+
+        Of a machine on a fixed base it has no jumps, as a command has where friction changes its
+        sign: it is that of the averages, through which polynomials go. Feet make it jump; there it
+        is the command without what is left of it, smoothed over three blocks.
+
+        Args:
+            command: at these times.
+        """
         motion, n = self.motion, len(self.robot.joint_names)
-        loss = smoothed(motion.residual.value[:, :n])
-        time = (
-            motion.start + (np.arange(len(motion.signals.joint_position) - 1) + 0.5) * motion.period
-        )
-        return np.stack([np.interp(time, motion.time, column) for column in loss.T], axis=1)
+        left = motion.residual.value[:, :n]
+        if not self.robot.has_floating_base and len(left) >= _LOAD_BLOCKS:
+            torque = savgol_filter(motion.blocks.torque_command - left, _LOAD_BLOCKS, 2, axis=0)
+            inside = np.clip(time, motion.time[0], motion.time[-1])
+            return CubicSpline(motion.time, torque)(inside)
+        loss = np.stack([np.interp(time, motion.time, c) for c in smoothed(left).T], axis=1)
+        return command - loss
 
 
 def _reader(scenario: Scenario) -> tuple[Any, ...]:

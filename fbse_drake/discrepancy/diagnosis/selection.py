@@ -183,6 +183,9 @@ def _shows_within(fits: Fits, candidate: Candidate) -> bool:
         return True
     joints = dictionary.predictor.joints_of(candidate.signature.rows)
     reached, least = _REACH * float(dictionary.speed[joints].max()), dictionary.steps[joints].max()
+    if effect.is_after_turns and not dictionary.per_step:
+        # A torque that was recorded late does the same in this time.
+        least = max(least, dictionary.turning[joints].max())
 
     def values(*units: str) -> np.ndarray:
         of = [candidate.parameters[name].unit in units for name in candidate.nonlinear_names]

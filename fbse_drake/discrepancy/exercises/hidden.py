@@ -399,7 +399,7 @@ def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
     measurements."""
     if effect.needs_motor_encoder and scenario.sensors.motor_encoders is None:
         return False
-    if effect.needs_sampled_torque and scenario.recording.rows == "per_step":
+    if effect.needs_sampled_torque and not scenario.recording.is_sampled:
         return False
     if effect.__name__ == "FootCreep" and scenario.plant.discrete_contact_approximation not in (
         "lagged",

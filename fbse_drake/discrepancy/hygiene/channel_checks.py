@@ -215,7 +215,7 @@ def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
         if changing.any() and (share := float(held[changing].mean())) > _REPEATED:
             late = 500 * evidence.period / (1 - share)
             text = f"{100 * share:.0f} % of its samples repeat the one before: "
-            is_instant = evidence.motion.recording.rows == "instantaneous"
+            is_instant = evidence.motion.recording.is_sampled
             is_command = name == "joint/torque_command" and not is_instant
             if is_command or rows_per_reading(values) == 1:
                 text += f"it comes {late:.2g} ms late on average; its noise is not white"

@@ -247,7 +247,7 @@ def _clock(
         # A short one is looked for as an effect.
         motion = evidence.motion
         severity: Severity = "untrustworthy"
-        is_sampled = motion.recording.rows == "instantaneous"
+        is_sampled = motion.recording.is_sampled
         if is_sampled and seconds <= motion.length * motion.period:
             severity = "warning"
             text += f"; {TorqueReadingLag.__name__} allows for it"

@@ -246,7 +246,7 @@ def measured_noise(
     missed = np.zeros(rows)
     missed[: len(motion.robot.joint_names)] = missed_torque(motion)
     believed = replace(residual, variance=residual.variance + missed / length)
-    is_sampled = motion.recording.rows == "instantaneous"
+    is_sampled = motion.recording.is_sampled
     levels = [_level(believed, blocks) for blocks in (_SCALES if is_sampled else (1,))]
     # White noise is no more than what any of them shows.
     bounds = np.nan_to_num([level.bound for level in levels], nan=np.inf)

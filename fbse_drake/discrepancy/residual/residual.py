@@ -216,7 +216,7 @@ def read_signals(
         specific_force=specific_force,
         angular_velocity=angular_velocity,
         pad_force=pad_force,
-        torque_command=on_grid(torque) if recording.rows == "instantaneous" else held(torque),
+        torque_command=on_grid(torque) if recording.is_sampled else held(torque),
         motor_position=on_grid(log.get("joint/motor_position", np.zeros((len(log.time), 0)))),
     )
     return signals, known
@@ -296,7 +296,7 @@ class Timing:
     def of(log: Log, recording: RecordingConfig) -> "Timing":
         """That of a log's rows, but for the integration of its motion."""
         period = float(log.meta["period"])
-        if recording.rows == "instantaneous":
+        if recording.is_sampled:
             return Timing(period)
         said = (log.meta.get(key) for key in ("reading_time", "command_time"))
         reading, command = (period if time is None else min(time, period) for time in said)
@@ -783,7 +783,7 @@ class RecordedMotion:
                 )
         self.start, self._left_out = float(log.time[0]), left_out
         self.equation = EquationOfMotion(robot)
-        if recording.rows == "per_step":
+        if not recording.is_sampled:
             position, velocity = self.signals.joint_position, self.signals.joint_velocity
             found = integration_step(position, velocity, self.period, self.measured)
             self.timing = replace(self.timing, integration=found)

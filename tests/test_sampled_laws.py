@@ -1,0 +1,105 @@
+"""Laws of rows that are sampled at an instant hold at the samples, as their torques do, however
+much a joint's speed changes between two of them.
+
+Truth: inverse dynamics of an arm, with friction by formulas of this file.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded_arm import ARM, Course
+
+from fbse_drake.discrepancy.diagnosis.bandwidth import averaged_to_bandwidth
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.effects.effect import library
+from fbse_drake.scenario import Scenario
+
+TRANSITION = 0.01
+# Of a torque in multiples of its noise: a law that is off by a tenth shows.
+LOUD = 30.0
+SIZE = LOUD * np.array(ARM.torque_noise)
+
+
+def coulomb(course: Course) -> np.ndarray:
+    return SIZE * np.tanh(course.velocity / TRANSITION)
+
+
+def load_dependent(course: Course) -> np.ndarray:
+    return 0.3 * np.abs(course.torque) * np.tanh(course.velocity / TRANSITION)
+
+
+def believing(scenario: Scenario, effect: str, **values: dict[str, float]) -> Scenario:
+    effects = {"known": library()[effect](**values)}
+    return replace(scenario, model=replace(scenario.model, effects=effects))
+
+
+@pytest.mark.parametrize("period", [0.005, 0.01])
+def test_a_known_law_leaves_noise_where_joints_turn(period: float):
+    """In a hundredth of a second an axis goes from full friction to full friction."""
+    machine = replace(ARM, period=period, duration=20.0)
+    course = machine.course(2)
+    change = np.abs(np.diff(course.velocity, axis=0)).max(axis=0)
+    assert (change > TRANSITION).all()
+    scenario = believing(
+        machine.scenario,
+        "CoulombFriction",
+        coulomb=machine.by_joint(tuple(SIZE)),
+        transition={"all": TRANSITION},
+    )
+    log = machine.log(course, course.torque + coulomb(course))
+    predictor, _ = averaged_to_bandwidth(Predictor(scenario, log))
+    plain, _ = averaged_to_bandwidth(machine.predictor(machine.log(course)))
+    # What friction adds to what is left, by the same noise.
+    added = (predictor.residual.value - plain.residual.value) / plain.residual.noise_floor
+    assert np.sqrt((added**2).mean(axis=0)).max() < 0.3
+    middle = 0.5 * (course.velocity[1:] + course.velocity[:-1])
+    amid = SIZE * np.tanh(middle / TRANSITION) - 0.5 * (coulomb(course)[1:] + coulomb(course)[:-1])
+    # As it would be by the speed amid two samples.
+    assert np.sqrt((amid**2).mean(axis=0) / np.array(machine.torque_noise) ** 2).min() > 0.6
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_friction_of_the_load_is_that_of_what_the_links_get(seed: int):
+    """Where a joint turns the drive's torque jumps by twice the friction, and that of its links
+    does not: nothing else is named for it."""
+    machine = replace(
+        ARM, period=0.002, duration=20.0, torque_noise=(0.2, 0.2, 0.1, 0.04, 0.04, 0.02)
+    )
+    course = machine.course(seed)
+    tried = ("LoadDependentFriction", "CoulombFriction", "ViscousFriction", "StribeckFriction")
+    diagnosis = diagnose(
+        machine.predictor(machine.log(course, course.torque + load_dependent(course))),
+        [library()[name] for name in (*tried, "PreslidingHysteresis", "TorqueGain")],
+    )
+    assert diagnosis.verdict == "effect_found"
+    assert {f.effect for f in diagnosis.chosen} == {"LoadDependentFriction"}
+    for finding in diagnosis.chosen:
+        assert finding.parameters["coefficient"].value == pytest.approx(0.3, rel=0.03)
+
+
+@pytest.mark.parametrize(("displacement", "named"), [(1e-4, False), (5e-3, True)])
+def test_what_is_over_when_a_late_torque_has_followed_is_not_named(
+    displacement: float, named: bool
+):
+    """Friction that builds up over a displacement, of joints that pass it in some milliseconds or
+    in some tens of them."""
+    machine = replace(ARM, period=0.004, duration=20.0)
+    course = machine.course(4)
+    # Dahl's law for what moves on between samples, by Dahl's own formula.
+    z, given = np.zeros(6), course.torque.copy()
+    for k, v in enumerate(course.velocity):
+        sign = np.sign(v)
+        given[k] += SIZE * (sign + (z - sign) * np.exp(-np.abs(v) * 0.5 * 0.004 / displacement))
+        z = sign + (z - sign) * np.exp(-np.abs(v) * 0.004 / displacement)
+    tried = ("CoulombFriction", "ViscousFriction", "PreslidingHysteresis")
+    diagnosis = diagnose(
+        machine.predictor(machine.log(course, given)), [library()[name] for name in tried]
+    )
+    assert ("PreslidingHysteresis" in {f.effect for f in diagnosis.chosen}) is named
+    if named:
+        assert {f.effect for f in diagnosis.chosen} == {"PreslidingHysteresis"}
+        for finding in diagnosis.chosen:
+            found = finding.parameters["displacement"].value
+            assert found == pytest.approx(displacement, rel=0.15)
