@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.effect import library
+from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.scenario import RecordingConfig
 
 TRIED = (
@@ -68,12 +69,39 @@ def test_late_torques_are_no_friction(late: float, by_clock: bool):
     assert finding.parameters["time_constant"].value == pytest.approx(late, rel=0.15)
 
 
-def test_friction_is_found_beside_late_torques():
-    diagnosis = diagnosis_of(4, 0.004, 0.2)
+@pytest.mark.parametrize(("late", "by_clock"), [(0.004, False), (0.006, False), (0.004, True)])
+@pytest.mark.parametrize("seed", [4, 5, 6, 7])
+def test_friction_is_found_beside_late_torques(seed: int, late: float, by_clock: bool):
+    """And nothing else: that jumps come late is no presliding."""
+    diagnosis = diagnosis_of(seed, late, 0.2, by_clock=by_clock)
     assert diagnosis.verdict == "effect_found"
-    named = found(diagnosis)
-    assert named.keys() == {"CoulombFriction", "TorqueReadingLag"}
-    assert named["CoulombFriction"] == set(MACHINE.joints)
+    named, everywhere = found(diagnosis), set(MACHINE.joints)
+    assert named == {"CoulombFriction": everywhere, "TorqueReadingLag": everywhere}
+    (finding,) = (f for f in diagnosis.chosen if f.effect == "TorqueReadingLag")
+    assert finding.parameters["time_constant"].value == pytest.approx(late, rel=0.2)
+    assert diagnosis.effects["TorqueReadingLag"].verdict == "present"
+    assert diagnosis.held_out_before > 10.0
+    assert diagnosis.held_out_after < 1.0
+
+
+def test_a_model_that_knows_of_late_torques_reads_them_in_time():
+    """Friction that jumps leaves noise when both are in the model."""
+    course, late, size = course_of(2), 0.004, 30.0 * np.array(MACHINE.torque_noise)
+    given = course.torque + size * np.tanh(course.velocity / 0.005)
+    read = np.concatenate([given[:1].repeat(4, axis=0), given[:-4]])
+    rare = Course(*(values[::4] for values in vars(course).values()))
+    log = MACHINE.log(rare, read[::4], 2)
+    friction = CoulombFriction(coulomb=MACHINE.by_joint(tuple(size)), transition={"all": 0.005})
+    errors = []
+    for effects in (
+        {"friction": friction},
+        {"friction": friction, "late": TorqueReadingLag(time_constant={"all": late})},
+    ):
+        model = replace(MACHINE.scenario.model, effects=effects)
+        residual = Predictor(replace(MACHINE.scenario, model=model), log).residual
+        errors.append(np.sqrt((residual.value**2).mean(axis=0)) / residual.noise_floor)
+    assert (errors[0] > 2.0).all()
+    assert (errors[1] < 1.1).all()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])

@@ -175,7 +175,8 @@ class TorqueReadingLag(JointTorqueEffect):
 
     The given torque is the one that is read, plus time_constant times its rate: in steps, so that a
     log shows the time constant linearly. In a simulation the command is what is read, and the motor
-    is ahead of it.
+    is ahead of it. Of a log whose model has it torques are read so much earlier: friction that
+    jumps has no rate.
     """
 
     description: ClassVar[str] = (
@@ -215,6 +216,16 @@ class TorqueReadingLag(JointTorqueEffect):
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:  # noqa: ARG004
         return np.concatenate([motion.command[:1], motion.command[:-1]])[None]
+
+    @staticmethod
+    def in_time(torque: np.ndarray, time_constant: np.ndarray, period: float) -> np.ndarray:
+        """Torques (N, n) of rows so much earlier as each joint's come late, (n,) [s]."""
+        at = np.arange(len(torque))
+        earlier = [
+            np.interp(at + late / period, at, column)
+            for late, column in zip(time_constant, torque.T, strict=True)
+        ]
+        return np.stack(earlier, axis=1)
 
 
 def _kept(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:

@@ -43,6 +43,7 @@ from fbse_drake.discrepancy.identification.structure import (
 )
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
 from fbse_drake.discrepancy.residual.noise import Noise
+from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.joint_torque import JointTorqueEffect
@@ -57,6 +58,8 @@ _LARGEST_REST = 5.0
 # A member that takes less than this share of what exceeds the noise in its rows without it is
 # tentative: it leaves more than it takes.
 _MOSTLY = 0.5
+# Where torques are read earlier, the error may be so many times as large: noise is measured anew.
+_AS_GOOD = 1.02
 # A search is tried again, so often in all, if less than this share of what it explained pays.
 _HOLDS, _MOST_WAYS = 0.5, 3
 
@@ -260,6 +263,14 @@ def diagnose(
         noisier = tuple(rows[k].name for k in np.flatnonzero(search.more_noise.factor > 1.0))
         predictor = predictor.noisier(search.more_noise)
         search = _searched(Dictionary(predictor, tried, progress), tried)
+    error_before = root_mean_square(search.proposals.fits.white, search.before)
+    late = _late_torques(search)
+    if late is not None:
+        in_time = _with_torques_in_time(predictor, late, tried, progress)
+        if in_time.error <= _AS_GOOD * search.error:
+            search, predictor = in_time, in_time.proposals.fits.dictionary.predictor
+        else:
+            late = None
     proposals, path, alternatives = search.proposals, search.path, search.alternatives
     before, inertia, unexplained = search.before, search.inertia, search.unexplained
     partial, final, fits = search.partial, path[-1], proposals.fits
@@ -290,12 +301,17 @@ def diagnose(
                 progress("finding what would have been seen", k / len(dictionary.effects))
                 status = _status(fits, final, tentative, effect, equal, experiments)
                 statuses[effect.__name__] = status.hidden_in(search.noisy)
+            if late is not None:
+                statuses[TorqueReadingLag.__name__] = _status(
+                    late.fits, late.explanation, (), TorqueReadingLag, {}, experiments
+                )
     except Interrupted as stop:
         partial = str(stop)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
+    has_inertia = inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN
     if unexplained and not _well_explained(white, final, unexplained):
         verdict: Verdict = "unknown_effect"
-    elif named or (inertia is not None and final.deviance < white.deviance(white.sse) - MARGIN):
+    elif named or late is not None or has_inertia:
         verdict = "effect_found"
     elif matters:
         verdict = "unknown_effect"
@@ -312,6 +328,8 @@ def diagnose(
         )
         for member, finding in _members(fits, final, without, equal, named)
     ]
+    if late is not None:
+        members += late.findings
     others = (e for of_member in alternatives.values() for e in of_member)
     return Diagnosis(
         verdict,
@@ -323,8 +341,9 @@ def diagnose(
         ),
         statuses,
         tuple(unexplained),
-        _steps(path, root_mean_square(white, before)),
-        *(root_mean_square(white, sse) for sse in (before, final.held_out_sse, final.sse)),
+        _steps(path, error_before),
+        error_before,
+        *(root_mean_square(white, sse) for sse in (final.held_out_sse, final.sse)),
         inertia,
         averaging,
         partial,
@@ -358,6 +377,73 @@ class _Search:
     # That nobody believed in, by what is left; None where there is none.
     more_noise: Noise | None
     partial: str | None
+
+    @property
+    def error(self) -> float:
+        """Root mean square of what is left on held-out data, in multiples of the noise."""
+        return root_mean_square(self.proposals.fits.white, self.path[-1].held_out_sse)
+
+
+@dataclass(frozen=True)
+class _LateTorques:
+    """Torques that a search found to come late."""
+
+    fits: Fits
+    explanation: Explanation
+    # With their sizes, and by place of a member rivals that explain as much.
+    members: Mapping[Candidate, float]
+    equal: Mapping[int, Sequence[Explanation]]
+
+    @property
+    def findings(self) -> list[Finding]:
+        final = self.explanation
+        without = {
+            member: self.fits.explain([c for c in final.candidates if c is not member])
+            for member in final.candidates
+        }
+        return [
+            replace(finding, share=self.members[member])
+            for member, finding in _members(self.fits, final, without, self.equal, self.members)
+            if member in self.members
+        ]
+
+    @property
+    def effect(self) -> TorqueReadingLag:
+        by_joint = {
+            joint: self.explanation.values(member)[0]["time_constant"]
+            for member in self.members
+            for joint in member.targets
+        }
+        return TorqueReadingLag(time_constant=by_joint)
+
+
+def _late_torques(search: _Search) -> _LateTorques | None:
+    """What a search found to come late, as far as it matters."""
+    fits, final = search.proposals.fits, search.path[-1]
+    significance = fits.dictionary.significance
+    tolerance = fits.dictionary.predictor.scenario.identify.tolerance
+    shares = {
+        c: significance.share(final, c) for c in final.candidates if c.effect is TorqueReadingLag
+    }
+    members = {c: share for c, share in shares.items() if not share < tolerance}
+    if search.partial is not None or not members:
+        return None
+    return _LateTorques(fits, final, members, indistinguishable(fits, search.alternatives, final))
+
+
+def _with_torques_in_time(
+    predictor: Predictor,
+    late: _LateTorques,
+    effects: Sequence[type[Effect]],
+    progress: Progress,
+) -> _Search:
+    """What is found when torques are read earlier by what they come late: beside friction, which
+    jumps, a rate is no delay, and other laws are found in what is left of the jumps."""
+    model = predictor.scenario.believed
+    model = replace(model, effects=dict(model.effects) | {"_late_torques": late.effect})
+    others = [effect for effect in effects if effect is not TorqueReadingLag]
+    in_time = predictor.of(replace(predictor.scenario, model=model))
+    return _searched(Dictionary(in_time, others, progress), others)
 
 
 def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> _Search:

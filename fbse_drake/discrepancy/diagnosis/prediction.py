@@ -25,6 +25,7 @@ from fbse_drake.discrepancy.residual.residual import (
     rms,
     within_steps,
 )
+from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import (
     ContactEffect,
     FootCreep,
@@ -175,6 +176,9 @@ class Predictor:
     def _believed_residual(self) -> Residual:
         residual = self.motion.residual
         for known in self._known:
+            if known.effect is TorqueReadingLag and self.motion.recording.is_sampled:
+                # See `Reading`.
+                continue
             residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
             residual = residual.minus(self._on_slope(self._believed_slope))

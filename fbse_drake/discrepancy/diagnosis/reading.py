@@ -13,6 +13,7 @@ from scipy.signal import savgol_filter, welch
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
 from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
+from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
@@ -56,6 +57,11 @@ class Reading:
             if isinstance(effect, SensorEffect):
                 known = effect.resolve(self.robot.description, key=f"model.effects.{key}")
                 self.motion.signals = self.undone(known, self.remembered(known))
+            elif isinstance(effect, TorqueReadingLag) and self.motion.recording.is_sampled:
+                lag = effect.resolve(self.robot.description, key=f"model.effects.{key}").linear[0]
+                signals = self.motion.signals
+                torque = TorqueReadingLag.in_time(signals.torque_command, lag, self.motion.period)
+                self.motion.signals = replace(signals, torque_command=torque)
 
     def serves(self, scenario: Scenario) -> bool:
         """Would another scenario read the log alike?"""
@@ -183,7 +189,8 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     bodies = {
         name: effect
         for name, effect in model.effects.items()
-        if not isinstance(effect, JointTorqueEffect | GroundEffect)
+        if isinstance(effect, TorqueReadingLag)
+        or not isinstance(effect, JointTorqueEffect | GroundEffect)
     }
     recording = scenario.recording
     model = replace(model, effects=bodies)
