@@ -85,7 +85,7 @@ def test_the_completed_model_gets_it_all_the_same(beside_a_stranger: Diagnosis):
 def test_it_is_said_to_be_tentative(beside_a_stranger: Diagnosis):
     outcome = diagnosis_outcome(beside_a_stranger)
     assert "The model also lacks Coulomb friction in axis 1, axis 2." in outcome
-    assert "Joint spring in axis 2 would explain more, but more is left there" in outcome
+    assert "Tentative: joint spring in axis 2. The completed model has it, but more is" in outcome
     statuses = beside_a_stranger.effects
     assert statuses["CoulombFriction"].verdict == "present"
     assert statuses["JointSpring"].verdict == "confusable"

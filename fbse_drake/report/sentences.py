@@ -276,10 +276,11 @@ def _tentative(findings: Sequence[Finding]) -> str:
     """Says what explains something and may stand for something else; empty if nothing does."""
     if not findings:
         return ""
-    each = "it takes" if len(findings) == 1 else "each of them takes"
+    listed = listed_effects(findings)
+    what, each = ("it", "it takes") if len(findings) == 1 else ("them", "each of them takes")
     return (
-        f" {as_sentence(listed_effects(findings))[:-1]} would explain more, but more is left there "
-        f"than {each} off: that is tentative, for it may stand for something else."
+        f" Tentative: {listed}. The completed model has {what}, but more is left there than {each} "
+        "off, so something else may be missing in its place."
     )
 
 
