@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import swinging_legs
-from recorded_arm import ARM
+from recorded_arm import ARM, Course
 from scipy.optimize import minimize
 
 from fbse_drake import Log, Scenario, load_scenario
@@ -374,3 +374,24 @@ def test_a_real_hump_beside_makes_none_that_costs_more_than_it_brings(seed: int)
     names = ("CoulombFriction", "ViscousFriction", "StribeckFriction")
     found = diagnose(machine.predictor(log), [library()[name] for name in names]).chosen
     assert [f.targets for f in found if f.effect == "StribeckFriction"] == [("axis_2",)]
+
+
+def test_where_a_larger_law_does_not_pay_a_simpler_one_may_though_it_explains_less():
+    """Of seldom samples, beside torques that are late by a part of one: next to nothing is known of
+    what happens where a joint turns, and all the more of its friction."""
+    machine = replace(ARM, period=0.01, duration=20.0)
+    course = replace(machine, period=0.001).course(10)
+    size = np.sqrt((course.torque**2).mean(axis=0))
+    speed = np.sqrt((course.velocity**2).mean(axis=0))
+    friction = 0.2 * np.tanh(course.velocity / 0.02) + 0.2 * course.velocity / speed
+    read = np.roll(course.torque + size * friction, 3, axis=0)
+    rare = Course(*(values[10::10] for values in vars(course).values()))
+    log = machine.log(rare, read[10::10], 10)
+    names = (*FRICTION, "TorqueReadingLag", "TorqueLag", "TorqueDelay")
+    diagnosis = diagnose(machine.predictor(log), [library()[name] for name in names])
+    named: dict[str, set[str]] = {}
+    for finding in diagnosis.chosen:
+        named.setdefault(finding.effect, set()).update(finding.targets)
+    assert diagnosis.verdict == "effect_found"
+    assert named.keys() == {"CoulombFriction", "ViscousFriction", "TorqueReadingLag"}
+    assert all(targets == set(machine.joints) for targets in named.values())

@@ -139,6 +139,7 @@ def _smaller(
         if len(alike) < 2 or not judge.pay_together(explanation, alike, without):
             # A law may be none that can be, and a simpler one that it contains be there.
             yield from _simpler(proposals, judge, explanation, member)
+            yield from _at_least(proposals, judge, explanation, member, without[member])
             yield without[member]
     explained = judge.explained(explanation)
     for member in by_gain:
@@ -549,6 +550,31 @@ def _simpler(
             yield smaller
     if not is_doubtful:
         yield from _with_another(proposals, judge, explanation, reduced(last), member)
+
+
+def _at_least(
+    proposals: Proposals,
+    judge: Judge,
+    explanation: Explanation,
+    member: Candidate,
+    without: Explanation,
+) -> Iterator[Explanation]:
+    """With the largest laws in the place of a member that it contains and that pay, though it is
+    better: more than nothing is known where it does not pay itself.
+
+    Args:
+        without: the explanation without it.
+    """
+    if not issubclass(member.effect, JointTorqueEffect):
+        return
+    tried = set(proposals.fits.dictionary.effects)
+    for reduction in reversed(member.effect.reductions):
+        if not tried.issuperset(reduction.effects):
+            continue
+        smaller = _with_laws(proposals, explanation, member, reduction.effects)
+        pay = judge.all_pay(smaller, reduction.effects, member.targets)
+        if pay and smaller.deviance < without.deviance - MARGIN:
+            yield smaller
 
 
 def _with_another(
