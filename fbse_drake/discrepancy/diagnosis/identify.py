@@ -12,13 +12,13 @@ from fbse_drake.discrepancy.diagnosis.diagnose import (
     Finding,
     finding_of,
     inertia_findings,
-    root_mean_square,
 )
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import consistent, remeasured
+from fbse_drake.discrepancy.diagnosis.search import root_mean_square
 from fbse_drake.discrepancy.diagnosis.spread import spreads, spreads_json
 from fbse_drake.discrepancy.diagnosis.validation import ModelError, model_error
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
