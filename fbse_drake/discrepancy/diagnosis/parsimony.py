@@ -126,7 +126,8 @@ def blocks_per_sample(scores: np.ndarray) -> np.ndarray:
 def _smaller(
     proposals: Proposals, judge: "Judge", explanation: Explanation
 ) -> Iterator[Explanation]:
-    """Smaller explanations that are as good, the first to be taken first."""
+    """Smaller explanations that are as good, or without what does not pay, the first to be taken
+    first."""
     fits = proposals.fits
     without = {
         member: fits.explain([c for c in explanation.candidates if c is not member])
