@@ -157,7 +157,7 @@ class RecordingConfig:
     `fbse simulate`."""
 
     # The equation of motion is averaged over blocks of this length [s], and of at least three
-    # samples where velocities are had from the angles.
+    # samples where rows are sampled at an instant or velocities are had from the angles.
     block: float = 0.010
     # What a row of the log holds: `per_step` (IMU and forces over the time that ends there, the
     # torque that is held over the time that begins there; the log's `reading_time` and

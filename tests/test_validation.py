@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import swinging_legs
 from scipy.signal import lfilter
 
 import fbse_drake
@@ -176,16 +177,14 @@ def test_a_study_is_headed_by_what_was_set_aside(
     )
 
 
-def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall(
-    swing: tuple[Scenario, Log],
-):
+def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall():
     """Less than half a second is a single batch."""
-    scenario, log = swing
+    scenario, log = swinging_legs(6, NOISE, "log.period=0.005")
     rubbed = rubbing(log, 2.0, 2.0)
     right = believing(scenario, CoulombFriction({KNEE: 2.0}))
     long, short = (
         validated(*(Predictor(one, part) for one in (scenario, right)))
-        for part in (rubbed, rubbed.part(slice(0, 40)))
+        for part in (rubbed, rubbed.part(slice(0, 81)))
     )
     assert long.course == "falls"
     assert short.course == "unclear"
@@ -193,7 +192,7 @@ def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall(
     assert short.change.value < 0.5
     assert not long.refutes
     assert not short.refutes
-    worse = validated(*(Predictor(one, rubbed.part(slice(0, 40))) for one in (right, scenario)))
+    worse = validated(*(Predictor(one, rubbed.part(slice(0, 81))) for one in (right, scenario)))
     assert worse.refutes
     # So does one long enough to say that the error falls, and which does not.
     assert dataclasses.replace(long, change=Measured(0.9, (0.7, 1.2))).refutes

@@ -64,8 +64,9 @@ _AXES = ("x", "y", "z")
 # at once: Jacobians take room.
 _REMEMBERED = 3
 _MOST_INSTANTS = 20_000
-# Blocks of fewer samples share angles that their velocities are differenced from.
-_DIFFERENCED = 3
+# Blocks of fewer samples share much of what is sampled at their ends, or angles that their
+# velocities are differenced from: their noise is not that of neighbours that are independent.
+_SHARING = 3
 # The noise of so many blocks is calculated at a time, which bounds the matrices that are kept.
 _AT_A_TIME = 500
 
@@ -766,7 +767,8 @@ class RecordedMotion:
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period
         self.signals, self.measured = read_signals(robot, log, recording)
-        least = _DIFFERENCED if differences_angles(recording, log) else 1
+        is_shared = recording.is_sampled or differences_angles(recording, log)
+        least = _SHARING if is_shared else 1
         self.length = max(least, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(
