@@ -26,10 +26,6 @@ def coulomb(course: Course) -> np.ndarray:
     return SIZE * np.tanh(course.velocity / TRANSITION)
 
 
-def load_dependent(course: Course) -> np.ndarray:
-    return 0.3 * np.abs(course.torque) * np.tanh(course.velocity / TRANSITION)
-
-
 def believing(scenario: Scenario, effect: str, **values: dict[str, float]) -> Scenario:
     effects = {"known": library()[effect](**values)}
     return replace(scenario, model=replace(scenario.model, effects=effects))
@@ -58,25 +54,6 @@ def test_a_known_law_leaves_noise_where_joints_turn(period: float):
     amid = SIZE * np.tanh(middle / TRANSITION) - 0.5 * (coulomb(course)[1:] + coulomb(course)[:-1])
     # As it would be by the speed amid two samples.
     assert np.sqrt((amid**2).mean(axis=0) / np.array(machine.torque_noise) ** 2).min() > 0.6
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_friction_of_the_load_is_that_of_what_the_links_get(seed: int):
-    """Where a joint turns the drive's torque jumps by twice the friction, and that of its links
-    does not: nothing else is named for it."""
-    machine = replace(
-        ARM, period=0.002, duration=20.0, torque_noise=(0.2, 0.2, 0.1, 0.04, 0.04, 0.02)
-    )
-    course = machine.course(seed)
-    tried = ("LoadDependentFriction", "CoulombFriction", "ViscousFriction", "StribeckFriction")
-    diagnosis = diagnose(
-        machine.predictor(machine.log(course, course.torque + load_dependent(course))),
-        [library()[name] for name in (*tried, "PreslidingHysteresis", "TorqueGain")],
-    )
-    assert diagnosis.verdict == "effect_found"
-    assert {f.effect for f in diagnosis.chosen} == {"LoadDependentFriction"}
-    for finding in diagnosis.chosen:
-        assert finding.parameters["coefficient"].value == pytest.approx(0.3, rel=0.03)
 
 
 @pytest.mark.parametrize(("displacement", "named"), [(1e-4, False), (5e-3, True)])

@@ -300,7 +300,7 @@ def diagnose(
         ),
         statuses,
         tuple(unexplained),
-        _steps(path, found.error_before),
+        _steps(path, found.error_before, [] if late is None else late.members),
         found.error_before,
         *(root_mean_square(white, sse) for sse in (final.held_out_sse, final.sse)),
         inertia,
@@ -313,16 +313,22 @@ def diagnose(
     )
 
 
-def _steps(path: Sequence[Explanation], before: float) -> tuple[SelectionStep, ...]:
+def _steps(
+    path: Sequence[Explanation], before: float, beside: Collection[Candidate]
+) -> tuple[SelectionStep, ...]:
     """What is kept of explanations.
 
     Args:
         before: root mean square of the residual before anything is explained.
+        beside: what every one but the first has as well.
     """
     whole = path[0].held_out_sse.sum()
     return tuple(
         SelectionStep(
-            frozenset((candidate.name, candidate.targets) for candidate in explanation.candidates),
+            frozenset(
+                (c.name, c.targets)
+                for c in (*explanation.candidates, *(beside if explanation.candidates else ()))
+            ),
             *(
                 before * float(np.sqrt(sse.sum() / whole))
                 for sse in (explanation.held_out_sse, explanation.sse)

@@ -10,7 +10,7 @@ from pydrake.math import RotationMatrix
 from scipy.ndimage import shift
 from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.diagnosis.reading import Reading, smoothed
+from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read, smoothed
 from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
@@ -25,7 +25,6 @@ from fbse_drake.discrepancy.residual.residual import (
     rms,
     within_steps,
 )
-from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import (
     ContactEffect,
     FootCreep,
@@ -176,10 +175,8 @@ class Predictor:
     def _believed_residual(self) -> Residual:
         residual = self.motion.residual
         for known in self._known:
-            if known.effect is TorqueReadingLag and self.motion.recording.is_sampled:
-                # See `Reading`.
-                continue
-            residual = residual.minus(self.predict(known))
+            if not is_read(known.effect, self.motion.recording):
+                residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
             residual = residual.minus(self._on_slope(self._believed_slope))
             residual = residual.minus(self.ground_gives_way())

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter, welch
 
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
@@ -15,17 +14,16 @@ from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, w
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
+from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
 from fbse_drake.errors import located
 from fbse_drake.log import Log
-from fbse_drake.scenario import Scenario, build_robot
+from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take
 # them.
 _SMOOTHING = 9
-# The torque that links get is smoothed over so many blocks.
-_LOAD_BLOCKS = 5
 # Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
 # it.
 _SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
@@ -57,7 +55,7 @@ class Reading:
             if isinstance(effect, SensorEffect):
                 known = effect.resolve(self.robot.description, key=f"model.effects.{key}")
                 self.motion.signals = self.undone(known, self.remembered(known))
-            elif isinstance(effect, TorqueReadingLag) and self.motion.recording.is_sampled:
+            elif isinstance(effect, TorqueReadingLag) and is_read(effect, scenario.recording):
                 lag = effect.resolve(self.robot.description, key=f"model.effects.{key}").linear[0]
                 signals = self.motion.signals
                 torque = TorqueReadingLag.in_time(signals.torque_command, lag, self.motion.period)
@@ -132,7 +130,7 @@ class Reading:
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
-            load=self._load_at(middle, at.torque_command),
+            load=at.torque_command - self._loss_at(middle),
             rotor_inertia=self.robot.rotor_inertias,
         )
 
@@ -163,24 +161,17 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
-    def _load_at(self, time: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Torque that links get by the rigid model at times (M,), (M, n).
+    def _loss_at(self, time: np.ndarray) -> np.ndarray:
+        """What the links do not get of the command by the rigid model at times (M,), smoothed over
+        three blocks, (M, n)."""
+        loss = smoothed(self.motion.residual.value[:, : len(self.robot.joint_names)])
+        return np.stack([np.interp(time, self.motion.time, c) for c in loss.T], axis=1)
 
-        Of a machine on a fixed base it has no jumps, as a command has where friction changes its
-        sign: it is that of the averages, through which polynomials go. Feet make it jump; there it
-        is the command without what is left of it, smoothed over three blocks.
 
-        Args:
-            command: at these times.
-        """
-        motion, n = self.motion, len(self.robot.joint_names)
-        left = motion.residual.value[:, :n]
-        if not self.robot.has_floating_base and len(left) >= _LOAD_BLOCKS:
-            torque = savgol_filter(motion.blocks.torque_command - left, _LOAD_BLOCKS, 2, axis=0)
-            inside = np.clip(time, motion.time[0], motion.time[-1])
-            return CubicSpline(motion.time, torque)(inside)
-        loss = np.stack([np.interp(time, motion.time, c) for c in smoothed(left).T], axis=1)
-        return command - loss
+def is_read(effect: Effect | type[Effect], recording: RecordingConfig) -> bool:
+    """Is it a joint torque effect that a log is read by, as torques that are read earlier, and that
+    is not taken off the residual?"""
+    return effect.needs_sampled_torque and recording.is_sampled
 
 
 def _reader(scenario: Scenario) -> tuple[Any, ...]:
@@ -189,7 +180,7 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     bodies = {
         name: effect
         for name, effect in model.effects.items()
-        if isinstance(effect, TorqueReadingLag)
+        if is_read(effect, scenario.recording)
         or not isinstance(effect, JointTorqueEffect | GroundEffect)
     }
     recording = scenario.recording
