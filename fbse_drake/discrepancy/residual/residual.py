@@ -33,6 +33,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.discrepancy.residual.memory import Memory
+from fbse_drake.discrepancy.residual.velocity_clock import Lateness, are_differences
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
@@ -224,8 +225,13 @@ def read_signals(
 
 
 def differences_angles(recording: RecordingConfig, log: Log) -> bool:
-    """Are velocities had from the angles, by central differences?"""
-    return recording.velocity == "differenced" or "joint/velocity" not in log
+    """Are velocities had from the angles, by central differences? Also where those of a log that is
+    sampled are such differences, which would be half a sample late as they are."""
+    if recording.velocity == "differenced" or "joint/velocity" not in log:
+        return True
+    return recording.is_sampled and are_differences(
+        log.time, log["joint/position"], log["joint/velocity"]
+    )
 
 
 def _low_passed(
@@ -767,6 +773,12 @@ class RecordedMotion:
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period
         self.signals, self.measured = read_signals(robot, log, recording)
+        self.lateness = Lateness.none(len(robot.joint_names))
+        if recording.is_sampled and not differences_angles(recording, log):
+            q, v = self.signals.joint_position, self.signals.joint_velocity
+            self.lateness = Lateness.of(q, v, self.period, _stretches(self.measured))
+            v = self.lateness.in_time(v, self.period)
+            self.signals = replace(self.signals, joint_velocity=v)
         is_shared = recording.is_sampled or differences_angles(recording, log)
         least = _SHARING if is_shared else 1
         self.length = max(least, round(recording.block / self.period))

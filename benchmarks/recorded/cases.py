@@ -1,0 +1,174 @@
+"""Recordings that nobody chose: a machine, what it has beside its model, how it moves and what
+records it, drawn at random."""
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.cases import judged, sources_checksum
+from benchmarks.recorded.course import Course, inverse_dynamics, swings
+from benchmarks.recorded.machine import Machine, random_machine
+from benchmarks.recorded.physics import Hidden, random_physics
+from benchmarks.recorded.recorder import Recorder, random_recorder
+from fbse_drake import Log, Scenario
+from fbse_drake.campaign.steps import Material
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.scenario import RobotConfig
+from fbse_drake.walking.reference import Recorded
+
+Outcome = Literal["right", "unsure", "missed", "wrong", "error"]
+
+# Of what is recorded, and step at which it is computed [s].
+_DURATION, _STEP = (15.0, 30.0), 0.001
+# By the step, friction that changes its sign is followed.
+LATE = "TorqueReadingLag"
+# Laws of friction that are one law where the other part is none.
+_FRICTION = {
+    "CoulombFriction": ("CoulombViscousFriction",),
+    "ViscousFriction": ("CoulombViscousFriction",),
+    "StribeckFriction": ("CoulombFriction", "CoulombViscousFriction"),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A number that everything is drawn from."""
+
+    number: int
+
+    @property
+    def name(self) -> str:
+        return f"recording-{self.number}"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A machine that moved, and what was recorded of it."""
+
+    machine: Machine
+    recorder: Recorder
+    hidden: tuple[Hidden, ...]
+    scenario: Scenario
+    log: Log
+
+    @property
+    def truth(self) -> Mapping[str, set[str]]:
+        """Effects that rightly say something about a target."""
+        found: dict[str, set[str]] = {}
+        for hidden in self.hidden:
+            for target in hidden.targets:
+                for name in hidden.names:
+                    found.setdefault(target, set()).update((name, *_FRICTION.get(name, ())))
+        if self.recorder.late:
+            for joint in self.machine.joints:
+                found.setdefault(joint, set()).add(LATE)
+        return found
+
+
+def record(number: int, folder: Path) -> Recording:
+    """The recording of this number: the same each time.
+
+    Args:
+        folder: where the machine's description is written.
+    """
+    random = np.random.default_rng([number, 71])
+    believed, recorder = random_machine(random), random_recorder(random)
+    duration = random.uniform(*_DURATION)
+    instants = np.arange(round(duration / _STEP) + 1) * _STEP
+    motion = swings(
+        random, instants, np.array(believed.posture), np.array(believed.amplitude)
+    )
+
+    def course(machine: Machine, name: str) -> Course:
+        (folder / name).mkdir()
+        return Course(instants, *motion, inverse_dynamics(machine.robot(folder / name), *motion))
+
+    known = course(believed, "believed")
+    hidden = random_physics(random, believed, known)
+    machine = believed
+    for physics in hidden:
+        machine = physics.change(machine)
+    real = known if machine == believed else course(machine, "real")
+    torque = real.torque + sum(physics.loss(real) for physics in hidden)
+    for physics in hidden:
+        torque = physics.told(torque)
+    sensors, recording = recorder.scenario(believed.joints, known)
+    body = RobotConfig(
+        str(folder / "believed" / "machine.yaml"), rotor_inertia=believed.rotors()
+    )
+    scenario = Scenario(
+        title="A machine that was drawn.",
+        duration=duration,
+        robot=body,
+        model=body,
+        reference=Recorded(),
+        sensors=sensors,
+        recording=recording,
+    )
+    log = recorder.log(random, believed.joints, real, np.asarray(torque))
+    return Recording(believed, recorder, hidden, scenario, log)
+
+
+def judge(material: Material) -> dict[str, str]:
+    """Runs the case of this number; see `benchmarks.store.Store`."""
+    case = Case(material.values["case"]["number"])
+    with TemporaryDirectory() as folder:
+        recording = record(case.number, Path(folder))
+        start = time.perf_counter()
+        diagnosis = diagnosis_json(diagnose(Predictor(recording.scenario, recording.log)))
+        duration = time.perf_counter() - start
+    found = {
+        "outcome": outcome(recording, diagnosis),
+        "hidden": [{"names": h.names, "targets": h.targets} for h in recording.hidden],
+        "recorder": recording.recorder.text(),
+        "wall_time": duration,
+        "diagnoses": [diagnosis],
+    }
+    return judged(case, found, sources())
+
+
+def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
+    """How a recording's diagnosis is: right if everything that shows is named and nothing else."""
+    truth = recording.truth
+    chosen = [finding for finding in diagnosis["ranking"] if finding["chosen"]]
+
+    def is_right(finding: Mapping[str, Any], target: str) -> bool:
+        said = {finding["effect"], *finding["confusable_with"]}
+        return bool(said & truth.get(target, set()))
+
+    # Of what joints share it is enough to be right in one of them: that is what a shared value says.
+    wrong = [f for f in chosen if not all(is_right(f, target) for target in f["joints"])]
+    if wrong:
+        return "wrong" if diagnosis["verdict"] == "effect_found" else "unsure"
+    if diagnosis["verdict"] == "unknown_effect":
+        return "unsure"
+    named = {
+        name for finding in chosen for name in (finding["effect"], *finding["confusable_with"])
+    }
+    small = {f["effect"] for f in diagnosis["ranking"] if f["too_small"]}
+    everything = all(set(h.names) & (named | small) or not shows(h, diagnosis) for h in recording.hidden)
+    return "right" if everything else "missed"
+
+
+def shows(hidden: Hidden, diagnosis: Mapping[str, Any]) -> bool:
+    """Does the diagnosis state of each of its names that it would have shown?"""
+    for name in hidden.names:
+        sizes = diagnosis["effects"].get(name, {}).get("smallest_detectable_by_target", {})
+        if not any(math.isfinite(sizes.get(target) or math.inf) for target in hidden.targets):
+            return False
+    return True
+
+
+def sources() -> str:
+    """Checksum of what decides on a case."""
+    return sources_checksum(*sorted(Path(__file__).parent.glob("*.py")))
+
+
+__all__ = ["Case", "Outcome", "Recording", "asdict", "judge", "outcome", "record"]

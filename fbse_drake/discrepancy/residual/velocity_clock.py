@@ -1,0 +1,108 @@
+"""When joint velocities are so. Those that come out of a low-pass, or are differences to the angle
+before, are late against their angles, and inertia looks like friction with them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+# Angles and velocities are compared over windows of this length [s], of which there must be so
+# many with so many samples each.
+_WINDOW, _FEWEST_WINDOWS, _FEWEST_SAMPLES = 2.0, 4, 20
+# A joint's velocity is late for sure if it is by so many standard deviations of that.
+_SURE = 4.0
+# What is later than this is no filter's [s].
+_LATEST = 0.05
+# A velocity that is a difference of the angles that it stands beside differs from that by less than
+# this share of what two such differences differ by.
+_SAME = 0.1
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """By how much the velocity of each joint comes after its angle [s], and the standard deviation
+    of that, (n,) each; 0 where it does not for sure."""
+
+    seconds: np.ndarray
+    deviation: np.ndarray
+
+    @staticmethod
+    def none(joints: int) -> "Lateness":
+        """All in time."""
+        return Lateness(*np.zeros((2, joints)))
+
+    @staticmethod
+    def of(
+        position: np.ndarray, velocity: np.ndarray, period: float, stretches: Sequence[slice]
+    ) -> "Lateness":
+        """Compares angles with what velocities add up to.
+
+        The integral of what is late by d falls behind its angle by d times the velocity. What
+        scales or offsets a velocity falls behind otherwise. Each window has its own offset and
+        drift; by how much the windows differ is the doubt (cluster-robust, Liang and Zeger 1986).
+
+        Args:
+            position, velocity: (N, n) [rad, rad/s] or [m, m/s], on an even grid.
+            stretches: runs of samples without gaps.
+        """
+        count = max(round(_WINDOW / period), _FEWEST_SAMPLES)
+        windows = [
+            slice(start, start + count)
+            for stretch in stretches
+            for start in range(stretch.start, stretch.stop - count + 1, count)
+        ]
+        joints = position.shape[1]
+        if len(windows) < _FEWEST_WINDOWS:
+            return Lateness.none(joints)
+        behind, motion = np.zeros((2, len(windows), count, joints))
+        for k, window in enumerate(windows):
+            q, v = position[window], velocity[window]
+            gap = q - cumulative_trapezoid(v, dx=period, axis=0, initial=0.0)
+            for j in range(joints):
+                nuisance = np.vander(np.arange(count) / count, 2)
+                nuisance = np.column_stack([nuisance, q[:, j] - q[:, j].mean()])
+                both = np.column_stack([gap[:, j], v[:, j]])
+                left = both - nuisance @ np.linalg.lstsq(nuisance, both, rcond=None)[0]
+                behind[k, :, j], motion[k, :, j] = left.T
+        information = (motion**2).sum(axis=(0, 1))
+        seconds = np.divide(
+            (motion * behind).sum(axis=(0, 1)),
+            information,
+            out=np.zeros(joints),
+            where=information > 0,
+        )
+        score = (motion * (behind - seconds * motion)).sum(axis=1)
+        spread = np.sqrt((score**2).sum(axis=0) * len(windows) / (len(windows) - 1))
+        deviation = np.divide(spread, information, out=np.zeros(joints), where=information > 0)
+        is_late = (np.abs(seconds) > _SURE * deviation) & (np.abs(seconds) < _LATEST)
+        return Lateness(np.where(is_late, seconds, 0.0), deviation)
+
+    def in_time(self, velocity: np.ndarray, period: float) -> np.ndarray:
+        """Velocities (N, n) as they were at the time of their angles, interpolated linearly."""
+        samples = np.arange(len(velocity))
+        shifted = [
+            np.interp(samples + late / period, samples, v)
+            for late, v in zip(self.seconds, velocity.T, strict=True)
+        ]
+        return np.stack(shifted, axis=1)
+
+
+def are_differences(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> bool:
+    """Are the velocities nothing but differences of the angles beside them, to the one before or
+    between both neighbours?
+
+    Args:
+        time: (N,) [s]; position, velocity: (N, n).
+    """
+    if len(time) < _FEWEST_SAMPLES:
+        return False
+    backward = (np.diff(position, axis=0) / np.diff(time)[:, None])[:-1]
+    central = (position[2:] - position[:-2]) / (time[2:] - time[:-2])[:, None]
+    read = velocity[1:-1]
+    apart = ((backward - central) ** 2).mean(axis=0)
+    nearest = np.minimum(
+        ((read - backward) ** 2).mean(axis=0), ((read - central) ** 2).mean(axis=0)
+    )
+    moving = apart > 0
+    return bool(moving.any() and (nearest[moving] < _SAME**2 * apart[moving]).all())
