@@ -13,7 +13,8 @@ from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.identification.regression import Regression, Signature, WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import EXCESS, leftover_structure
-from fbse_drake.discrepancy.residual.residual import Residual, Row, block_means, rms
+from fbse_drake.discrepancy.residual.blocks import block_means
+from fbse_drake.discrepancy.residual.residual import Residual, Row, rms
 from fbse_drake.effects.effect import library
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log

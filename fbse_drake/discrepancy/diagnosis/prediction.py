@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read, smoothed
 from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.identification.regression import Signature
+from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
+from fbse_drake.discrepancy.residual.recorded_velocity import velocity_error
 from fbse_drake.discrepancy.residual.residual import (
     EquationOfMotion,
     Instants,
     Residual,
     averaged,
-    block_means,
     foot_pairs,
     joint_velocity_noise,
     rms,
@@ -237,11 +238,12 @@ class Predictor:
 
         A law of the velocity does not say at which velocity within a step it holds: its torque is
         uncertain by its slope times what the velocity changes in the step. This counts where a
-        sticking joint trembles. Of rows that are sampled at an instant nothing is doubted.
+        sticking joint trembles. Of rows that are sampled at an instant it is uncertain by the error
+        of the velocity (effective variance, Orear 1982), which counts where a joint turns.
         """
         motion, joint_motion = self.motion, self.joint_motion
         if motion.recording.is_sampled:
-            return np.zeros(motion.blocks.joint_position.shape)
+            return self._variance_by_velocity([law for law in laws if not law.effect.has_memory])
         slope = np.zeros(joint_motion.velocity.shape)
         for law in laws:
             if not law.effect.has_memory:
@@ -250,6 +252,33 @@ class Predictor:
         change = np.diff(motion.signals.joint_velocity, axis=0) ** 2
         real = np.maximum(block_means(change, motion.length) - 2 * noise**2, 0.0)
         return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
+
+    def _variance_by_velocity(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
+        """Of the torque of laws whose velocity errs, (B, n) [Nm^2]."""
+        here, error = self.joint_motion, self._velocity_error
+        torques = [
+            sum(
+                (
+                    law.torque_and_slope(here._replace(velocity=here.velocity + shift))[0]
+                    for law in laws
+                ),
+                start=np.zeros(here.velocity.shape),
+            )
+            for shift in (0.0, error, -error)
+        ]
+        change = [
+            block_means(_in_steps(self.motion.recording, torque - torques[0]), self.motion.length)
+            for torque in torques[1:]
+        ]
+        return np.square(change).mean(axis=0)
+
+    @cached_property
+    def _velocity_error(self) -> np.ndarray:
+        """Of that by which laws are evaluated, see `velocity_error`, (n,)."""
+        motion, velocity = self.motion, self.joint_motion.velocity
+        return velocity_error(
+            motion.signals.joint_position, velocity, motion.period, motion.stretches, motion.length
+        )
 
     def predict(self, effect: ResolvedEffect) -> np.ndarray:
         """What an effect adds to the residual, (B, R). Inertia and sensor effects and slopes of the

@@ -17,8 +17,9 @@ from scipy.optimize import lsq_linear
 from scipy.stats import t as student
 
 from fbse_drake.discrepancy.identification.inertial import inertial_regressor
+from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.evidence import Evidence
-from fbse_drake.discrepancy.residual.residual import Instants, block_means
+from fbse_drake.discrepancy.residual.residual import Instants
 
 # Probability that any reading of any torque of a log that is as recorded is called wrong.
 FALSE_ALARM = 1e-3

@@ -8,11 +8,11 @@ from scipy.linalg import toeplitz
 from scipy.special import comb
 from scipy.stats import chi2
 
+from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
 from fbse_drake.discrepancy.residual.residual import (
     RecordedMotion,
     Residual,
-    block_means,
     differences_angles,
     rms,
 )

@@ -31,9 +31,10 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 
+from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.discrepancy.residual.memory import Memory
-from fbse_drake.discrepancy.residual.velocity_clock import Lateness, are_differences
+from fbse_drake.discrepancy.residual.recorded_velocity import Lateness, are_differences
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
@@ -354,15 +355,6 @@ def within_steps(values: np.ndarray, share: float) -> np.ndarray:
     """Samples (N, ...) interpolated in every step, (N - 1, ...): at its start for a share of 0, at
     its end for 1."""
     return (1.0 - share) * values[:-1] + share * values[1:]
-
-
-def block_means(values: np.ndarray, length: int) -> np.ndarray:
-    """Averages over blocks of this many samples, (N, ...) -> (N // length, ...); what is left at
-    the end is dropped."""
-    blocks = len(values) // length
-    by_block = values[: blocks * length].reshape(blocks, length, *values.shape[1:])
-    # Faster than `mean`, which takes the few samples of a block one by one.
-    return np.einsum("bl...->b...", by_block.astype(float, copy=False)) / length
 
 
 def averaged(instants: Instants, length: int) -> Instants:
@@ -776,7 +768,7 @@ class RecordedMotion:
         self.lateness = Lateness.none(len(robot.joint_names))
         if recording.is_sampled and not differences_angles(recording, log):
             q, v = self.signals.joint_position, self.signals.joint_velocity
-            self.lateness = Lateness.of(q, v, self.period, _stretches(self.measured))
+            self.lateness = Lateness.of(q, v, self.period, self.stretches)
             v = self.lateness.in_time(v, self.period)
             self.signals = replace(self.signals, joint_velocity=v)
         is_shared = recording.is_sampled or differences_angles(recording, log)
@@ -813,7 +805,12 @@ class RecordedMotion:
     def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
         """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0
         Hz."""
-        return _low_passed(values, corner, self.period, _stretches(self.measured))
+        return _low_passed(values, corner, self.period, self.stretches)
+
+    @cached_property
+    def stretches(self) -> list[slice]:
+        """Runs of samples without a gap."""
+        return _stretches(self.measured)
 
     def averages(self, predicted: np.ndarray) -> np.ndarray:
         """Averages over blocks of what was predicted step by step, (N - 1, ...), as the recording

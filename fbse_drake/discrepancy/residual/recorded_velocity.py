@@ -1,11 +1,18 @@
-"""When joint velocities are so. Those that come out of a low-pass, or are differences to the angle
-before, are late against their angles, and inertia looks like friction with them."""
+"""What recorded joint velocities are worth, by the angles beside them.
+
+Those that come out of a low-pass, or are differences to the angle before, are late, and inertia
+looks like friction with them. Those of a coarse encoder are wrong, and a joint that turns has
+friction of either sign for all they tell.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.signal import savgol_filter
+
+from fbse_drake.discrepancy.residual.blocks import block_means
 
 # Angles and velocities are compared over windows of this length [s], of which there must be so
 # many with so many samples each.
@@ -14,6 +21,8 @@ _WINDOW, _FEWEST_WINDOWS, _FEWEST_SAMPLES = 2.0, 4, 20
 _SURE = 4.0
 # What is later than this is no filter's [s].
 _LATEST = 0.05
+# Angles are smoothed by polynomials of this order over times of these lengths [s].
+_ORDER, _SMOOTHING = 3, (0.02, 0.05, 0.1, 0.2)
 # A velocity that is a difference of the angles that it stands beside differs from that by less than
 # this share of what two such differences differ by.
 _SAME = 0.1
@@ -86,6 +95,44 @@ class Lateness:
             for late, v in zip(self.seconds, velocity.T, strict=True)
         ]
         return np.stack(shifted, axis=1)
+
+
+def velocity_error(
+    position: np.ndarray,
+    velocity: np.ndarray,
+    period: float,
+    stretches: Sequence[slice],
+    length: int,
+) -> np.ndarray:
+    """Standard deviation of the mean error of each joint's velocity over a block, (n,).
+
+    By what differs from the rate of the smoothed angles (Savitzky and Golay 1964). Smoothed too
+    little, that is as noisy; too much, it lags behind what moves: the least difference counts.
+
+    Args:
+        position, velocity: (N, n), on an even grid.
+        stretches: runs of samples without gaps.
+        length: of a block [samples].
+    """
+    found = []
+    for time in _SMOOTHING:
+        window = 2 * round(0.5 * time / period) + 1
+        if window <= _ORDER + 1:
+            continue
+        errors = [
+            block_means(
+                velocity[stretch]
+                - savgol_filter(
+                    position[stretch], window, _ORDER, deriv=1, delta=period, axis=0
+                ),
+                length,
+            )
+            for stretch in stretches
+            if stretch.stop - stretch.start >= max(window, length)
+        ]
+        if errors:
+            found.append(np.sqrt((np.concatenate(errors) ** 2).mean(axis=0)))
+    return np.min(found, axis=0) if found else np.zeros(position.shape[1])
 
 
 def are_differences(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> bool:
