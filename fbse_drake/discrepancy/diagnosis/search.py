@@ -29,6 +29,7 @@ from fbse_drake.discrepancy.identification.structure import (
     Structure,
     leftover_structure,
     noisy_rows,
+    tolerated,
     untested_rows,
 )
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
@@ -140,35 +141,65 @@ def best_search(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Best
     """A search by a dictionary, or the one that was begun anew for what was learned of the log:
     something acted on it for a while, there is noise that nobody told of, torques come late."""
     predictor, progress = dictionary.predictor, dictionary.progress
-    search = _searched(dictionary, effects)
+    noisier: set[int] = set()
+
+    def with_noise(more: Noise) -> Predictor:
+        noisier.update(np.flatnonzero(more.factor > 1.0).tolist())
+        return predictor.noisier(more)
+
+    try:
+        search = _searched(dictionary, effects, until_noise=True)
+    except _NoiseAlone as found:
+        predictor = with_noise(found.noise)
+        search = _searched(Dictionary(predictor, effects, progress), effects)
     disturbances = search.disturbances
     if disturbances:
         predictor = predictor.without([(one.start, one.end) for one in disturbances])
         search = _searched(Dictionary(predictor, effects, progress), effects)
-    noisier: tuple[str, ...] = ()
     if search.more_noise is not None:
-        rows = predictor.residual.rows
-        noisier = tuple(rows[k].name for k in np.flatnonzero(search.more_noise.factor > 1.0))
-        predictor = predictor.noisier(search.more_noise)
+        predictor = with_noise(search.more_noise)
         search = _searched(Dictionary(predictor, effects, progress), effects)
+    names = tuple(predictor.residual.rows[row].name for row in sorted(noisier))
     before = root_mean_square(search.proposals.fits.white, search.before)
     late = _late_torques(search)
     if late is not None:
         in_time = _with_torques_in_time(predictor, late, effects, progress)
         if in_time.error <= _AS_GOOD * search.error:
-            return BestSearch(in_time, disturbances, noisier, late, before)
-    return BestSearch(search, disturbances, noisier, None, before)
+            return BestSearch(in_time, disturbances, names, late, before)
+    return BestSearch(search, disturbances, names, None, before)
 
 
-def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Search:
-    """What is found by a dictionary of these effects."""
+class _NoiseAlone(Exception):
+    """What is left is nothing but noise that nobody told of."""
+
+    def __init__(self, noise: Noise):
+        super().__init__()
+        self.noise = noise
+
+
+def _searched(
+    dictionary: Dictionary, effects: Sequence[type[Effect]], *, until_noise: bool = False
+) -> Search:
+    """What is found by a dictionary of these effects.
+
+    Args:
+        until_noise: ends where nothing is left but noise that nobody told of, in which many effects
+            would be tried.
+
+    Raises:
+        _NoiseAlone: it ended so.
+    """
     predictor, progress, partial = dictionary.predictor, dictionary.progress, None
     proposals = Proposals(Fits(dictionary))
     path, before = [proposals.fits.explain([])], proposals.fits.white.sse
     try:
         first = remeasured(proposals.fits)
-        for path, proposals in _held(first.dictionary, first.white):  # noqa: B007 - the last one.
+        if until_noise:
+            _raise_if_noise_alone(first, path[-1])
+        for path, proposals in _held(first.dictionary, first.white):
             progress("looking for what explains more")
+            if until_noise:
+                _raise_if_noise_alone(proposals.fits, path[-1])
     except Interrupted as stop:
         partial = str(stop)
     alternatives: dict[int, list[Explanation]] = {}
@@ -206,6 +237,23 @@ def _searched(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Search
         else _more_noise(predictor, remaining, left, [s.index for s in unexplained]),
         partial,
     )
+
+
+def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
+    """
+    Raises:
+        _NoiseAlone: what an explanation leaves is that, in all rows in which there is more of it
+            than is believed.
+    """
+    predictor, left = fits.dictionary.predictor, fits.leftover(explanation)
+    loud = [
+        row
+        for row in np.flatnonzero(fits.white.count > 0)
+        if np.sqrt((left[:, row] ** 2).sum() / fits.white.count[row]) > tolerated(fits.white, row)
+    ]
+    noise = _more_noise(predictor, fits.white, left, loud)
+    if noise is not None and (noise.factor[loud] > 1.0).all():
+        raise _NoiseAlone(noise)
 
 
 def _more_noise(

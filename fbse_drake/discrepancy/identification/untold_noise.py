@@ -16,16 +16,17 @@ from fbse_drake.discrepancy.residual.residual import Residual
 _FALSE_ALARM = 1e-3
 # White noise beside that of the sensors, as a share of its variance: none, and a guess.
 _NO_SHARE, _SHARE = 1e-9, 1e-2
-# Logarithm of more noise than there is in any log, in place of what is believed.
-_MOST = 30.0
+# Logarithms of the least that there may be of what is believed, for noise of a velocity that is
+# filtered is measured where it is loudest, and of more than there is in any log.
+_LEAST, _MOST = -3.0, 30.0
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 
 
 def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
-    """Noise of rows in which nothing but noise is left, by maximum likelihood: how much more there
-    is of that of the sensors, and how much white noise beside; None if none of these rows has more
-    than is believed, or what is left is not such noise.
+    """Noise of rows in which nothing but noise is left, by maximum likelihood: how many times there
+    is that of the sensors, and how much white noise beside; None if none of these rows has other
+    noise than is believed, or what is left is not such noise.
 
     Args:
         length: of a block [steps].
@@ -39,7 +40,7 @@ def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noi
         gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
         if gained > least and left.is_noise(more, beside):
             sensors[row], white[row] = more, beside * length
-            factor[row] = np.sqrt(more + beside / left.variance.mean())
+            factor[row] = np.sqrt((left.whitened(1.0, 0.0) ** 2).mean())
     return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
 
 
@@ -83,7 +84,7 @@ class _Left:
         found = minimize(
             lambda x: self.deviance(np.exp(x[0]), typical * np.exp(x[1])),
             np.log([1.0, _SHARE]),
-            bounds=[(0.0, _MOST), (np.log(_NO_SHARE), _MOST)],
+            bounds=[(_LEAST, _MOST), (np.log(_NO_SHARE), _MOST)],
             method="L-BFGS-B",
         )
         return float(np.exp(found.x[0])), typical * float(np.exp(found.x[1]))

@@ -87,14 +87,24 @@ class Lateness:
         is_late = (np.abs(seconds) > _SURE * deviation) & (np.abs(seconds) < _LATEST)
         return Lateness(np.where(is_late, seconds, 0.0), deviation)
 
-    def in_time(self, velocity: np.ndarray, period: float) -> np.ndarray:
-        """Velocities (N, n) as they were at the time of their angles, interpolated linearly."""
+    def in_time(
+        self, velocity: np.ndarray, known: np.ndarray, period: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities (N, n) as they were at the time of their angles, interpolated linearly.
+
+        Args:
+            known: samples that are measured, (N,).
+
+        Returns:
+            The velocities, and where they come from samples that are known, (N,).
+        """
         samples = np.arange(len(velocity))
-        shifted = [
-            np.interp(samples + late / period, samples, v)
-            for late, v in zip(self.seconds, velocity.T, strict=True)
-        ]
-        return np.stack(shifted, axis=1)
+        result, weight = np.empty_like(velocity), known.astype(float)
+        for joint, late in enumerate(self.seconds):
+            at = samples + late / period
+            result[:, joint] = np.interp(at, samples, velocity[:, joint])
+            weight = np.minimum(weight, np.interp(at, samples, known, left=0.0, right=0.0))
+        return result, weight == 1.0
 
 
 def velocity_error(

@@ -211,6 +211,12 @@ def read_signals(
         pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
     measured = not differences_angles(recording, log)
+    if not measured:
+        # Where a stretch ends there is no central difference.
+        inside = np.zeros_like(known)
+        for stretch in stretches:
+            inside[stretch.start + 1 : stretch.stop - 1] = True
+        known = inside
     torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
     torque = np.where(robot.description.has_motor, torque, 0.0)
     signals = SensorSignals(
@@ -768,8 +774,9 @@ class RecordedMotion:
         self.lateness = Lateness.none(len(robot.joint_names))
         if recording.is_sampled and not differences_angles(recording, log):
             q, v = self.signals.joint_position, self.signals.joint_velocity
-            self.lateness = Lateness.of(q, v, self.period, self.stretches)
-            v = self.lateness.in_time(v, self.period)
+            lateness = Lateness.of(q, v, self.period, _stretches(self.measured))
+            v, known = lateness.in_time(v, self.measured, self.period)
+            self.lateness, self.measured = lateness, known
             self.signals = replace(self.signals, joint_velocity=v)
         is_shared = recording.is_sampled or differences_angles(recording, log)
         least = _SHARING if is_shared else 1
