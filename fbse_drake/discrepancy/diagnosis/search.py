@@ -29,7 +29,6 @@ from fbse_drake.discrepancy.identification.structure import (
     Structure,
     leftover_structure,
     noisy_rows,
-    tolerated,
     untested_rows,
 )
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
@@ -40,6 +39,8 @@ from fbse_drake.progress import Interrupted, Progress
 
 # Where torques are read earlier, the error may be so many times as large: noise is measured anew.
 _AS_GOOD = 1.02
+# Of fewer averages than this a test of whiteness says little.
+_TELLING = 400
 # A search is tried again, so often in all, if less than this share of what it explained pays.
 _HOLDS, _MOST_WAYS = 0.5, 3
 
@@ -242,15 +243,13 @@ def _searched(
 def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
     """
     Raises:
-        _NoiseAlone: what an explanation leaves is that, in all rows in which there is more of it
-            than is believed.
+        _NoiseAlone: what an explanation leaves is that, in all rows in which more than noise seems
+            to be left.
     """
     predictor, left = fits.dictionary.predictor, fits.leftover(explanation)
-    loud = [
-        row
-        for row in np.flatnonzero(fits.white.count > 0)
-        if np.sqrt((left[:, row] ** 2).sum() / fits.white.count[row]) > tolerated(fits.white, row)
-    ]
+    loud = [s.index for s in leftover_structure(predictor.motion, fits.white, left)]
+    if (fits.white.count[loud] < _TELLING).any():
+        return
     noise = _more_noise(predictor, fits.white, left, loud)
     if noise is not None and (noise.factor[loud] > 1.0).all():
         raise _NoiseAlone(noise)

@@ -25,8 +25,8 @@ _ROUNDING = 1e-18
 
 def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
     """Noise of rows in which nothing but noise is left, by maximum likelihood: how many times there
-    is that of the sensors, and how much white noise beside; None if none of these rows has other
-    noise than is believed, or what is left is not such noise.
+    is that of the sensors, and how much white noise beside; None if none of these rows has more
+    than is believed, or what is left is not such noise.
 
     Args:
         length: of a block [steps].
@@ -36,11 +36,13 @@ def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noi
     least = chi2.isf(_FALSE_ALARM / max(1, len(rows)), 2)
     for row in rows:
         left = _Left.of(residual, row)
+        louder = np.sqrt((left.whitened(1.0, 0.0) ** 2).mean())
+        if louder <= 1.0:
+            continue
         more, beside = left.likeliest()
         gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
         if gained > least and left.is_noise(more, beside):
-            sensors[row], white[row] = more, beside * length
-            factor[row] = np.sqrt((left.whitened(1.0, 0.0) ** 2).mean())
+            sensors[row], white[row], factor[row] = more, beside * length, louder
     return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
 
 
