@@ -96,10 +96,12 @@ rivals: $(DEVELOPED)
 	$(VENV)/bin/fbse rivals hrp2_walk_fbse --set duration=4.3 --seeds 10 --out out/rivals/hrp2_walk_fbse
 
 # How well missing physics is found: some 430 logs, an hour and a half on two cores; goes on where it was stopped. By hand: --quick, --only NAME.
-# Then in another simulator, if the extra `mujoco` is installed: some 70 logs, a quarter of an hour.
+# Then in another simulator, if the extra `mujoco` is installed: some 70 logs, a quarter of an hour; and in recordings of machines that
+# are drawn, ten minutes.
 hidden: $(DEVELOPED)
 	$(VENV)/bin/python -m benchmarks.hidden
 	$(VENV)/bin/python -m benchmarks.mujoco_hidden
+	$(VENV)/bin/python -m benchmarks.recordings
 
 # Installs again when the package's needs change. Modules are compiled when they are first imported:
 # most never are.

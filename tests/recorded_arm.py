@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.multibody.tree import MultibodyForces
 
+from benchmarks.recorded.course import Course, inverse_dynamics, swings
 from fbse_drake import Log, Scenario
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.robot.plant import Robot, make_robot
@@ -16,25 +16,6 @@ from fbse_drake.sensors.encoders import EncoderConfig
 from fbse_drake.walking.reference import Recorded
 
 VELOCITY_NOISE = 5e-4
-
-
-@dataclass(frozen=True)
-class Course:
-    """What a machine did: (N, n) each, but for the time; torques are those that its links got."""
-
-    time: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    torque: np.ndarray
-
-    @property
-    def period(self) -> float:
-        return float(self.time[1] - self.time[0])
-
-    def rate(self, values: np.ndarray) -> np.ndarray:
-        """Derivative of what was sampled."""
-        return np.gradient(values, self.period, axis=0, edge_order=2)
 
 
 @dataclass(frozen=True)
@@ -77,19 +58,15 @@ class Machine:
 
     def course(self, seed: int = 0, rotor_inertia: tuple[float, ...] | None = None) -> Course:
         """Every joint swings as three sines about its posture."""
-        random = np.random.default_rng(seed)
         time = np.arange(round(self.duration / self.period) + 1) * self.period
-        motion = np.zeros((3, len(time), len(self.posture)))
-        motion[0] += self.posture
-        for joint, amplitude in enumerate(self.amplitude):
-            shares, lowest = random.uniform(0.4, 1.0, 3), random.uniform(0.15, 0.3)
-            for k, share in enumerate(shares / shares.sum(), 1):
-                pulsation, phase = 2 * np.pi * k * lowest, random.uniform(0, 2 * np.pi)
-                for order in range(3):
-                    wave = np.sin(pulsation * time + phase + 0.5 * np.pi * order)
-                    motion[order, :, joint] += amplitude * share * pulsation**order * wave
+        motion = self.motion(seed, time)
         robot = self.robot(self.by_joint(rotor_inertia or self.rotor_inertia))
         return Course(time, *motion, inverse_dynamics(robot, *motion))
+
+    def motion(self, seed: int, time: np.ndarray) -> np.ndarray:
+        """Positions, velocities and accelerations at any times, (3, N, n)."""
+        random = np.random.default_rng(seed)
+        return swings(random, time, np.array(self.posture), np.array(self.amplitude))
 
     def log(
         self,
@@ -121,22 +98,6 @@ class Machine:
 
     def predictor(self, log: Log) -> Predictor:
         return Predictor(self.scenario, log)
-
-
-def inverse_dynamics(
-    robot: Robot, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
-) -> np.ndarray:
-    """Torques that a motion needs, (N, n)."""
-    plant, context = robot.plant, robot.plant.CreateDefaultContext()
-    forces, result = MultibodyForces(plant), np.empty_like(position)
-    at, of = robot.position_index, robot.velocity_index
-    q, v, a = np.zeros(plant.num_positions()), *np.zeros((2, plant.num_velocities()))
-    for k in range(len(position)):
-        q[at], v[of], a[of] = position[k], velocity[k], acceleration[k]
-        plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
-        plant.CalcForceElementsContribution(context, forces)
-        result[k] = plant.CalcInverseDynamics(context, a, forces)[of]
-    return result
 
 
 ARM = Machine(

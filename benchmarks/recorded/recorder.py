@@ -1,7 +1,7 @@
 """How a motion and its torques become a log: rates, encoders, filters, and what is told of them."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from scipy.signal import butter, lfilter
@@ -10,6 +10,11 @@ from benchmarks.recorded.course import Course
 from fbse_drake import Log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
+
+Velocity: TypeAlias = Literal["measured", "low-passed", "differenced", "missing"]
+Told: TypeAlias = Literal["nothing", "something", "everything"]
+VELOCITIES: tuple[Velocity, ...] = get_args(Velocity)
+TOLD: tuple[Told, ...] = get_args(Told)
 
 # Of the angle that one count is: encoders of 12 to 20 bits.
 _BITS = (12, 20)
@@ -26,7 +31,7 @@ class Recorder:
     # Of the log [s], a multiple of the course's.
     period: float
     bits: int
-    velocity: Literal["measured", "low-passed", "differenced", "missing"]
+    velocity: Velocity
     # Low-pass of such velocities [Hz].
     corner: float
     # Over the largest torque of a joint; 0 for none.
@@ -34,7 +39,7 @@ class Recorder:
     torque_step: float
     # Torques are recorded behind a filter of this time constant [s]; 0 for none.
     late: float
-    told: Literal["nothing", "something", "everything"]
+    told: Told
 
     @property
     def count(self) -> float:
@@ -96,9 +101,7 @@ class Recorder:
         start = np.array([[(1 - b[0])]]) * velocity[:1]
         return lfilter(b, a, velocity, axis=0, zi=start)[0][::every]
 
-    def scenario(
-        self, joints: list[str], course: Course
-    ) -> tuple[SensorsConfig, RecordingConfig]:
+    def scenario(self, joints: list[str], course: Course) -> tuple[SensorsConfig, RecordingConfig]:
         """What a user writes who knows nothing of it, its torques' noise, or all."""
         velocity: Literal["measured", "differenced"] = (
             "differenced" if self.velocity in ("differenced", "missing") else "measured"
@@ -121,20 +124,14 @@ class Recorder:
 
 def random_recorder(random: np.random.Generator) -> Recorder:
     """From a cheap logger to a good one."""
-    kinds: tuple[Literal["measured", "low-passed", "differenced", "missing"], ...] = (
-        "measured",
-        "low-passed",
-        "differenced",
-        "missing",
-    )
     steps = random.random() < 0.4
     return Recorder(
         period=float(random.choice([0.001, 0.002, 0.004, 0.005, 0.008, 0.01])),
         bits=int(random.integers(_BITS[0], _BITS[1] + 1)),
-        velocity=kinds[random.integers(len(kinds))],
+        velocity=VELOCITIES[random.integers(len(VELOCITIES))],
         corner=float(random.uniform(20.0, 60.0)),
         torque_noise=float(np.exp(random.uniform(*np.log(_NOISE)))),
         torque_step=float(np.exp(random.uniform(*np.log(_STEPS)))) if steps else 0.0,
         late=float(random.choice([0.0, 0.0, 0.001, 0.003])),
-        told=("nothing", "something", "everything")[random.integers(3)],
+        told=TOLD[random.integers(len(TOLD))],
     )

@@ -149,7 +149,7 @@ def best_search(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Best
         return predictor.noisier(more)
 
     try:
-        search = _searched(dictionary, effects, until_noise=True)
+        search = _searched(dictionary, effects, until_noise=predictor.motion.recording.is_sampled)
     except _NoiseAlone as found:
         predictor = with_noise(found.noise)
         search = _searched(Dictionary(predictor, effects, progress), effects)

@@ -32,6 +32,8 @@ from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, r
 # Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation
 # from which on a delay can be told.
 _LARGEST_OFFSET, _SMALLEST_OFFSET, _CORRELATED = 20, 1.5, 0.7
+# What is allowed for is said from so many samples on.
+_WORTH_SAYING = 0.25
 # Moments of feet are smoothed over so many samples before they are differenced.
 _SMOOTHED = 11
 # What a delay or a low-pass must take off the mismatch of two channels to be named, as a share of
@@ -95,8 +97,11 @@ def _clock(
 
 def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
     """Angles and velocities of one joint are the same motion: what is between them is between their
-    clocks."""
+    clocks, or a filter."""
     if "joint/velocity" not in evidence.log:
+        return
+    if (late := evidence.motion.lateness.seconds).any():
+        yield from _read_in_time(evidence, late)
         return
     velocity = evidence.log["joint/velocity"]
     differenced = np.gradient(evidence.log["joint/position"], evidence.log.time, axis=0)
@@ -108,6 +113,22 @@ def check_velocity_clock(evidence: Evidence) -> Iterable[HygieneFinding]:
             *_offset(differenced[:, moving], velocity[:, moving]),
             "the rate of the angles",
         )
+
+
+def _read_in_time(evidence: Evidence, late: np.ndarray) -> Iterable[HygieneFinding]:
+    """
+    Args:
+        late: by what the velocity of each joint comes late, (n,) [s].
+    """
+    worst = int(np.argmax(np.abs(late)))
+    if abs(late[worst]) < _WORTH_SAYING * evidence.period:
+        return
+    seconds = float(late[worst])
+    text = (
+        f"comes {1e3 * abs(seconds):.3g} ms {'late' if seconds > 0 else 'early'} against the rate "
+        "of the angles, as behind a filter; it is read in time with them"
+    )
+    yield remark("velocity_clock", "note", "joint/velocity", seconds, "s", text)
 
 
 def check_gyro_clock(evidence: Evidence) -> Iterable[HygieneFinding]:

@@ -132,9 +132,7 @@ def velocity_error(
         errors = [
             block_means(
                 velocity[stretch]
-                - savgol_filter(
-                    position[stretch], window, _ORDER, deriv=1, delta=period, axis=0
-                ),
+                - savgol_filter(position[stretch], window, _ORDER, deriv=1, delta=period, axis=0),
                 length,
             )
             for stretch in stretches
