@@ -96,6 +96,7 @@ def best_additions(
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most, in_part=in_part), []
+    there: list[Candidate | ResolvedEffect] = [*fits.dictionary.predictor.known, *base.candidates]
     tried = [
         *([candidate] for candidate in promising),
         *proposals.together(base, promising),
@@ -103,7 +104,6 @@ def best_additions(
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
         everything = [*base.candidates, *added]
-        there = [*fits.dictionary.predictor.known, *base.candidates]
         if _loses_scale(fits, everything) or _cancel(there, added):
             continue
         wider = fits.explain(everything)
