@@ -258,11 +258,12 @@ def test_angles_that_are_differenced_have_the_noise_of_their_steps(bits: int) ->
     np.testing.assert_allclose(spread, 1.0, atol=0.3)
 
 
-def left_in_a_row(white: float, wave: float, seed: int) -> Residual:
-    """Noise as of differenced velocities, of variance 1, with white noise and a wave beside."""
+def left_in_a_row(white: float, wave: float, seed: int, sensors: float = 1.0) -> Residual:
+    """Noise as of differenced velocities, of a variance beside the believed 1, with white noise and
+    a wave beside."""
     residual, random = arm(0.0)[0].motion.residual, np.random.default_rng(seed)
     blocks = len(residual.time)
-    steps = np.sqrt(0.5) * np.diff(random.standard_normal(blocks + 1))
+    steps = np.sqrt(0.5 * sensors) * np.diff(random.standard_normal(blocks + 1))
     value = np.zeros_like(residual.value)
     value[:, 0] = steps + np.sqrt(white) * random.standard_normal(blocks)
     value[:, 0] += wave * np.sin(0.7 * np.arange(blocks))
@@ -284,6 +285,17 @@ def test_what_is_as_believed_or_no_noise_is_not_taken_for_more_noise(
 ) -> None:
     assert likeliest_noise(left_in_a_row(white, wave, 3), 5, [0]) is None
     assert likeliest_noise(left_in_a_row(0.05, 0.0, 3), 5, []) is None
+
+
+def test_sensors_may_be_less_noisy_than_they_look() -> None:
+    """Noise of a filtered velocity is measured where it is loudest. What white noise there is
+    beside shows all the same."""
+    found = [likeliest_noise(left_in_a_row(0.05, 0.0, seed, 0.4), 5, [0]) for seed in range(10)]
+    white = [noise.white[0] / 5 for noise in found if noise is not None]
+    sensors = [noise.sensors[0] for noise in found if noise is not None]
+    assert len(white) == 10
+    assert np.mean(white) == pytest.approx(0.05, rel=0.1)
+    assert np.mean(sensors) == pytest.approx(0.4, rel=0.05)
 
 
 def test_nothing_is_no_noise() -> None:

@@ -93,8 +93,7 @@ class Predictor:
         if reading is None or not reading.serves(scenario):
             reading = Reading(scenario, log, self.left_out)
         self.reading, self.robot, self.motion = reading, reading.robot, reading.motion
-        # Effects of the model.
-        self.known = [
+        self._known = [
             effect.resolve(self.robot.description, key=f"model.effects.{key}")
             for key, effect in scenario.believed.effects.items()
         ]
@@ -144,7 +143,7 @@ class Predictor:
         `JointTorqueEffect.shares`."""
         return sum(
             known.linear_values(name)[known.targets.index(joint)]
-            for known in self.known
+            for known in self._known
             if effect.shares(name, known.effect)
         )
 
@@ -176,7 +175,7 @@ class Predictor:
     @cached_property
     def _believed_residual(self) -> Residual:
         residual = self.motion.residual
-        for known in self.known:
+        for known in self._known:
             if not is_read(known.effect, self.motion.recording):
                 residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
@@ -186,7 +185,7 @@ class Predictor:
                 residual,
                 variance=residual.variance + self.sinking_variance / self._contact.stiffness**2,
             )
-        return self.doubted(residual, self.known)
+        return self.doubted(residual, self._known)
 
     def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
         """A residual that is less certain because effects were taken off it.
@@ -842,7 +841,7 @@ class Predictor:
     @cached_property
     def _believed_slope(self) -> np.ndarray:
         """Of the model's ground, (2,) [rad], see `Ground.slope`."""
-        known = [e.linear[:, 0] for e in self.known if issubclass(e.effect, GroundSlope)]
+        known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
         return np.sum([self.scenario.ground.slope, *known], axis=0)
 
     @cached_property

@@ -119,7 +119,10 @@ def _with_torques_in_time(
     jumps, a rate is no delay, and other laws are found in what is left of the jumps."""
     model = predictor.scenario.believed
     model = replace(model, effects=dict(model.effects) | {"_late_torques": late.effect})
-    others = [effect for effect in effects if effect is not TorqueReadingLag]
+    # What is read too early is no drive that is late, unless one was found before.
+    found = {c.effect for c in late.explanation.candidates}
+    barred = {TorqueReadingLag, *(e for e in TorqueReadingLag.opposites if e not in found)}
+    others = [effect for effect in effects if effect not in barred]
     in_time = predictor.of(replace(predictor.scenario, model=model))
     return _searched(Dictionary(in_time, others, progress), others)
 

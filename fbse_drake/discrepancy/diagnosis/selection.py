@@ -10,7 +10,7 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation,
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
-from fbse_drake.effects.effect import Effect, ResolvedEffect, library
+from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.sensor import FootForceGain
@@ -96,7 +96,6 @@ def best_additions(
     """
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most, in_part=in_part), []
-    there: list[Candidate | ResolvedEffect] = [*fits.dictionary.predictor.known, *base.candidates]
     tried = [
         *([candidate] for candidate in promising),
         *proposals.together(base, promising),
@@ -104,7 +103,7 @@ def best_additions(
     for k, added in enumerate(tried):
         fits.dictionary.progress(LOOKING, 0.3 + 0.7 * k / len(tried))
         everything = [*base.candidates, *added]
-        if _loses_scale(fits, everything) or _cancel(there, added):
+        if _loses_scale(fits, everything) or _cancel(base.candidates, added):
             continue
         wider = fits.explain(everything)
         if wider.deviance >= most:
@@ -156,14 +155,12 @@ def _loses_scale(fits: Fits, candidates: Sequence[Candidate]) -> bool:
     )
 
 
-def _cancel(
-    there: Sequence[Candidate | ResolvedEffect], added: Sequence[Candidate | ResolvedEffect]
-) -> bool:
+def _cancel(members: Sequence[Candidate], added: Sequence[Candidate]) -> bool:
     """Would effects undo what others do in the same place?"""
     return any(
         set(one.targets) & set(other.targets)
         and (one.effect in other.effect.opposites or other.effect in one.effect.opposites)
-        for one in there
+        for one in members
         for other in added
     )
 

@@ -1,0 +1,123 @@
+"""The benchmark of recordings that are drawn (benchmarks/recordings.py): what is recorded is what
+is said to be, and outcomes are judged as they should be."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import recordings
+from benchmarks.recorded.cases import Recording, outcome, record
+from benchmarks.recorded.course import inverse_dynamics
+from benchmarks.recorded.machine import random_machine
+from benchmarks.recorded.physics import Hidden
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.robot.plant import make_robot
+
+
+def test_a_number_is_a_recording(tmp_path: Path) -> None:
+    both = []
+    for folder in ("one", "other"):
+        (tmp_path / folder).mkdir()
+        both.append(record(5, tmp_path / folder))
+    one, other = both
+    assert one.machine == other.machine
+    assert one.recorder == other.recorder
+    for name, values in one.log.channels.items():
+        np.testing.assert_array_equal(values, other.log[name])
+
+
+def test_heavier_links_weigh_what_they_have_more(tmp_path: Path) -> None:
+    """At rest the first joint of a machine carries the moments of all links behind it: by a mass
+    at its link's centre, found here by the change of the potential energy."""
+    machine = random_machine(np.random.default_rng(4))
+    last, more = len(machine.links) - 1, 0.7
+    posture = np.array([machine.posture])
+    still = np.zeros_like(posture)
+    torques, energies = [], []
+    for k, mass in enumerate((machine.links[last].mass, machine.links[last].mass + more)):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        robot = machine.with_link(last, mass=mass).robot(folder)
+        torques.append(inverse_dynamics(robot, posture, still, still)[0])
+
+        def energy(q: np.ndarray, folder: Path = folder) -> float:
+            plant = make_robot(folder / "machine.yaml")[0].plant
+            context = plant.CreateDefaultContext()
+            plant.SetPositions(context, q)
+            return float(plant.CalcPotentialEnergy(context))
+
+        step = 1e-6 * np.eye(len(machine.joints))
+        energies.append([(energy(posture[0] + d) - energy(posture[0] - d)) / 2e-6 for d in step])
+    np.testing.assert_allclose(torques, energies, atol=1e-6)
+    assert np.abs(torques[1] - torques[0]).max() > 1e-3
+
+
+def diagnosis(verdict: str, *named: tuple[str, list[str], list[str]]) -> dict:
+    findings = [
+        {
+            "effect": effect,
+            "joints": joints,
+            "confusable_with": alike,
+            "chosen": True,
+            "too_small": False,
+        }
+        for effect, joints, alike in named
+    ]
+    shown = {"smallest_detectable_by_target": {"joint_1": 0.1, "joint_2": 0.1}}
+    effects = dict.fromkeys(("TorqueBias", "QuadraticDrag"), shown)
+    return {"verdict": verdict, "ranking": findings, "effects": effects}
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        (diagnosis("effect_found", ("TorqueBias", ["joint_1"], [])), "right"),
+        (diagnosis("effect_found", ("JointSpring", ["joint_1"], ["TorqueBias"])), "right"),
+        (diagnosis("effect_found", ("TorqueBias", ["joint_2"], [])), "wrong"),
+        (diagnosis("effect_found", ("TorqueBias", ["joint_1", "joint_2"], [])), "wrong"),
+        (diagnosis("effect_found", ("QuadraticDrag", ["joint_1"], [])), "wrong"),
+        (diagnosis("unknown_effect", ("QuadraticDrag", ["joint_1"], [])), "unsure"),
+        (diagnosis("unknown_effect", ("TorqueBias", ["joint_1"], [])), "unsure"),
+        (diagnosis("nothing_missing"), "missed"),
+    ],
+)
+def test_outcomes(tmp_path: Path, said: dict, expected: str) -> None:
+    drawn = record(5, tmp_path)
+    hidden = (Hidden(("TorqueBias",), ("joint_1",)),)
+    punctual = type(drawn.recorder)(**{**vars(drawn.recorder), "late": 0.0})
+    one = Recording(drawn.machine, punctual, hidden, drawn.scenario, drawn.log)
+    assert outcome(one, said) == expected
+
+
+def test_what_does_not_show_is_not_missed(tmp_path: Path) -> None:
+    drawn = record(5, tmp_path)
+    hidden = (Hidden(("TorqueBias",), ("joint_3",)),)
+    one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
+    assert outcome(one, diagnosis("nothing_missing")) == "right"
+
+
+@pytest.mark.parametrize("number", [10, 17, 232])
+def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
+    """Nothing hidden, and angles alone that nobody tells the noise of; filtered velocities whose
+    torques have the noise that is told; the same where nobody tells it."""
+    drawn = record(number, tmp_path)
+    found = diagnose(Predictor(drawn.scenario, drawn.log))
+    assert outcome(drawn, diagnosis_json(found)) == "right"
+
+
+def test_a_line_says_what_went_wrong() -> None:
+    tree = {
+        "case": {"number": 7},
+        "outcome": "wrong",
+        "recorder": "100 Hz, nothing told",
+        "hidden": [{"names": ["TorqueBias", "JointSpring"], "targets": ["joint_1"]}],
+        "diagnoses": [
+            diagnosis("effect_found", ("TorqueGain", ["joint_1"], [])) | {"unexplained": []}
+        ],
+    }
+    assert recordings.text(tree) == (
+        "recording-7, wrong (100 Hz, nothing told): TorqueBias (joint_1) -> effect_found: "
+        "TorqueGain (joint_1); unexplained: nothing"
+    )
