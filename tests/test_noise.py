@@ -18,8 +18,9 @@ from fbse_drake.discrepancy.hygiene.hygiene import inspect
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
-from fbse_drake.discrepancy.residual.noise import channel_noise, noise_power
+from fbse_drake.discrepancy.residual.noise import Noise, channel_noise, noise_power
 from fbse_drake.discrepancy.residual.residual import Residual
+from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.effects.transmission import Backlash
@@ -296,6 +297,25 @@ def test_sensors_may_be_less_noisy_than_they_look() -> None:
     assert len(white) == 10
     assert np.mean(white) == pytest.approx(0.05, rel=0.1)
     assert np.mean(sensors) == pytest.approx(0.4, rel=0.05)
+
+
+def test_noise_that_is_found_twice_adds_up() -> None:
+    """Also when the model changes, and its rows' noise is measured anew."""
+    predictor, _ = arm(0.3)
+    rows = predictor.rows
+    once, twice = (
+        Noise((), np.full(rows, white), np.full(rows, sensors), np.full(rows, 2.0))
+        for white, sensors in ((0.02, 0.5), (0.03, 2.0))
+    )
+    noisier = predictor.noisier(once).noisier(twice)
+    white = (predictor.noise.white * 0.5 + 0.02) * 2.0 + 0.03
+    np.testing.assert_allclose(noisier.noise.white, white)
+    np.testing.assert_allclose(noisier.noise.sensors, predictor.noise.sensors)
+    model = replace(predictor.scenario.believed, effects={"bias": TorqueBias({"all": 0.1})})
+    changed = replace(predictor.scenario, model=model)
+    anew = Predictor(changed, predictor.log)
+    white = (anew.noise.white * 0.5 + 0.02) * 2.0 + 0.03
+    np.testing.assert_allclose(noisier.of(changed).noise.white, white)
 
 
 def test_nothing_is_no_noise() -> None:

@@ -111,7 +111,10 @@ class Predictor:
 
     def noisier(self, more: Noise) -> "Predictor":
         """The same with noise beyond what was measured of it."""
-        return Predictor(self.scenario, self.log, self.noise, self.left_out, self.reading, more)
+        more = more if self._more_noise is None else self._more_noise.with_more(more)
+        return Predictor(
+            self.scenario, self.log, self._measured_noise, self.left_out, self.reading, more
+        )
 
     def is_like(self, other: "Predictor") -> bool:
         """Does another one predict the same?"""
@@ -166,11 +169,15 @@ class Predictor:
     @cached_property
     def noise(self) -> Noise:
         """Of the rows, beyond what is believed."""
-        noise = self._given_noise
-        if noise is None:
-            channels = self.reading.noisier_channels
-            noise = measured_noise(self.motion, self._believed_residual, channels)
-        return noise if self._more_noise is None else noise.with_more(self._more_noise)
+        measured, more = self._measured_noise, self._more_noise
+        return measured if more is None else measured.with_more(more)
+
+    @cached_property
+    def _measured_noise(self) -> Noise:
+        """Without what the rows themselves do not show."""
+        if self._given_noise is not None:
+            return self._given_noise
+        return measured_noise(self.motion, self._believed_residual, self.reading.noisier_channels)
 
     @cached_property
     def _believed_residual(self) -> Residual:
