@@ -147,7 +147,12 @@ def test_laws_are_doubted_where_a_joint_turns(machine: Machine, course: Course) 
         change = np.tanh((velocity + wrong) / TRANSITION) - np.tanh(velocity / TRANSITION)
         drawn.append(COULOMB * change.reshape(blocks, motion.length, 6).mean(axis=1))
     expected = np.mean(np.square(drawn), axis=(0, 1))
-    np.testing.assert_allclose(doubt.mean(axis=0), expected, rtol=0.4)
+    # It is nothing beside the noise of the accelerations where it is not doubted.
+    noise = motion.residual.variance[:, :6].mean(axis=0)
+    doubted = doubt.any(axis=0)
+    assert doubted.sum() >= 3
+    np.testing.assert_allclose(doubt.mean(axis=0)[doubted], expected[doubted], rtol=0.4)
+    assert (expected[~doubted] < 0.01 * noise[~doubted]).all()
     # Far from a turn the sign of a velocity is sure.
     fast = np.abs(motion.blocks.joint_velocity) > 10.0 * error + 10.0 * TRANSITION
     assert doubt[fast].max() < 1e-6 * doubt.max()

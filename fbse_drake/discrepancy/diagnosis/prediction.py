@@ -55,6 +55,8 @@ from fbse_drake.sensors.foot_force import force_noise
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change
 # within the step, squared.
 _LAW_DOUBT = 8.0
+# Of a row's variance; where no block has more it is not worth weighing the row anew.
+_NEGLIGIBLE_DOUBT = 0.25
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
@@ -261,8 +263,11 @@ class Predictor:
         return _LAW_DOUBT * block_means(slope**2, motion.length) * real / motion.length
 
     def _variance_by_velocity(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
-        """Of the torque of laws whose velocity errs, (B, n) [Nm^2]."""
+        """Of the torque of laws whose velocity errs, (B, n) [Nm^2]; 0 for joints in which it is
+        next to nothing beside the noise, and where the recording's low-pass averages it."""
         here, error = self.joint_motion, self._velocity_error
+        if self.motion.recording.recorded_cutoff > 0:
+            return np.zeros(self.motion.blocks.joint_position.shape)
         torques = [
             sum(
                 (
@@ -277,7 +282,10 @@ class Predictor:
             block_means(_in_steps(self.motion.recording, torque - torques[0]), self.motion.length)
             for torque in torques[1:]
         ]
-        return np.square(change).mean(axis=0)
+        doubt = np.square(change).mean(axis=0)
+        noise = self.motion.residual.variance[:, : doubt.shape[1]]
+        matters = doubt.max(axis=0) > _NEGLIGIBLE_DOUBT * noise.mean(axis=0)
+        return np.where(matters, doubt, 0.0)
 
     @cached_property
     def _velocity_error(self) -> np.ndarray:

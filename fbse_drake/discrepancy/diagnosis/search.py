@@ -29,6 +29,7 @@ from fbse_drake.discrepancy.identification.structure import (
     Structure,
     leftover_structure,
     noisy_rows,
+    tolerated,
     untested_rows,
 )
 from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
@@ -249,12 +250,21 @@ def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
         _NoiseAlone: what an explanation leaves is that, in all rows in which more than noise seems
             to be left.
     """
-    predictor, left = fits.dictionary.predictor, fits.leftover(explanation)
-    loud = [s.index for s in leftover_structure(predictor.motion, fits.white, left)]
-    if (fits.white.count[loud] < _TELLING).any():
+    predictor, white, left = fits.dictionary.predictor, fits.white, fits.leftover(explanation)
+
+    def noise_of(rows: Sequence[int]) -> Noise | None:
+        if (white.count[rows] < _TELLING).any():
+            return None
+        found = _more_noise(predictor, white, left, rows)
+        return found if found is not None and (found.factor[rows] > 1.0).all() else None
+
+    size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
+    loud = [row for row in range(len(size)) if size[row] > tolerated(white, row)]
+    # Mostly there is more than noise, which is found out sooner than what it lives in.
+    if noise_of(loud) is None:
         return
-    noise = _more_noise(predictor, fits.white, left, loud)
-    if noise is not None and (noise.factor[loud] > 1.0).all():
+    noise = noise_of([s.index for s in leftover_structure(predictor.motion, white, left)])
+    if noise is not None:
         raise _NoiseAlone(noise)
 
 
