@@ -259,7 +259,8 @@ def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
         return found if found is not None and (found.factor[rows] > 1.0).all() else None
 
     size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    loud = [row for row in range(len(size)) if size[row] > tolerated(white, row)]
+    known = np.flatnonzero(white.count).tolist()
+    loud = [row for row in known if size[row] > tolerated(white, row)]
     # Mostly there is more than noise, which is found out sooner than what it lives in.
     if noise_of(loud) is None:
         return
