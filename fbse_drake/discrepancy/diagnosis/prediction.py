@@ -265,9 +265,10 @@ class Predictor:
     def _variance_by_velocity(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
         """Of the torque of laws whose velocity errs, (B, n) [Nm^2]; 0 for joints in which it is
         next to nothing beside the noise, and where the recording's low-pass averages it."""
+        motion = self.motion
+        if not laws or motion.recording.recorded_cutoff > 0:
+            return np.zeros(motion.blocks.joint_position.shape)
         here, error = self.joint_motion, self._velocity_error
-        if self.motion.recording.recorded_cutoff > 0:
-            return np.zeros(self.motion.blocks.joint_position.shape)
         torques = [
             sum(
                 (
@@ -279,11 +280,11 @@ class Predictor:
             for shift in (0.0, error, -error)
         ]
         change = [
-            block_means(_in_steps(self.motion.recording, torque - torques[0]), self.motion.length)
+            block_means(_in_steps(motion.recording, torque - torques[0]), motion.length)
             for torque in torques[1:]
         ]
         doubt = np.square(change).mean(axis=0)
-        noise = self.motion.residual.variance[:, : doubt.shape[1]]
+        noise = motion.residual.variance[:, : doubt.shape[1]]
         matters = doubt.max(axis=0) > _NEGLIGIBLE_DOUBT * noise.mean(axis=0)
         return np.where(matters, doubt, 0.0)
 

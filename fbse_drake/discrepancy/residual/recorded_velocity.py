@@ -11,14 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_filter
+from scipy.stats import t as student
 
 from fbse_drake.discrepancy.residual.blocks import block_means
 
 # Angles and velocities are compared over windows of this length [s], of which there must be so
 # many with so many samples each.
 _WINDOW, _FEWEST_WINDOWS, _FEWEST_SAMPLES = 2.0, 4, 20
-# A joint's velocity is late for sure if it is by so many standard deviations of that.
-_SURE = 4.0
+# Probability of calling the velocity of a joint late by chance.
+_FALSE_ALARM = 1e-4
 # What is later than this is no filter's [s].
 _LATEST = 0.05
 # Angles are smoothed by polynomials of this order over times of these lengths [s].
@@ -84,7 +85,9 @@ class Lateness:
         score = (motion * (behind - seconds * motion)).sum(axis=1)
         spread = np.sqrt((score**2).sum(axis=0) * len(windows) / (len(windows) - 1))
         deviation = np.divide(spread, information, out=np.zeros(joints), where=information > 0)
-        is_late = (np.abs(seconds) > _SURE * deviation) & (np.abs(seconds) < _LATEST)
+        # Of few windows their spread is not known well.
+        sure = student.isf(0.5 * _FALSE_ALARM, len(windows) - 1) * deviation
+        is_late = (np.abs(seconds) > sure) & (np.abs(seconds) < _LATEST)
         return Lateness(np.where(is_late, seconds, 0.0), deviation)
 
     def in_time(

@@ -140,13 +140,15 @@ def _rows_of_floating_base(robot: Robot) -> list[Row]:
 
 
 def read_signals(
-    robot: Robot, log: Log, recording: RecordingConfig
+    robot: Robot, log: Log, recording: RecordingConfig, *, differenced: bool
 ) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
     Late samples are interpolated, and what sensors hold between their readings; what lies in a gap
-    is marked. Without `joint/velocity` angles are differenced; without `joint/torque_command`
-    torques are 0.
+    is marked. Without `joint/torque_command` torques are 0.
+
+    Args:
+        differenced: see `differences_angles`.
 
     Returns:
         The signals, N samples, and which of them are measured (not interpolated over a gap), shape
@@ -210,8 +212,7 @@ def read_signals(
         )
         pad_force = on_grid(measured_pad_forces(robot, log))
     q = on_grid(log["joint/position"])
-    measured = not differences_angles(recording, log)
-    if not measured:
+    if differenced:
         # Where a stretch ends there is no central difference.
         inside = np.zeros_like(known)
         for stretch in stretches:
@@ -221,7 +222,7 @@ def read_signals(
     torque = np.where(robot.description.has_motor, torque, 0.0)
     signals = SensorSignals(
         joint_position=q,
-        joint_velocity=on_grid(log["joint/velocity"]) if measured else rate(q),
+        joint_velocity=rate(q) if differenced else on_grid(log["joint/velocity"]),
         specific_force=specific_force,
         angular_velocity=angular_velocity,
         pad_force=pad_force,
@@ -770,16 +771,16 @@ class RecordedMotion:
         self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period
-        self.signals, self.measured = read_signals(robot, log, recording)
+        differenced = differences_angles(recording, log)
+        self.signals, self.measured = read_signals(robot, log, recording, differenced=differenced)
         self.lateness = Lateness.none(len(robot.joint_names))
-        if recording.is_sampled and not differences_angles(recording, log):
+        if recording.is_sampled and not differenced:
             q, v = self.signals.joint_position, self.signals.joint_velocity
             lateness = Lateness.of(q, v, self.period, _stretches(self.measured))
             v, known = lateness.in_time(v, self.measured, self.period)
             self.lateness, self.measured = lateness, known
             self.signals = replace(self.signals, joint_velocity=v)
-        is_shared = recording.is_sampled or differences_angles(recording, log)
-        least = _SHARING if is_shared else 1
+        least = _SHARING if recording.is_sampled or differenced else 1
         self.length = max(least, round(recording.block / self.period))
         if len(self.signals.joint_position) < 20 * self.length:
             raise InputError(
