@@ -1,5 +1,5 @@
-"""White noise of a measured torque is in the residual and in the regressors of what depends on the
-torque alike."""
+"""Noise that is in the residual and in a regressor alike: that of a measured torque, and that of
+the accelerations by a coarse encoder."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,8 +16,10 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.identification.regression import Regression, WhitenedResidual
 from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import ReflectedInertia
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, SensorsConfig
@@ -131,6 +133,38 @@ def test_friction_that_steps_is_no_elasticity() -> None:
         chosen = diagnose(ARM.predictor(ARM.log(course, course.torque + friction, seed))).chosen
         assert {finding.effect for finding in chosen} == {"CoulombFriction"}
         assert {joint for finding in chosen for joint in finding.targets} == set(ARM.joints)
+
+
+@pytest.mark.parametrize("bits", [12, 14])
+def test_noise_of_a_coarse_encoder_biases_no_inertia(bits: int) -> None:
+    """Accelerations by rounded angles are nearly all noise, which the inertia of the model brings
+    into the residual: an inertia that is missing is then found too small, or negative."""
+    more, count = np.array([0.2, 0.2, 0.1, 0.05, 0.05, 0.03]), 2 * np.pi / 2**bits
+    machine = replace(ARM, duration=20.0)
+    by_name, by_rough = [], []
+    for seed in range(3):
+        course = machine.course(seed, tuple(np.array(ARM.rotor_inertia) + more))
+        log = machine.log(course, seed=seed)
+        channels = {"joint/position": count * np.round(course.position / count)}
+        channels |= {
+            name: log[name] for name in log.channels if name not in (*channels, "joint/velocity")
+        }
+        predictor = machine.predictor(replace(log, channels=channels))
+        white = WhitenedResidual(predictor.residual)
+        rough = predictor.motion.blocks.joint_acceleration
+        for place, joint in enumerate(machine.joints):
+            signature = predictor.signature(ReflectedInertia, joint, np.zeros(0))
+            own = replace(
+                signature, rows=np.array([place]), values=-rough[:, place, None, None]
+            )
+            for found, columns in ((by_name, signature), (by_rough, own)):
+                fit = Regression(white).fit([white.whiten_signature(columns)])
+                found.append((fit.parameters[0] / more[place], fit.deviation[0] / more[place]))
+    values, deviations = np.array(by_name).T
+    assert np.abs((values - 1.0) / deviations).max() < 4.0
+    weight = deviations**-2 / (deviations**-2).sum()
+    assert weight @ values == pytest.approx(1.0, abs=0.01)
+    assert np.median(np.array(by_rough)[:, 0]) < 0.95
 
 
 def test_a_gain_pays_for_no_noise_that_its_regressor_has_not() -> None:

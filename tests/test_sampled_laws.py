@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded_arm import ARM, Course
+from scipy.signal import lfilter
 
 from fbse_drake.discrepancy.diagnosis.bandwidth import averaged_to_bandwidth
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
@@ -80,3 +81,30 @@ def test_what_is_over_when_a_late_torque_has_followed_is_not_named(
         for finding in diagnosis.chosen:
             found = finding.parameters["displacement"].value
             assert found == pytest.approx(displacement, rel=0.15)
+
+
+@pytest.mark.parametrize(("hump", "noise", "seed"), [(0.0, 0.3, 3), (0.0, 0.1, 4), (0.8, 0.1, 4)])
+def test_a_filter_of_the_torque_makes_no_stribeck_hump(hump: float, noise: float, seed: int):
+    """Behind a current filter friction that jumps comes smeared, about which rows of some
+    milliseconds say little; a hump of joints that are slow for longer is there all the same.
+
+    Args:
+        noise: of the torques, as a share of the arm's.
+    """
+    torque_noise = tuple(noise * np.array(ARM.torque_noise))
+    fine = replace(ARM, period=0.001, duration=30.0, torque_noise=torque_noise)
+    course, every, late = fine.course(seed), 4, 0.003
+    law = SIZE * np.tanh(course.velocity / TRANSITION)
+    friction = law * (1.0 + hump * np.exp(-((course.velocity / 0.15) ** 2)))
+    share = 1.0 - np.exp(-fine.period / late)
+    given = lfilter([share], [1.0, share - 1.0], course.torque + friction, axis=0)
+    seen = Course(*(np.asarray(values)[::every] for values in vars(course).values()))
+    machine = replace(fine, period=fine.period * every)
+    tried = ("CoulombFriction", "ViscousFriction", "StribeckFriction", "TorqueReadingLag")
+    diagnosis = diagnose(
+        machine.predictor(machine.log(seen, given[::every])), [library()[name] for name in tried]
+    )
+    law_found = "StribeckFriction" if hump else "CoulombFriction"
+    assert {f.effect for f in diagnosis.chosen} == {law_found, "TorqueReadingLag"}
+    having = {joint for f in diagnosis.chosen if f.effect == law_found for joint in f.targets}
+    assert having == set(ARM.joints)

@@ -26,6 +26,7 @@ from fbse_drake.discrepancy.residual.residual import (
     rms,
     within_steps,
 )
+from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import (
     ContactEffect,
     FootCreep,
@@ -264,26 +265,32 @@ class Predictor:
 
     def _variance_by_velocity(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
         """Of the torque of laws whose velocity errs, (B, n) [Nm^2]; 0 for joints in which it is
-        next to nothing beside the noise, and where the recording's low-pass averages it."""
+        next to nothing beside the noise, and where the recording's low-pass averages it.
+
+        Torques that were read earlier err by what the laws change meanwhile: the filter that they
+        come from smears a jump.
+        """
         motion = self.motion
         if not laws or motion.recording.recorded_cutoff > 0:
             return np.zeros(motion.blocks.joint_position.shape)
-        here, error = self.joint_motion, self._velocity_error
-        torques = [
-            sum(
-                (
-                    law.torque_and_slope(here._replace(velocity=here.velocity + shift))[0]
-                    for law in laws
-                ),
-                start=np.zeros(here.velocity.shape),
-            )
-            for shift in (0.0, error, -error)
-        ]
-        change = [
-            block_means(_in_steps(motion.recording, torque - torques[0]), motion.length)
-            for torque in torques[1:]
-        ]
-        doubt = np.square(change).mean(axis=0)
+        here, error, late = self.joint_motion, self._velocity_error, self.reading.late_torques
+        earlier, later = (
+            TorqueReadingLag.in_time(here.velocity, sign * late, motion.period)
+            for sign in (1.0, -1.0)
+        )
+
+        def change(velocity: np.ndarray) -> np.ndarray:
+            """Of the torque of the laws at another velocity, (B, n)."""
+            torque = np.zeros(velocity.shape)
+            for law in laws:
+                torque += law.torque_and_slope(here._replace(velocity=velocity))[0]
+                torque -= law.torque_and_slope(here)[0]
+            return block_means(_in_steps(motion.recording, torque), motion.length)
+
+        doubt = sum(
+            np.square([change(velocity) for velocity in either_way]).mean(axis=0)
+            for either_way in ((here.velocity + error, here.velocity - error), (earlier, later))
+        )
         noise = motion.residual.variance[:, : doubt.shape[1]]
         matters = doubt.max(axis=0) > _NEGLIGIBLE_DOUBT * noise.mean(axis=0)
         return np.where(matters, doubt, 0.0)
@@ -492,7 +499,19 @@ class Predictor:
     @cached_property
     def _smooth_blocks(self) -> Instants:
         """Averages at which derivatives are taken."""
-        return self._smoothed(self.motion.blocks)
+        return self._smooth_blocks_of(self.motion.signals)
+
+    def _smooth_blocks_of(self, signals: SensorSignals) -> Instants:
+        """Averages of signals over blocks without frequencies in which the log has little but noise
+        of the joints' velocities: in a regressor it would be the noise of the residual, which is
+        the same (errors in variables)."""
+        motion, corners = self.motion, self.reading.velocity_corners
+        velocity = [
+            motion.low_passed(v, corner)
+            for v, corner in zip(signals.joint_velocity.T, corners, strict=True)
+        ]
+        signals = replace(signals, joint_velocity=np.stack(velocity, axis=1))
+        return self._smoothed(averaged(motion.steps_of(signals), motion.length))
 
     def _smoothed(self, blocks: Instants) -> Instants:
         """Averages with accelerations that are smoothed further, for their noise is in the residual
@@ -587,7 +606,11 @@ class Predictor:
 
     @cached_property
     def _noisier_residual_at_blocks(self) -> np.ndarray:
-        return self.motion.equation.residual(self._smoothed(self._noisier_blocks))
+        return self.motion.equation.residual(self._noisier_smooth_blocks)
+
+    @cached_property
+    def _noisier_smooth_blocks(self) -> Instants:
+        return self._smooth_blocks_of(self._noisier_signals)
 
     def noise_in(
         self,
@@ -631,7 +654,7 @@ class Predictor:
 
     def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
         """What an inertia effect adds to the residual, (B, R)."""
-        blocks = self._smoothed(self._noisier_blocks) if noisier else self._smooth_blocks
+        blocks = self._noisier_smooth_blocks if noisier else self._smooth_blocks
 
         def regressor(body: str) -> np.ndarray:
             key = (body, noisier)
@@ -731,8 +754,7 @@ class Predictor:
             read, before = motion.signals, self._residual_at_blocks
             memory = self._memory(effect, resolved)
         signals = self.reading.undone(resolved, memory, read)
-        blocks = averaged(motion.steps_of(signals), motion.length)
-        return before - motion.equation.residual(self._smoothed(blocks))
+        return before - motion.equation.residual(self._smooth_blocks_of(signals))
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone,

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.signal import savgol_filter, welch
 
+from fbse_drake.discrepancy.residual.evidence import step_of
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
-from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, within_steps
+from fbse_drake.discrepancy.residual.residual import (
+    Instants,
+    RecordedMotion,
+    differences_angles,
+    joint_velocity_noise,
+    within_steps,
+)
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
@@ -50,6 +57,8 @@ class Reading:
         log = with_command(scenario, log, self.robot.description)
         sensors, self.noisier_channels = measured_sensors(scenario.sensors, scenario.recording, log)
         self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
+        # By how much torques are read earlier than the log has them, (n,) [s].
+        self.late_torques = np.zeros(len(self.robot.joint_names))
         # What came last into the readings goes first.
         for key, effect in reversed(scenario.believed.effects.items()):
             if isinstance(effect, SensorEffect):
@@ -60,6 +69,7 @@ class Reading:
                 signals = self.motion.signals
                 torque = TorqueReadingLag.in_time(signals.torque_command, lag, self.motion.period)
                 self.motion.signals = replace(signals, torque_command=torque)
+                self.late_torques += lag
 
     def serves(self, scenario: Scenario) -> bool:
         """Would another scenario read the log alike?"""
@@ -161,6 +171,25 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
+    @cached_property
+    def velocity_corners(self) -> list[float]:
+        """Frequency above which each joint's velocity is little but noise [Hz]; 0 for none, or in
+        logs per step, whose impacts are as fast.
+
+        A velocity of which no noise is known is taken to be a rate of the angles beside it.
+        """
+        motion, sensors = self.motion, self.motion.sensors
+        velocity, noise = motion.signals.joint_velocity, joint_velocity_noise(sensors)
+        if not motion.recording.is_sampled or motion.recording.cutoff > 0:
+            return [0.0] * velocity.shape[1]
+        differenced = noise == 0 or differences_angles(motion.recording, self.log)
+        if differenced:
+            steps = np.array([step_of(q) for q in self.log["joint/position"].T])
+            deviation = np.maximum(steps / np.sqrt(12.0), sensors.encoders.angle_noise)
+        else:
+            deviation = np.full(velocity.shape[1], noise)
+        return noise_corners(velocity, deviation**2, motion.period, of_rates=differenced)
+
     def _loss_at(self, time: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
         three blocks, (M, n)."""
@@ -188,17 +217,22 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     return model, scenario.sensors, recording, scenario.reference, scenario.control
 
 
-def noise_corners(torque: np.ndarray, variance: np.ndarray, period: float) -> list[float]:
-    """Frequency above which each joint's torque (N, n) is little but white noise [Hz]; 0 for none.
+def noise_corners(
+    values: np.ndarray, variance: np.ndarray, period: float, *, of_rates: bool = False
+) -> list[float]:
+    """Frequency above which each joint's values (N, n) are little but noise [Hz]; 0 for none.
 
     Args:
-        variance: of the noise of a sample, (n,).
+        variance: of the white noise of a sample, (n,).
+        of_rates: are the values differences over a period, and the white noise that of what they
+            are differences of?
     """
-    window = min(len(torque), round(_SPECTRUM / period))
-    frequency, power = welch(torque, 1.0 / period, nperseg=window, axis=0)
+    window = min(len(values), round(_SPECTRUM / period))
+    frequency, power = welch(values, 1.0 / period, nperseg=window, axis=0)
+    gain = (2.0 * np.sin(np.pi * frequency * period) / period) ** 2 if of_rates else 1.0
     corners = []
     for density, white in zip(power.T, 2 * variance * period, strict=True):
-        above = np.flatnonzero(density > _ABOVE_NOISE * white)
+        above = np.flatnonzero(density > _ABOVE_NOISE * white * gain)
         last = above[-1] + 1 if len(above) else 1
         corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
     return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
