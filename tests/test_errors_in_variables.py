@@ -154,9 +154,7 @@ def test_noise_of_a_coarse_encoder_biases_no_inertia(bits: int) -> None:
         rough = predictor.motion.blocks.joint_acceleration
         for place, joint in enumerate(machine.joints):
             signature = predictor.signature(ReflectedInertia, joint, np.zeros(0))
-            own = replace(
-                signature, rows=np.array([place]), values=-rough[:, place, None, None]
-            )
+            own = replace(signature, rows=np.array([place]), values=-rough[:, place, None, None])
             for found, columns in ((by_name, signature), (by_rough, own)):
                 fit = Regression(white).fit([white.whiten_signature(columns)])
                 found.append((fit.parameters[0] / more[place], fit.deviation[0] / more[place]))

@@ -17,9 +17,10 @@ from fbse_drake.discrepancy.identification.inertial import (
     untrusted_inertia,
 )
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual.evidence import step_of, travel_of
+from fbse_drake.discrepancy.residual.evidence import travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.white_noise import step_of
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.geometry import GeometryEffect

@@ -246,7 +246,8 @@ class Fits:
 
         With u = share * torque, the rest torque - u - ... is the error of the torque times 1 -
         share: a share near 1 would explain everything. As the error of the torque itself it is the
-        larger the more is taken.
+        larger the more is taken. What gives torque makes it no smaller: regressors are free of the
+        torque's noise.
 
         Args:
             kept: share of the torque's error that is in what effects take of it, (n,), or in all
@@ -275,7 +276,7 @@ class Fits:
                 float((part[known] ** 2).sum())
                 for part in (torque[:, row], torque[:, row] - kept[row] * values)
             )
-            if own > 0 and rest > 0:
+            if own > rest > 0:
                 factor[row] = own / rest
         return factor
 

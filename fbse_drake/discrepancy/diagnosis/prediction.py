@@ -162,12 +162,7 @@ class Predictor:
     def residual(self) -> Residual:
         """What the model, with its effects, leaves over; with the noise that the log shows where
         that is more than is believed."""
-        residual, noise = self._believed_residual, self.noise
-        return replace(
-            residual,
-            variance=noise.sensors * residual.variance + noise.white / self.motion.length,
-            covariance=noise.sensors * residual.covariance,
-        )
+        return self.noise.added_to(self._believed_residual, self.motion.length)
 
     @cached_property
     def noise(self) -> Noise:
@@ -499,19 +494,12 @@ class Predictor:
     @cached_property
     def _smooth_blocks(self) -> Instants:
         """Averages at which derivatives are taken."""
-        return self._smooth_blocks_of(self.motion.signals)
+        return self._smoothed(self.motion.quiet_blocks)
 
     def _smooth_blocks_of(self, signals: SensorSignals) -> Instants:
-        """Averages of signals over blocks without frequencies in which the log has little but noise
-        of the joints' velocities: in a regressor it would be the noise of the residual, which is
-        the same (errors in variables)."""
-        motion, corners = self.motion, self.reading.velocity_corners
-        velocity = [
-            motion.low_passed(v, corner)
-            for v, corner in zip(signals.joint_velocity.T, corners, strict=True)
-        ]
-        signals = replace(signals, joint_velocity=np.stack(velocity, axis=1))
-        return self._smoothed(averaged(motion.steps_of(signals), motion.length))
+        """The same of other signals."""
+        motion, quiet = self.motion, self.motion.without_velocity_noise(signals)
+        return self._smoothed(averaged(motion.steps_of(quiet), motion.length))
 
     def _smoothed(self, blocks: Instants) -> Instants:
         """Averages with accelerations that are smoothed further, for their noise is in the residual

@@ -7,18 +7,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.signal import savgol_filter, welch
+from scipy.signal import savgol_filter
 
-from fbse_drake.discrepancy.residual.evidence import step_of
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
 from fbse_drake.discrepancy.residual.residual import (
     Instants,
     RecordedMotion,
-    differences_angles,
-    joint_velocity_noise,
     within_steps,
 )
 from fbse_drake.discrepancy.residual.servo import with_command
+from fbse_drake.discrepancy.residual.white_noise import noise_corners
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
 from fbse_drake.effects.effect import Effect
@@ -31,9 +29,6 @@ from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take
 # them.
 _SMOOTHING = 9
-# Length of the windows of a torque's spectrum [s]; it is more than noise where it is so many times
-# it.
-_SPECTRUM, _ABOVE_NOISE = 1.0, 3.0
 # For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
 # those that we did.
 _EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
@@ -123,7 +118,8 @@ class Reading:
     def joint_motion_of(self, signals: SensorSignals) -> JointMotion:
         """The same of other signals."""
         motion = self.motion
-        velocity = savgol_filter(signals.joint_velocity, _SMOOTHING, 2, axis=0)
+        velocity = motion.without_velocity_noise(signals).joint_velocity
+        velocity = savgol_filter(velocity, _SMOOTHING, 2, axis=0)
         torque = self._without_noise(signals.torque_command)
         smooth = replace(signals, joint_velocity=velocity, torque_command=torque)
         at: SensorSignals | Instants = smooth
@@ -171,25 +167,6 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
-    @cached_property
-    def velocity_corners(self) -> list[float]:
-        """Frequency above which each joint's velocity is little but noise [Hz]; 0 for none, or in
-        logs per step, whose impacts are as fast.
-
-        A velocity of which no noise is known is taken to be a rate of the angles beside it.
-        """
-        motion, sensors = self.motion, self.motion.sensors
-        velocity, noise = motion.signals.joint_velocity, joint_velocity_noise(sensors)
-        if not motion.recording.is_sampled or motion.recording.cutoff > 0:
-            return [0.0] * velocity.shape[1]
-        differenced = noise == 0 or differences_angles(motion.recording, self.log)
-        if differenced:
-            steps = np.array([step_of(q) for q in self.log["joint/position"].T])
-            deviation = np.maximum(steps / np.sqrt(12.0), sensors.encoders.angle_noise)
-        else:
-            deviation = np.full(velocity.shape[1], noise)
-        return noise_corners(velocity, deviation**2, motion.period, of_rates=differenced)
-
     def _loss_at(self, time: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
         three blocks, (M, n)."""
@@ -215,27 +192,6 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     recording = scenario.recording
     model = replace(model, effects=bodies)
     return model, scenario.sensors, recording, scenario.reference, scenario.control
-
-
-def noise_corners(
-    values: np.ndarray, variance: np.ndarray, period: float, *, of_rates: bool = False
-) -> list[float]:
-    """Frequency above which each joint's values (N, n) are little but noise [Hz]; 0 for none.
-
-    Args:
-        variance: of the white noise of a sample, (n,).
-        of_rates: are the values differences over a period, and the white noise that of what they
-            are differences of?
-    """
-    window = min(len(values), round(_SPECTRUM / period))
-    frequency, power = welch(values, 1.0 / period, nperseg=window, axis=0)
-    gain = (2.0 * np.sin(np.pi * frequency * period) / period) ** 2 if of_rates else 1.0
-    corners = []
-    for density, white in zip(power.T, 2 * variance * period, strict=True):
-        above = np.flatnonzero(density > _ABOVE_NOISE * white * gain)
-        last = above[-1] + 1 if len(above) else 1
-        corners.append(float(frequency[last]) if last < len(frequency) - 1 else 0.0)
-    return [c if v > 0 else 0.0 for c, v in zip(corners, variance, strict=True)]
 
 
 def smoothed(values: np.ndarray) -> np.ndarray:

@@ -264,8 +264,15 @@ def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
     # Mostly there is more than noise, which is found out sooner than what it lives in.
     if noise_of(loud) is None:
         return
-    noise = noise_of([s.index for s in leftover_structure(predictor.motion, white, left)])
-    if noise is not None:
+    motion = predictor.motion
+    noise = noise_of([s.index for s in leftover_structure(motion, white, left)])
+    if noise is None:
+        return
+    # What is small beside the noise may live in something all the same.
+    noisier = WhitenedResidual(
+        noise.added_to(replace(white.residual, value=white.coloured(left)), motion.length)
+    )
+    if not leftover_structure(motion, noisier, noisier.y):
         raise _NoiseAlone(noise)
 
 

@@ -180,7 +180,7 @@ def is_white(left: np.ndarray, count: int) -> bool:
 def _variables(motion: RecordedMotion, white: WhitenedResidual, row: int) -> dict[str, np.ndarray]:
     """Piecewise linear functions of the variables that a row's residual may live in, (B, pieces)
     each."""
-    blocks, n = motion.blocks, len(motion.robot.joint_names)
+    blocks, n = motion.quiet_blocks, len(motion.robot.joint_names)
     result = {"time": hat_functions(motion.time)}
 
     def without_own_noise(values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion
+from fbse_drake.discrepancy.residual.white_noise import step_of
 
 Severity = Literal["note", "warning", "untrustworthy"]
 
@@ -237,14 +238,3 @@ def travel_of(position: np.ndarray) -> np.ndarray:
     travel = np.ptp(position, axis=0)
     least = [max(STILL, _STEPS * step_of(column)) for column in position.T]
     return np.where(travel < least, 0.0, travel)
-
-
-def step_of(column: np.ndarray) -> float:
-    """Step in which values come; 0 if there is none."""
-    levels = np.unique(column)
-    if not 2 < len(levels) < 0.5 * len(column):
-        return 0.0
-    differences = np.diff(levels)
-    step = float(differences[differences > 1e-9 * np.ptp(column)].min())
-    off = np.abs(differences / step - np.rint(differences / step))
-    return step if off.max() < 0.05 else 0.0

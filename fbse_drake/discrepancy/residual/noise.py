@@ -64,6 +64,14 @@ class Noise:
             self.factor * other.factor,
         )
 
+    def added_to(self, residual: Residual, length: int) -> Residual:
+        """A residual with this noise, of blocks of so many steps."""
+        return replace(
+            residual,
+            variance=self.sensors * residual.variance + self.white / length,
+            covariance=self.sensors * residual.covariance,
+        )
+
 
 @dataclass(frozen=True)
 class Power:

@@ -35,6 +35,7 @@ from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.integration import integration_step
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.recorded_velocity import Lateness, are_differences
+from fbse_drake.discrepancy.residual.white_noise import noise_corners, step_of
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.floating_base import ImuMount
@@ -839,6 +840,40 @@ class RecordedMotion:
     def blocks(self) -> Instants:
         """Averages of the steps."""
         return averaged(self.steps, self.length)
+
+    @cached_property
+    def quiet_blocks(self) -> Instants:
+        """The same without the noise of the joints' velocities."""
+        return averaged(self.steps_of(self.without_velocity_noise(self.signals)), self.length)
+
+    def without_velocity_noise(self, signals: SensorSignals) -> SensorSignals:
+        """Signals without frequencies in which the log has little but noise of the joints'
+        velocities: in a regressor it would be the noise of the residual, which is the same (errors
+        in variables)."""
+        velocity = [
+            self.low_passed(v, corner)
+            for v, corner in zip(signals.joint_velocity.T, self._velocity_corners, strict=True)
+        ]
+        return replace(signals, joint_velocity=np.stack(velocity, axis=1))
+
+    @cached_property
+    def _velocity_corners(self) -> list[float]:
+        """Frequency above which each joint's velocity is little but noise [Hz]; 0 for none, or in
+        logs per step, whose impacts are as fast.
+
+        A velocity of which no noise is known is taken to be a rate of the angles beside it.
+        """
+        recording, velocity = self.recording, self.signals.joint_velocity
+        if not recording.is_sampled or recording.cutoff > 0:
+            return [0.0] * velocity.shape[1]
+        noise = joint_velocity_noise(self.sensors)
+        of_rates = noise == 0 or differences_angles(recording, self.log)
+        if of_rates:
+            steps = np.array([step_of(q) for q in self.log["joint/position"].T])
+            deviation = np.maximum(steps / np.sqrt(12.0), self.sensors.encoders.angle_noise)
+        else:
+            deviation = np.full(velocity.shape[1], noise)
+        return noise_corners(velocity, deviation**2, self.period, of_rates=of_rates)
 
     @cached_property
     def time(self) -> np.ndarray:
