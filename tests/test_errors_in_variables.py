@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
-from recorded_arm import ARM
+from recorded_arm import ARM, Course, Machine
 
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
@@ -18,7 +18,7 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import Regression, WhitenedResidual
 from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import ReflectedInertia
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.log import Log
@@ -135,34 +135,67 @@ def test_friction_that_steps_is_no_elasticity() -> None:
         assert {joint for finding in chosen for joint in finding.targets} == set(ARM.joints)
 
 
+def by_angles(machine: Machine, course: Course, bits: int, torque: np.ndarray, seed: int) -> Log:
+    """A log of a course without velocities, of encoders of so many bits."""
+    log, count = machine.log(course, torque, seed), 2 * np.pi / 2**bits
+    channels = {name: log[name] for name in log.channels if name != "joint/velocity"}
+    channels["joint/position"] = count * np.round(course.position / count)
+    return replace(log, channels=channels)
+
+
 @pytest.mark.parametrize("bits", [12, 14])
 def test_noise_of_a_coarse_encoder_biases_no_inertia(bits: int) -> None:
     """Accelerations by rounded angles are nearly all noise, which the inertia of the model brings
     into the residual: an inertia that is missing is then found too small, or negative."""
-    more, count = np.array([0.2, 0.2, 0.1, 0.05, 0.05, 0.03]), 2 * np.pi / 2**bits
-    machine = replace(ARM, duration=20.0)
-    by_name, by_rough = [], []
+    more, machine = np.array([0.2, 0.2, 0.1, 0.05, 0.05, 0.03]), replace(ARM, duration=20.0)
+    by_signature, by_rough = [], []
     for seed in range(3):
         course = machine.course(seed, tuple(np.array(ARM.rotor_inertia) + more))
-        log = machine.log(course, seed=seed)
-        channels = {"joint/position": count * np.round(course.position / count)}
-        channels |= {
-            name: log[name] for name in log.channels if name not in (*channels, "joint/velocity")
-        }
-        predictor = machine.predictor(replace(log, channels=channels))
+        predictor = machine.predictor(by_angles(machine, course, bits, course.torque, seed))
         white = WhitenedResidual(predictor.residual)
         rough = predictor.motion.blocks.joint_acceleration
         for place, joint in enumerate(machine.joints):
             signature = predictor.signature(ReflectedInertia, joint, np.zeros(0))
             own = replace(signature, rows=np.array([place]), values=-rough[:, place, None, None])
-            for found, columns in ((by_name, signature), (by_rough, own)):
+            for found, columns in ((by_signature, signature), (by_rough, own)):
                 fit = Regression(white).fit([white.whiten_signature(columns)])
                 found.append((fit.parameters[0] / more[place], fit.deviation[0] / more[place]))
-    values, deviations = np.array(by_name).T
+    values, deviations = np.array(by_signature).T
     assert np.abs((values - 1.0) / deviations).max() < 4.0
     weight = deviations**-2 / (deviations**-2).sum()
     assert weight @ values == pytest.approx(1.0, abs=0.01)
     assert np.median(np.array(by_rough)[:, 0]) < 0.95
+
+
+@pytest.mark.parametrize("bits", [11, 12])
+def test_what_is_small_beside_the_noise_of_accelerations_is_no_noise(bits: int) -> None:
+    """That noise is fast: a gain is many times as large at the speed of the motion, but passes for
+    white noise of the torque in tests of what is left from average to average."""
+    quiet = tuple(0.1 * np.array(ARM.torque_noise))
+    machine = replace(ARM, duration=20.0, torque_noise=quiet)
+    course = machine.course(1)
+    torque = course.torque.copy()
+    torque[:, 2] *= 1.08
+    encoders = EncoderConfig(resolution=2 * np.pi / 2**bits)
+    scenario = replace(machine.scenario, sensors=SensorsConfig(encoders=encoders))
+    tried = ("TorqueGain", "TorqueBias", "JointSpring", "ViscousFriction", "CoulombFriction")
+    predictor = Predictor(scenario, by_angles(machine, course, bits, torque, 1))
+    (found,) = diagnose(predictor, [library()[name] for name in tried]).chosen
+    assert (found.effect, found.targets) == ("TorqueGain", ("axis_3",))
+    assert found.parameters["shortfall"].value == pytest.approx(1.0 - 1.0 / 1.08, abs=0.005)
+
+
+def test_an_effect_is_rewarded_for_no_torque_that_it_adds() -> None:
+    """A gain takes a share of the torque with its error; the torque's noise is not in its column,
+    and what a joint is said to get beside makes nothing smaller."""
+    fits = Fits(Dictionary(ARM.predictor(ARM.log(ARM.course())), [TorqueGain]))
+    nothing = fits.remainder(fits.explain([]))
+    gain = fits.candidate(TorqueGain, ("axis_2",), np.zeros(0), nothing)
+    taking, giving = (fits.torque_factor([gain], np.array([share])) for share in (0.5, -0.5))
+    row = ARM.joints.index("axis_2")
+    assert taking[row] == pytest.approx(4.0, rel=0.01)
+    np.testing.assert_array_equal(np.delete(taking, row), 1.0)
+    np.testing.assert_array_equal(giving, 1.0)
 
 
 def test_a_gain_pays_for_no_noise_that_its_regressor_has_not() -> None:
