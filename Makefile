@@ -22,8 +22,10 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: walk test minimum docs lint kernels kernels-biped kernels-others characters format bench fuzz fbse rivals hidden clean
 
+# What the commands to come import is compiled meanwhile: an environment may forbid them to keep it.
 walk: $(INSTALLED)
-	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk
+	$(VENV)/bin/python -m compileall -qq fbse_drake $(VENV)/lib & \
+	$(VENV)/bin/fbse simulate paper_walk --meshcat --out out/paper_walk; status=$$?; wait; exit $$status
 
 # A file's tests share its runs, so they stay on one worker. Each has a core: threads of the linear algebra would wait for each other.
 test: $(DEVELOPED)

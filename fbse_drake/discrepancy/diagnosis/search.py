@@ -42,6 +42,8 @@ from fbse_drake.progress import Interrupted, Progress
 _AS_GOOD = 1.02
 # Of fewer averages than this a test of whiteness says little.
 _TELLING = 400
+# A search is begun so often, at most, for noise that nobody told of.
+_MOST_BEGINNINGS = 4
 # A search is tried again, so often in all, if less than this share of what it explained pays.
 _HOLDS, _MOST_WAYS = 0.5, 3
 
@@ -152,11 +154,14 @@ def best_search(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Best
         noisier.update(np.flatnonzero(more.factor > 1.0).tolist())
         return predictor.noisier(more)
 
-    try:
-        search = _searched(dictionary, effects, until_noise=predictor.motion.recording.is_sampled)
-    except _NoiseAlone as found:
-        predictor = with_noise(found.noise)
-        search = _searched(Dictionary(predictor, effects, progress), effects)
+    for again in reversed(range(_MOST_BEGINNINGS)):
+        is_last = again == 0 or not predictor.motion.recording.is_sampled
+        try:
+            search = _searched(dictionary, effects, until_noise=not is_last)
+            break
+        except _NoiseAlone as found:
+            predictor = with_noise(found.noise)
+            dictionary = Dictionary(predictor, effects, progress)
     disturbances = search.disturbances
     if disturbances:
         predictor = predictor.without([(one.start, one.end) for one in disturbances])
@@ -175,7 +180,7 @@ def best_search(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Best
 
 
 class _NoiseAlone(Exception):
-    """What is left is nothing but noise that nobody told of."""
+    """What is left in some rows is nothing but noise that nobody told of."""
 
     def __init__(self, noise: Noise):
         super().__init__()
@@ -188,8 +193,8 @@ def _searched(
     """What is found by a dictionary of these effects.
 
     Args:
-        until_noise: ends where nothing is left but noise that nobody told of, in which many effects
-            would be tried.
+        until_noise: ends where nothing is left in a row but noise that nobody told of, in which
+            many effects would be tried.
 
     Raises:
         _NoiseAlone: it ended so.
@@ -247,33 +252,24 @@ def _searched(
 def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
     """
     Raises:
-        _NoiseAlone: what an explanation leaves is that, in all rows in which more than noise seems
-            to be left.
+        _NoiseAlone: what an explanation leaves is that, in rows in which more seems to be left.
     """
     predictor, white, left = fits.dictionary.predictor, fits.white, fits.leftover(explanation)
-
-    def noise_of(rows: Sequence[int]) -> Noise | None:
-        if (white.count[rows] < _TELLING).any():
-            return None
-        found = _more_noise(predictor, white, left, rows)
-        return found if found is not None and (found.factor[rows] > 1.0).all() else None
-
     size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    known = np.flatnonzero(white.count).tolist()
-    loud = [row for row in known if size[row] > tolerated(white, row)]
-    # Mostly there is more than noise, which is found out sooner than what it lives in.
-    if noise_of(loud) is None:
-        return
-    motion = predictor.motion
-    noise = noise_of([s.index for s in leftover_structure(motion, white, left)])
+    telling = np.flatnonzero(white.count >= _TELLING).tolist()
+    loud = [row for row in telling if size[row] > tolerated(white, row)]
+    noise = _more_noise(predictor, white, left, loud)
     if noise is None:
         return
     # What is small beside the noise may live in something all the same.
+    motion = predictor.motion
     noisier = WhitenedResidual(
         noise.added_to(replace(white.residual, value=white.coloured(left)), motion.length)
     )
-    if not leftover_structure(motion, noisier, noisier.y):
-        raise _NoiseAlone(noise)
+    lives = [structure.index for structure in leftover_structure(motion, noisier, noisier.y)]
+    alone = np.setdiff1d(np.flatnonzero(noise.factor > 1.0), lives)
+    if alone.size:
+        raise _NoiseAlone(noise.in_rows(alone))
 
 
 def _more_noise(

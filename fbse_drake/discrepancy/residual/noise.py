@@ -64,6 +64,13 @@ class Noise:
             self.factor * other.factor,
         )
 
+    def in_rows(self, rows: np.ndarray) -> "Noise":
+        """The same in these rows alone."""
+        others = np.setdiff1d(np.arange(len(self.white)), rows)
+        white, sensors, factor = self.white.copy(), self.sensors.copy(), self.factor.copy()
+        white[others], sensors[others], factor[others] = 0.0, 1.0, 1.0
+        return Noise(self.channels, white, sensors, factor)
+
     def added_to(self, residual: Residual, length: int) -> Residual:
         """A residual with this noise, of blocks of so many steps."""
         return replace(

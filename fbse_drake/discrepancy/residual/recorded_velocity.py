@@ -22,8 +22,9 @@ _WINDOW, _FEWEST_WINDOWS, _FEWEST_SAMPLES = 2.0, 4, 20
 _FALSE_ALARM = 1e-4
 # What is later than this is no filter's [s].
 _LATEST = 0.05
-# Angles are smoothed by polynomials of this order over times of these lengths [s].
-_ORDER, _SMOOTHING = 3, (0.02, 0.05, 0.1, 0.2)
+# Angles are smoothed by polynomials of this order over times of these lengths [s], and velocities
+# over this one.
+_ORDER, _SMOOTHING, _SMOOTHED = 3, (0.02, 0.05, 0.1, 0.2), 0.1
 # A velocity that is a difference of the angles that it stands beside differs from that by less than
 # this share of what two such differences differ by.
 _SAME = 0.1
@@ -32,7 +33,7 @@ _SAME = 0.1
 @dataclass(frozen=True)
 class Lateness:
     """By how much the velocity of each joint comes after its angle [s], and the standard deviation
-    of that, (n,) each; 0 where it does not for sure."""
+    of that by its own motion, (n,) each; 0 where it does not for sure, nor as the others do."""
 
     seconds: np.ndarray
     deviation: np.ndarray
@@ -66,13 +67,16 @@ class Lateness:
         if len(windows) < _FEWEST_WINDOWS:
             return Lateness.none(joints)
         behind, motion = np.zeros((2, len(windows), count, joints))
+        # In a regressor noise would make the delay smaller.
+        span = 2 * round(0.5 * _SMOOTHED / period) + 1
+        smooth = savgol_filter(velocity, span, _ORDER, axis=0) if span > _ORDER + 1 else velocity
         for k, window in enumerate(windows):
             q, v = position[window], velocity[window]
             gap = q - cumulative_trapezoid(v, dx=period, axis=0, initial=0.0)
             for j in range(joints):
                 nuisance = np.vander(np.arange(count) / count, 2)
                 nuisance = np.column_stack([nuisance, q[:, j] - q[:, j].mean()])
-                both = np.column_stack([gap[:, j], v[:, j]])
+                both = np.column_stack([gap[:, j], smooth[window, j]])
                 left = both - nuisance @ np.linalg.lstsq(nuisance, both, rcond=None)[0]
                 behind[k, :, j], motion[k, :, j] = left.T
         information = (motion**2).sum(axis=(0, 1))
@@ -88,7 +92,13 @@ class Lateness:
         # Of few windows their spread is not known well.
         sure = student.isf(0.5 * _FALSE_ALARM, len(windows) - 1) * deviation
         is_late = (np.abs(seconds) > sure) & (np.abs(seconds) < _LATEST)
-        return Lateness(np.where(is_late, seconds, 0.0), deviation)
+        late = np.where(is_late, seconds, 0.0)
+        if is_late.any():
+            # One recorder has all joints: where this is not told well, the others tell.
+            mean = np.average(seconds[is_late], weights=deviation[is_late] ** -2.0)
+            agrees = (information > 0) & (np.abs(seconds - mean) <= sure)
+            late = np.where(agrees & ~is_late, mean, late)
+        return Lateness(late, deviation)
 
     def in_time(
         self, velocity: np.ndarray, known: np.ndarray, period: float
