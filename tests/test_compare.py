@@ -15,7 +15,9 @@ from fbse_drake.discrepancy.diagnosis.compare import (
     comparison_json,
 )
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.residual.residual import Instants, Residual, residual_rows
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
+from fbse_drake.discrepancy.residual.residual import Residual
+from fbse_drake.discrepancy.residual.rows import residual_rows
 from fbse_drake.scenario import build_robot
 
 BLOCKS, PERIOD = 1500, 0.01

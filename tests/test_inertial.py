@@ -28,7 +28,8 @@ from fbse_drake.discrepancy.identification.inertial import (
     consistent_parameters,
     inertial_regressor,
 )
-from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants
+from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.effects.inertia import (

@@ -19,7 +19,7 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.residual.residual import EquationOfMotion
+from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.estimation import estimate
 from fbse_drake.wiring import release

@@ -13,12 +13,10 @@ from rig import Base, rms
 from fbse_drake import Log
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.residual.residual import (
-    EquationOfMotion,
-    Instants,
-    RecordedMotion,
-    residual_rows,
-)
+from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
+from fbse_drake.discrepancy.residual.rows import residual_rows
 from fbse_drake.effects.contact import GroundCompliance
 from fbse_drake.effects.effect import library
 from fbse_drake.errors import InputError

@@ -16,7 +16,8 @@ from fbse_drake.discrepancy.identification.regression import (
     WhitenedResidual,
 )
 from fbse_drake.discrepancy.residual.memory import Memory
-from fbse_drake.discrepancy.residual.residual import Residual, Row
+from fbse_drake.discrepancy.residual.residual import Residual
+from fbse_drake.discrepancy.residual.rows import Row
 
 ROWS = 3
 

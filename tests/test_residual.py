@@ -14,7 +14,8 @@ from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.identification.regression import Regression, Signature, WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import EXCESS, leftover_structure
 from fbse_drake.discrepancy.residual.blocks import block_means
-from fbse_drake.discrepancy.residual.residual import Residual, Row, rms
+from fbse_drake.discrepancy.residual.residual import Residual, rms
+from fbse_drake.discrepancy.residual.rows import Row
 from fbse_drake.effects.effect import library
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
@@ -215,7 +216,7 @@ def test_gaps_are_left_out_and_touch_nothing_else(
     # The one thing that is found from the log as a whole.
     step = intact.motion.timing.integration
     monkeypatch.setattr(
-        "fbse_drake.discrepancy.residual.residual.integration_step", lambda *_: step
+        "fbse_drake.discrepancy.residual.recorded_motion.integration_step", lambda *_: step
     )
     keep = np.ones(len(log.time), dtype=bool)
     keep[1234:1240] = False
@@ -248,7 +249,7 @@ def test_a_long_log_is_computed_piece_by_piece(
 ) -> None:
     motion = Predictor(*walk).motion
     whole = motion.equation.residual(motion.steps)
-    monkeypatch.setattr("fbse_drake.discrepancy.residual.residual._MOST_INSTANTS", 700)
+    monkeypatch.setattr("fbse_drake.discrepancy.residual.equation_of_motion._MOST_INSTANTS", 700)
     np.testing.assert_array_equal(motion.equation.residual(motion.steps), whole)
 
 

@@ -15,7 +15,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, EffectStatus, F
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import Study, StudyStep
 from fbse_drake.discrepancy.identification.structure import Structure
-from fbse_drake.discrepancy.residual.residual import joint_velocity_noise
+from fbse_drake.discrepancy.residual.equation_of_motion import joint_velocity_noise
 from fbse_drake.effects.effect import library
 from fbse_drake.log import Log
 from fbse_drake.report import discrepancy_figures as figures

@@ -27,8 +27,9 @@ from fbse_drake.discrepancy.diagnosis.compare import (
 )
 from fbse_drake.discrepancy.diagnosis.diagnose import EffectStatus, Estimate, Finding
 from fbse_drake.discrepancy.diagnosis.study import StudyStep
-from fbse_drake.discrepancy.residual.residual import Residual, Row
+from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.discrepancy.residual.rollout import RolloutError
+from fbse_drake.discrepancy.residual.rows import Row
 from fbse_drake.effects.effect import library, spaced
 from fbse_drake.report.html import number
 from fbse_drake.report.style import (

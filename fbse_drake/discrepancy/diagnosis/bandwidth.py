@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import welch
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 
 # A log of no more blocks than this is not averaged further.
 _MOST_BLOCKS = 2500

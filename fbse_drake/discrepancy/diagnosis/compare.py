@@ -13,7 +13,8 @@ from scipy.stats import norm
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import FOLDS, WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import Residual, Row, rms
+from fbse_drake.discrepancy.residual.residual import Residual, rms
+from fbse_drake.discrepancy.residual.rows import Row
 from fbse_drake.robot.description import RobotDescription
 
 # Probability that a log of noise alone shows any failure.

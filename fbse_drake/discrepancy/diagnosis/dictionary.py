@@ -19,7 +19,7 @@ from fbse_drake.discrepancy.identification.inertial import (
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.white_noise import step_of
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction

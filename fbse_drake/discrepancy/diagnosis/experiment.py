@@ -12,7 +12,9 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import EquationOfMotion, Instants, Residual
+from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
+from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import Effect
 from fbse_drake.errors import InputError, located
 from fbse_drake.log import Log

@@ -14,18 +14,15 @@ from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read, smoothed
 from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.discrepancy.residual.blocks import block_means
-from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
-from fbse_drake.discrepancy.residual.recorded_velocity import velocity_error
-from fbse_drake.discrepancy.residual.residual import (
+from fbse_drake.discrepancy.residual.equation_of_motion import (
     EquationOfMotion,
-    Instants,
-    Residual,
-    averaged,
-    foot_pairs,
     joint_velocity_noise,
-    rms,
-    within_steps,
 )
+from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
+from fbse_drake.discrepancy.residual.recorded_signals import Instants, averaged, within_steps
+from fbse_drake.discrepancy.residual.recorded_velocity import velocity_error
+from fbse_drake.discrepancy.residual.residual import Residual, rms
+from fbse_drake.discrepancy.residual.rows import foot_pairs
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import (
     ContactEffect,

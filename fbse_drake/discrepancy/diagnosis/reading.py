@@ -10,11 +10,8 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
-from fbse_drake.discrepancy.residual.residual import (
-    Instants,
-    RecordedMotion,
-    within_steps,
-)
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.discrepancy.residual.white_noise import noise_corners
 from fbse_drake.effects.actuation import TorqueReadingLag

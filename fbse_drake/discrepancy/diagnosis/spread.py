@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.servo import stretches
 
 # Level of the intervals; a parameter differs if chance would make it so less often than this.

@@ -16,7 +16,7 @@ from fbse_drake.discrepancy.residual.evidence import (
     remark,
     remarks,
 )
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.held_readings import rows_per_reading
 
 # Scatter of the sampling period that is worth a word, and a warning, as shares of it.

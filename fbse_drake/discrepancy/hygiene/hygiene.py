@@ -13,7 +13,7 @@ from typing import Any
 from fbse_drake.discrepancy.hygiene import channel_checks, model_checks
 from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding, NoiseLevel
 from fbse_drake.discrepancy.residual.noise import Noise, noise_finding
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.errors import InputError
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import Scenario

@@ -27,7 +27,9 @@ from fbse_drake.discrepancy.residual.evidence import (
     remarks,
     travel_of,
 )
-from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion, rms
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
+from fbse_drake.discrepancy.residual.residual import rms
 
 # Largest clock offset that is looked for, and smallest that counts, in samples; and the correlation
 # from which on a delay can be told.

@@ -8,7 +8,8 @@ from pydrake.multibody.tree import RevoluteJoint
 
 from fbse_drake.discrepancy.hygiene.torque_checks import check_torque
 from fbse_drake.discrepancy.residual.evidence import Evidence
-from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
 from fbse_drake.errors import InputError
 
 # Gravity on the IMU and the weight on the feet may be off by this share; an error of calibration is

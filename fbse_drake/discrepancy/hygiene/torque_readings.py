@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.identification.inertial import inertial_regressor
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.evidence import Evidence
-from fbse_drake.discrepancy.residual.residual import Instants
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
 
 # Probability that any reading of any torque of a log that is as recorded is called wrong.
 FALSE_ALARM = 1e-3

@@ -25,11 +25,9 @@ import numpy as np
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from fbse_drake.discrepancy.identification.regression import Fit, Signature, WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import (
-    EquationOfMotion,
-    Instants,
-    RecordedMotion,
-)
+from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import (
     InertiaEffect,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.residual.residual import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 
 # Averages of a row from which on something is told of what is left in it; and from which on a test
 # that does not see that the averages are correlated says that it is noise: correlations of 0.2 at

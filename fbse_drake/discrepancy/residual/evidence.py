@@ -7,7 +7,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from fbse_drake.discrepancy.residual.residual import Instants, RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import Instants
 from fbse_drake.discrepancy.residual.white_noise import step_of
 
 Severity = Literal["note", "warning", "untrustworthy"]

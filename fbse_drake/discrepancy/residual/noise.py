@@ -10,12 +10,9 @@ from scipy.stats import chi2
 
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding, NoiseLevel, remark
-from fbse_drake.discrepancy.residual.residual import (
-    RecordedMotion,
-    Residual,
-    differences_angles,
-    rms,
-)
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.recorded_signals import differences_angles
+from fbse_drake.discrepancy.residual.residual import Residual, rms
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.motor_encoders import MotorEncoderConfig
