@@ -255,14 +255,21 @@ def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
         _NoiseAlone: what an explanation leaves is that, in rows in which more seems to be left.
     """
     predictor, white, left = fits.dictionary.predictor, fits.white, fits.leftover(explanation)
+    motion = predictor.motion
+
+    def noise_of(rows: Sequence[int]) -> Noise | None:
+        telling = [row for row in rows if white.count[row] >= _TELLING]
+        return _more_noise(predictor, white, left, telling)
+
     size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    telling = np.flatnonzero(white.count >= _TELLING).tolist()
-    loud = [row for row in telling if size[row] > tolerated(white, row)]
-    noise = _more_noise(predictor, white, left, loud)
+    known = np.flatnonzero(white.count).tolist()
+    # Mostly there is more than noise, which is found out sooner than what it lives in.
+    if noise_of([row for row in known if size[row] > tolerated(white, row)]) is None:
+        return
+    noise = noise_of([structure.index for structure in leftover_structure(motion, white, left)])
     if noise is None:
         return
     # What is small beside the noise may live in something all the same.
-    motion = predictor.motion
     noisier = WhitenedResidual(
         noise.added_to(replace(white.residual, value=white.coloured(left)), motion.length)
     )
