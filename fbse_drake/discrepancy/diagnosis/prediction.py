@@ -265,24 +265,26 @@ class Predictor:
         motion = self.motion
         if not laws or motion.recording.recorded_cutoff > 0:
             return np.zeros(motion.blocks.joint_position.shape)
-        here, error, late = self.joint_motion, self._velocity_error, self.reading.late_torques
-        earlier, later = (
-            TorqueReadingLag.in_time(here.velocity, sign * late, motion.period)
-            for sign in (1.0, -1.0)
-        )
+        here, late = self.joint_motion, self.reading.late_torques
+        pairs = [[here.velocity + error for error in (self._velocity_error, -self._velocity_error)]]
+        if late.any():
+            pairs.append(
+                [TorqueReadingLag.in_time(here.velocity, t, motion.period) for t in (late, -late)]
+            )
+
+        def torque(velocity: np.ndarray) -> np.ndarray:
+            """Of the laws at another velocity, (N, n)."""
+            moved = here._replace(velocity=velocity)
+            return sum((law.torque_and_slope(moved)[0] for law in laws), start=0.0 * velocity)
 
         def change(velocity: np.ndarray) -> np.ndarray:
-            """Of the torque of the laws at another velocity, (B, n)."""
-            torque = np.zeros(velocity.shape)
-            for law in laws:
-                torque += law.torque_and_slope(here._replace(velocity=velocity))[0]
-                torque -= law.torque_and_slope(here)[0]
-            return block_means(_in_steps(motion.recording, torque), motion.length)
+            """Of that torque, (B, n)."""
+            return block_means(
+                _in_steps(motion.recording, torque(velocity) - torque_here), motion.length
+            )
 
-        doubt = sum(
-            np.square([change(velocity) for velocity in either_way]).mean(axis=0)
-            for either_way in ((here.velocity + error, here.velocity - error), (earlier, later))
-        )
+        torque_here = torque(here.velocity)
+        doubt = sum(np.square([change(v) for v in either_way]).mean(axis=0) for either_way in pairs)
         noise = motion.residual.variance[:, : doubt.shape[1]]
         matters = doubt.max(axis=0) > _NEGLIGIBLE_DOUBT * noise.mean(axis=0)
         return np.where(matters, doubt, 0.0)
@@ -495,8 +497,7 @@ class Predictor:
 
     def _smooth_blocks_of(self, signals: SensorSignals) -> Instants:
         """The same of other signals."""
-        motion, quiet = self.motion, self.motion.without_velocity_noise(signals)
-        return self._smoothed(averaged(motion.steps_of(quiet), motion.length))
+        return self._smoothed(self.motion.quiet_blocks_of(signals))
 
     def _smoothed(self, blocks: Instants) -> Instants:
         """Averages with accelerations that are smoothed further, for their noise is in the residual

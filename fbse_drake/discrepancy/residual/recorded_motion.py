@@ -149,7 +149,11 @@ class RecordedMotion:
     @cached_property
     def quiet_blocks(self) -> Instants:
         """The same without the noise of the joints' velocities."""
-        return averaged(self.steps_of(self.without_velocity_noise(self.signals)), self.length)
+        return self.quiet_blocks_of(self.signals)
+
+    def quiet_blocks_of(self, signals: SensorSignals) -> Instants:
+        """The same of other signals on the same grid."""
+        return averaged(self.steps_of(self.without_velocity_noise(signals)), self.length)
 
     def without_velocity_noise(self, signals: SensorSignals) -> SensorSignals:
         """Signals without frequencies in which the log has little but noise of the joints'
