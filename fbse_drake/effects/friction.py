@@ -1,6 +1,6 @@
 """Joint friction."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -19,6 +19,9 @@ _COULOMB = Parameter("Nm", linear=True, plausible=(0.0, 50.0))
 _VISCOUS = Parameter("Nm s/rad", linear=True, plausible=(0.0, 30.0))
 # Velocity at which the smoothed sign has grown to tanh(1) = 0.76.
 _TRANSITION = Parameter("rad/s", linear=False, plausible=(1e-3, 5e-2), bounds=(1e-9, np.inf))
+# Friction that falls with speed does so by this share of what it falls to; what hardly does is a
+# Coulomb friction that is smeared.
+_LEAST_FALL = 0.05
 # Where time is told from place: by so many ranges of the angle and both directions, of which at
 # least this share of the scatter of time does not follow.
 _PLACES, _REPEATED = 8, 0.5
@@ -210,6 +213,15 @@ class StribeckFriction(JointTorqueEffect):
     gamma4: dict[str, float] = field(default_factory=dict)
     gamma5: dict[str, float] = field(default_factory=lambda: {"all": 100.0})
     gamma6: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def is_itself(values: Mapping[str, float]) -> bool:
+        """Does it fall with speed, viscous friction aside?"""
+        rises, falls, coulomb = (values[name] for name in ("gamma2", "gamma3", "gamma5"))
+        speed = np.geomspace(0.1 / max(rises, coulomb), 10.0 / min(falls, coulomb), 200)
+        friction = values["gamma1"] * (np.tanh(rises * speed) - np.tanh(falls * speed))
+        friction += values["gamma4"] * np.tanh(coulomb * speed)
+        return bool(friction.max() > (1.0 + _LEAST_FALL) * values["gamma4"])
 
     @staticmethod
     def basis(

@@ -198,6 +198,12 @@ class JointTorqueEffect(Effect):
         that is named in its place, and it is told that it may be this one."""
         return None
 
+    @staticmethod
+    def is_itself(values: Mapping[str, float]) -> bool:  # noqa: ARG004
+        """Is it with these values of its parameters what it is called, and not another shape of a
+        law that it contains?"""
+        return True
+
     @classmethod
     def shows_in(cls, motion: JointMotion) -> bool:  # noqa: ARG003
         """Does what a joint did in N steps, (N, 1) each, show what the effect is?"""

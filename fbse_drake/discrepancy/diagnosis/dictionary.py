@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -379,28 +380,29 @@ class Dictionary:
         return Significance(self.predictor)
 
     def takes_torque(self, effect: type[Effect]) -> bool:
-        # The load of inertia that is not trusted is taken from the measured torque.
-        return takes_command(effect, load_too=self.inertia is not None)
+        """Does what an effect takes depend on the measured torque?"""
+        # The load of inertia that is not trusted is taken from it.
+        return depends_on(effect, "command", *(["load"] if self.inertia is not None else []))
 
 
 @cache
-def takes_command(effect: type[Effect], *, load_too: bool) -> bool:
-    """Does what a joint effect takes depend on the commanded torque, or on the load?"""
+def depends_on(effect: type[Effect], *signals: Literal["command", "load"]) -> bool:
+    """Does what a joint effect takes depend on these signals of a joint's motion?"""
     if not issubclass(effect, JointTorqueEffect):
         return False
     time = np.arange(10.0)[:, None]
+    torque = np.exp(0.1 * time)
     motion = JointMotion(
         velocity=np.sin(time),
         position=np.cos(time),
-        command=np.exp(0.1 * time),
+        command=torque,
+        load=torque,
         time=time,
         time_step=1e-3,
     )
+    command, load = (100.0 * torque if of in signals else torque for of in ("command", "load"))
+    larger = motion._replace(command=command, load=load)
     nonlinear = usual_values(effect)[:, None]
-    motion = motion._replace(load=motion.command)
-    larger = motion._replace(
-        command=100 * motion.command, load=(100 if load_too else 1) * motion.load
-    )
     usual, changed = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
     return not np.array_equal(usual, changed)
 

@@ -21,7 +21,7 @@ from scipy.stats import t as student
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
-from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.proposals import CATCHES_UP, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import beside_model, converged, polished
 from fbse_drake.discrepancy.diagnosis.selection import (
     MISFIT,
@@ -270,6 +270,7 @@ class Judge:
             not worse[rows].any()
             and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
+            and _is_itself(whole, member)
             and self._is_all_of_it(rest, whole, member)
             and is_shown(fits, whole.as_fitted(member))
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
@@ -457,24 +458,32 @@ def _is_beyond_its_range(member: Candidate) -> bool:
     )
 
 
+def _is_itself(whole: Explanation, member: Candidate) -> bool:
+    """See `JointTorqueEffect.is_itself`."""
+    effect = member.effect
+    return not issubclass(effect, JointTorqueEffect) or effect.is_itself(whole.values(member)[0])
+
+
 def _on_fewer_targets(
     proposals: Proposals, judge: Judge, explanation: Explanation
 ) -> Iterator[Explanation]:
-    """Without targets of a member whose held-out error the shared values raise, or where it does
-    nothing at the values that were found."""
+    """Without targets of a member whose held-out error the shared values raise, or where it brings
+    nothing and at the values that were found is nothing, or too small to matter."""
+    dictionary = proposals.fits.dictionary
+    tolerance = dictionary.predictor.scenario.identify.tolerance
     for member in explanation.candidates:
         if len(member.targets) == 1 or not issubclass(member.effect, JointTorqueEffect):
             continue
         others = [c for c in explanation.candidates if c is not member]
         rest = proposals.fits.explain(others)
         gain = judge.gain_by_row(rest, explanation)
-        rows_of = proposals.fits.dictionary.rows_of
-        acting = member.signature.rows[_acts(member.signature)]
+        shares = dictionary.significance.shares(explanation, member)
+        matter = member.signature.rows[_acts(member.signature) & ~(shares < tolerance)]
+        of_target = {t: dictionary.rows_of(member.effect, [t]) for t in member.targets}
         kept = tuple(
             t
-            for t in member.targets
-            if gain[rows := rows_of(member.effect, [t])].sum() > -MARGIN
-            and np.isin(rows, acting).any()
+            for t, rows in of_target.items()
+            if gain[rows].sum() > (-MARGIN if np.isin(rows, matter).any() else MARGIN)
         )
         if kept and len(kept) < len(member.targets):
             yield proposals.beside(rest, member.effect, kept)
@@ -490,17 +499,24 @@ def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> It
     all joints where it may be, for not every joint shows what it has. Where it brings less than its
     parameters cost, it is not."""
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
-        smaller: Explanation | None = explanation
+        smaller, everywhere = explanation, True
         for key in [c.key for c in explanation.candidates if c.effect is effect]:
-            if smaller is None:
-                break
             # Others may have been moved to where they fit.
             member = next(c for c in smaller.candidates if c.key == key)
-            smaller = next(_simpler(proposals, judge.after(smaller), smaller, member), None)
-        if smaller is not None:
+            found = next(_simpler(proposals, judge.after(smaller), smaller, member), None)
+            everywhere = found is not None
+            if found is None:
+                break
+            smaller = found
+        if everywhere:
             yield smaller
-        for member in [c for c in explanation.candidates if c.effect is effect]:
-            yield from _simpler(proposals, judge, explanation, member, if_needless=True)
+        smaller = explanation
+        for key in [c.key for c in explanation.candidates if c.effect is effect]:
+            member = next(c for c in smaller.candidates if c.key == key)
+            needless = _simpler(proposals, judge.after(smaller), smaller, member, if_needless=True)
+            smaller = next(needless, smaller)
+        if smaller is not explanation:
+            yield smaller
 
 
 def _simpler(
@@ -588,7 +604,9 @@ def _with_another(
     """With one more effect beside the laws that were put into a member's place, where it pays and
     the two explain more than the member with fewer parameters, or far more with as many."""
     fits, most = proposals.fits, len(explanation.solved.parameters)
-    wider = best_additions(proposals, smaller, member.signature.rows, smaller.deviance)
+    lost = max(0.0, smaller.deviance - explanation.deviance)
+    wanted = smaller.deviance - CATCHES_UP * lost
+    wider = best_additions(proposals, smaller, member.signature.rows, wanted)
     # The laws are where they fit without it.
     for found in [e for e in wider if len(e.solved.parameters) <= most][:_ADDITIONS]:
         better = converged(fits, found)
@@ -676,19 +694,23 @@ def _with_laws(
 
 
 def _pooled(proposals: Proposals, judge: Judge, explanation: Explanation) -> Iterator[Explanation]:
-    """With one member for the same joint of all legs, in the place of one for each."""
-    fits = proposals.fits
-    alone = {
-        (c.effect, c.targets[0]): c
+    """With one member for the same joint of all legs, in the place of one for each, wherever they
+    agree."""
+    fits, pooled = proposals.fits, explanation
+    effects = dict.fromkeys(
+        c.effect
         for c in explanation.candidates
         if len(c.targets) == 1 and issubclass(c.effect, JointTorqueEffect)
-    }
+    )
     for group in fits.dictionary.groups:
-        for effect in dict.fromkeys(effect for effect, _ in alone):
-            members = [alone.get((effect, joint)) for joint in group]
-            if len(group) == 1 or None in members:
+        for effect in effects:
+            keys = [(effect, (joint,)) for joint in group]
+            members = [c for c in pooled.candidates if c.key in keys]
+            if len(group) == 1 or len(members) < len(group):
                 continue
-            rest = fits.explain([c for c in explanation.candidates if c not in members])
+            rest = fits.explain([c for c in pooled.candidates if c not in members])
             shared = polished(fits, proposals.beside(rest, effect, group))
-            if judge.is_as_good(shared, explanation):
-                yield shared
+            if judge.after(pooled).is_as_good(shared, pooled):
+                pooled = shared
+    if pooled is not explanation:
+        yield pooled

@@ -22,11 +22,13 @@ _POINTS = 9
 _EXPANSIONS = 3
 # What takes off less than this share of a deviance does not reach it at other values of its
 # nonlinear parameters either.
-_CATCHES_UP = 0.4
+CATCHES_UP = 0.4
 # What takes off this share of the sum of squares that is required is worth a fit.
 _ENOUGH = 0.5
 # So many numbers are kept in columns of candidates.
 _MOST_NUMBERS = 3_000_000
+# So many lists of additions are kept.
+_KEPT = 100
 # How often friction of all joints is fitted in turn.
 _SWEEPS = 3
 
@@ -46,6 +48,8 @@ class Proposals:
         """
         self.fits, self._barred = fits, barred
         self._found: Memory[Candidate] = Memory(_MOST_NUMBERS, lambda c: c.signature.values.size)
+        # What one more candidate makes of an explanation, see `best_additions`.
+        self.additions: Memory[list[Explanation]] = Memory(_KEPT)
         self._moments: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -233,7 +237,7 @@ class Proposals:
         """
         if wanted <= 0:
             return True
-        return largest_drop(self.fits.white, base.sse, rows, [*alone]) > _CATCHES_UP * wanted
+        return largest_drop(self.fits.white, base.sse, rows, [*alone]) > CATCHES_UP * wanted
 
     def _best_on(
         self,

@@ -8,8 +8,10 @@ from functools import partial
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary, depends_on
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.identification.inertial import (
     IdentifiedInertia,
@@ -263,8 +265,16 @@ def beside_model(
     effects = [
         effect for effect, c in zip(explanation.effects, members, strict=True) if _is_of_model(c)
     ]
-    inside = Fits(fits.dictionary, WhitenedResidual(_residual_with(fits, effects)))
+    predictor = _predictor_with(fits, effects)
+    inside = Fits(fits.dictionary, WhitenedResidual(predictor.residual))
     moved = {c: replace(c, signature=inside.white.whiten_signature(c.raw)) for c in others}
+    # Heavier links are another load.
+    of_model = Fits(Dictionary(predictor, fits.dictionary.effects), inside.white)
+    for c in others:
+        if not (issubclass(c.effect, JointTorqueEffect) and depends_on(c.effect, "load")):
+            continue
+        rest = of_model.remainder(of_model.explain([moved[o] for o in others if o is not c]))
+        moved[c] = of_model.candidate(c.effect, c.targets, c.nonlinear, rest)
     return inside, moved
 
 
@@ -278,15 +288,15 @@ class _InModel:
 
 
 def _in_model(fits: Fits, explanation: Explanation) -> _InModel:
-    residual = _residual_with(fits, explanation.effects)
+    residual = _predictor_with(fits, explanation.effects).residual
     white = WhitenedResidual(residual)
     share = fits.white.count / np.maximum(white.count, 1)
     factor = fits.torque_factor(explanation.candidates, explanation.solved.parameters)
     return _InModel(residual, white, white.sse * share * factor)
 
 
-def _residual_with(fits: Fits, found: Sequence[Effect]) -> Residual:
-    """Of the model with effects that were found."""
+def _predictor_with(fits: Fits, found: Sequence[Effect]) -> Predictor:
+    """By the model with effects that were found."""
     predictor = fits.dictionary.predictor
     scenario = predictor.scenario
     effects = dict(scenario.believed.effects)
@@ -295,7 +305,7 @@ def _residual_with(fits: Fits, found: Sequence[Effect]) -> Residual:
         if beside is not None:
             effects[f"_found_{k}"] = beside
     believed = replace(scenario.believed, effects=effects)
-    return predictor.of(replace(scenario, model=believed)).residual
+    return predictor.of(replace(scenario, model=believed))
 
 
 def _beside_interplay(fits: Fits, explanation: Explanation, left: Residual) -> Explanation:

@@ -94,6 +94,20 @@ def best_additions(
         most: only explanations with a smaller deviance.
         in_part: also what the log shows too little of to be named, see `could_be`.
     """
+    asked = (base, None if rows is None else rows.tobytes(), most, in_part)
+    return proposals.additions.or_made(
+        asked, lambda: _additions(proposals, base, rows, most, in_part=in_part)
+    )
+
+
+def _additions(
+    proposals: Proposals,
+    base: Explanation,
+    rows: np.ndarray | None,
+    most: float,
+    *,
+    in_part: bool,
+) -> list[Explanation]:
     fits = proposals.fits
     promising, found = proposals.promising(base, rows, base.deviance - most, in_part=in_part), []
     tried = [

@@ -51,12 +51,17 @@ class Significance:
     def share(self, explanation: Explanation, candidate: Candidate) -> float:
         """Largest root mean square of what a member of an explanation adds to a row, as a share of
         its size; NaN if no row has one."""
+        shares = self.shares(explanation, candidate)
+        return float(np.nanmax(shares)) if np.isfinite(shares).any() else np.nan
+
+    def shares(self, explanation: Explanation, candidate: Candidate) -> np.ndarray:
+        """The same in each row of the member's, (r,), NaN for those without a size."""
         start, raw = explanation.start(candidate), candidate.raw
         parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
         added = rms(raw.values @ parameters + raw.offset, self._known[:, raw.rows])
         sizes = self._sizes[raw.rows]
         measured = np.isfinite(sizes) & np.isfinite(added) & (sizes > 0)
-        return float((added[measured] / sizes[measured]).max()) if measured.any() else np.nan
+        return np.divide(added, sizes, out=np.full(len(sizes), np.nan), where=measured)
 
     def left_share(self, row: int, left: np.ndarray, white: WhitenedResidual) -> float:
         """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it

@@ -113,8 +113,10 @@ class RecordedMotion:
         return self.steps_of(self.signals)
 
     def steps_of(self, signals: SensorSignals) -> Instants:
-        """Steps of other signals on the same grid."""
-        return steps(signals, self.timing)
+        """Steps of other signals on the same grid; velocities without their noise, whose square
+        would be a torque of its own."""
+        quiet = steps(self.without_velocity_noise(signals), self.timing)
+        return replace(steps(signals, self.timing), joint_velocity=quiet.joint_velocity)
 
     def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
         """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0
@@ -153,7 +155,7 @@ class RecordedMotion:
 
     def quiet_blocks_of(self, signals: SensorSignals) -> Instants:
         """The same of other signals on the same grid."""
-        return averaged(self.steps_of(self.without_velocity_noise(signals)), self.length)
+        return averaged(steps(self.without_velocity_noise(signals), self.timing), self.length)
 
     def without_velocity_noise(self, signals: SensorSignals) -> SensorSignals:
         """Signals without frequencies in which the log has little but noise of the joints'
