@@ -61,12 +61,15 @@ class Recording:
 
     @property
     def truth(self) -> Mapping[str, set[str]]:
-        """Effects that rightly say something about a target."""
+        """Effects that rightly say something about a target. What a link has may look like what its
+        joint could have, and is then said of the joint."""
+        joint_of = {link.name: link.joint for link in self.machine.links}
         found: dict[str, set[str]] = {}
         for hidden in self.hidden:
             for target in hidden.targets:
                 for name in hidden.names:
-                    found.setdefault(target, set()).update((name, *_FRICTION.get(name, ())))
+                    for place in {target, joint_of.get(target, target)}:
+                        found.setdefault(place, set()).update((name, *_FRICTION.get(name, ())))
         if self.recorder.late:
             for joint in self.machine.joints:
                 found.setdefault(joint, set()).add(_LATE)

@@ -189,8 +189,11 @@ class BodyCentreOfMass(InertiaEffect):
         "Squat and sway slowly; for its height, tilt or accelerate the body."
     )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
+    linear_nearby: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("m", linear=True, plausible=(-0.05, 0.05), bounds=(-np.inf, np.inf))
+        axis: Parameter(
+            "m", linear=True, plausible=(-0.05, 0.05), bounds=(-np.inf, np.inf), belief=0.1
+        )
         for axis in "xyz"
     }
 

@@ -501,8 +501,9 @@ class Regression:
             )
             for name in ("prior", "steadying", "lowest")
         )
-        # Units must not decide what counts as singular.
-        norm = np.sqrt(np.einsum("rqq->q", together.whole[0]))[fitted]
+        # Units must not decide what counts as singular, nor a column that is next to nothing beside
+        # what is believed of it.
+        norm = np.sqrt(np.einsum("rqq->q", together.whole[0])[fitted] + prior + steadying)
         norm[norm == 0] = 1.0
         held = np.diag((prior + steadying) / norm**2)
 
