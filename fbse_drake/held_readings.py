@@ -13,8 +13,8 @@ _FEWEST_CHANGES = 20
 # This share of the times from one change to the next must be alike within a row: a sensor's clock
 # need not be the log's, but a coarse encoder changes as its joint turns.
 _REGULAR = 0.9
-# A sensor is not read sooner than its clock ticks: so many readings take no less than as many times
-# the usual one but for these rows, in this share of the cases. What changes in steps of its own does.
+# A sensor is not read sooner than its clock ticks, as what changes in steps of its own is: so many
+# readings take so many times as long as one, less these rows, or more.
 _READINGS, _JITTER = 10, 2.0
 
 

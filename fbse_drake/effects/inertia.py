@@ -29,6 +29,9 @@ class InertiaEffect(Effect):
     All its parameters are linear, at least about some values.
     """
 
+    # Simpler effects on the same body, one of which and something else may look like it.
+    parts: ClassVar[tuple[type["InertiaEffect"], ...]] = ()
+
     @staticmethod
     def suspected_bodies(robot: Robot) -> list[str]:
         """Bodies that the diagnosis tries it on: those that weigh something."""
@@ -236,6 +239,7 @@ class Payload(InertiaEffect):
     )
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
     linear_nearby: ClassVar[bool] = True
+    parts: ClassVar[tuple[type[InertiaEffect], ...]] = (BodyMass, BodyCentreOfMass)
     parameters: ClassVar[dict[str, Parameter]] = {
         "mass": Parameter("kg", linear=True, plausible=(0.0, 10.0)),
         **{

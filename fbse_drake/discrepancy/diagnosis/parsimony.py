@@ -477,8 +477,10 @@ def _on_fewer_targets(
         others = [c for c in explanation.candidates if c is not member]
         rest = proposals.fits.explain(others)
         gain = judge.gain_by_row(rest, explanation)
-        shares = dictionary.significance.shares(explanation, member)
-        matter = member.signature.rows[_acts(member.signature) & ~(shares < tolerance)]
+        # Of a recorder all joints have what most of them show.
+        is_small = dictionary.significance.shares(explanation, member) < tolerance
+        matters = _acts(member.signature) & ~(is_small & (not member.effect.needs_sampled_torque))
+        matter = member.signature.rows[matters]
         of_target = {t: dictionary.rows_of(member.effect, [t]) for t in member.targets}
         kept = tuple(
             t

@@ -84,7 +84,7 @@ class Proposals:
         enough = share * fits.threshold[1]
         known = {c.key for c in base.candidates} | self._barred
         result = [
-            self._settled(candidate, base)
+            self.settled(candidate, base)
             for candidate in fits.fixed_candidates
             if candidate.key not in known
             and changed[candidate.signature.rows].any()
@@ -140,7 +140,7 @@ class Proposals:
             if not alone or keys & taken:
                 continue
             if len(alone) == len(members) or self._one_value_explains_more(alike, alone, beside):
-                found.append([alone.get(c.targets) or self._settled(c, base) for c in members])
+                found.append([alone.get(c.targets) or self.settled(c, base) for c in members])
         return found
 
     @staticmethod
@@ -151,7 +151,7 @@ class Proposals:
         gram, right = _inner_products(beside, alike.signature)
         return any(fixed_gain(one.T @ gram @ one, one.T @ right) > best for one in alike.shared)
 
-    def _settled(self, candidate: Candidate, base: Explanation) -> Candidate:
+    def settled(self, candidate: Candidate, base: Explanation) -> Candidate:
         """A candidate made linear about the values that fit best beside an explanation, if it is
         linear only nearby."""
         if not candidate.effect.linear_nearby:

@@ -18,6 +18,7 @@ from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import converged
 from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_shown
 from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.errors import InputError
 
@@ -60,6 +61,32 @@ def rivals(proposals: Proposals, final: Explanation) -> dict[int, list[Explanati
         found = [fitted(fits, e) for e in additions[:_FITTED]] + additions[_FITTED:]
         result[k] = sorted(found, key=lambda e: e.deviance)
     return result
+
+
+def in_parts(proposals: Proposals, final: Explanation) -> dict[int, list[Explanation]]:
+    """For each member that can do much, as a payload can: explanations with a simpler effect on the
+    same body and another effect in its place, each of which comes last once.
+
+    These never take its place: one cause is likelier than two that together look like it.
+    """
+    fits, found = proposals.fits, {}
+    for k, member in enumerate(final.candidates):
+        parts = member.effect.parts if issubclass(member.effect, InertiaEffect) else ()
+        others = [c for c in final.candidates if c is not member]
+        pairs: list[Explanation] = []
+        for part in fits.fixed_candidates:
+            if part.effect not in parts or part.targets != member.targets:
+                continue
+            base = fits.explain([*others, proposals.settled(part, fits.explain(others))])
+            most = final.deviance + fits.threshold[-1]
+            for wider in best_additions(proposals, base, member.signature.rows, most):
+                if wider.candidates[-1].effect in (*parts, member.effect):
+                    continue
+                pair = fitted(fits, wider)
+                *rest, one, other = pair.candidates
+                pairs += [pair, fits.explain([*rest, other, one])]
+        found[k] = pairs
+    return found
 
 
 def rival_name(rival: Candidate, member: Candidate) -> str:

@@ -5,6 +5,7 @@ They are begun anew for what is learned of the log on the way.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from fbse_drake.discrepancy.diagnosis.parsimony import (
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, polished, remeasured
-from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable, rivals, settled
+from fbse_drake.discrepancy.diagnosis.rivals import in_parts, indistinguishable, rivals, settled
 from fbse_drake.discrepancy.diagnosis.selection import select
 from fbse_drake.discrepancy.identification.inertial import IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
@@ -96,6 +97,32 @@ class LateTorques:
             for joint in member.targets
         }
         return TorqueReadingLag(time_constant=by_joint)
+
+    def everywhere(self, proposals: Proposals) -> "LateTorques | None":
+        """With the lag that most joints share in those where none was found, for one recorder reads
+        them all; None if there is no such lag, or all have one.
+
+        Args:
+            proposals: of the search.
+        """
+        final, is_driven = self.explanation, self.fits.dictionary.predictor.is_driven
+        driven = [*compress(self.fits.dictionary.joints, is_driven)]
+        shared = max(self.members, key=lambda member: len(member.targets))
+        late = [joint for member in self.members for joint in member.targets]
+        lacking = tuple(joint for joint in driven if joint not in late)
+        if not lacking or 2 * len(shared.targets) <= len(driven):
+            return None
+        others = [c for c in final.candidates if c is not shared]
+        wider = proposals.beside(
+            self.fits.explain(others), TorqueReadingLag, shared.targets + lacking
+        )
+        now = dict(zip([*others, shared], wider.candidates, strict=True))
+        members = {now[member]: share for member, share in self.members.items()}
+        equal = {
+            wider.candidates.index(now[final.candidates[k]]): rivals
+            for k, rivals in self.equal.items()
+        }
+        return LateTorques(self.fits, wider, members, equal)
 
 
 def _late_torques(search: Search) -> LateTorques | None:
@@ -172,10 +199,11 @@ def best_search(dictionary: Dictionary, effects: Sequence[type[Effect]]) -> Best
     names = tuple(predictor.residual.rows[row].name for row in sorted(noisier))
     before = root_mean_square(search.proposals.fits.white, search.before)
     late = _late_torques(search)
-    if late is not None:
-        in_time = _with_torques_in_time(predictor, late, effects, progress)
+    tried = [] if late is None else [late.everywhere(search.proposals), late]
+    for one in (one for one in tried if one is not None):
+        in_time = _with_torques_in_time(predictor, one, effects, progress)
         if in_time.error <= _AS_GOOD * search.error:
-            return BestSearch(in_time, disturbances, names, late, before)
+            return BestSearch(in_time, disturbances, names, one, before)
     return BestSearch(search, disturbances, names, None, before)
 
 
@@ -352,7 +380,9 @@ def _settled_and_frugal(
         if smaller.deviance > explanation.deviance + MARGIN:
             smaller = explanation
     smaller = without_stand_ins(proposals.fits, smaller)
-    return smaller, found if smaller is final else rivals(proposals, smaller)
+    found = found if smaller is final else rivals(proposals, smaller)
+    pairs = in_parts(proposals, smaller)
+    return smaller, {k: [*of_member, *pairs[k]] for k, of_member in found.items()}
 
 
 def root_mean_square(
