@@ -21,6 +21,28 @@ def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedJointTorque
     )
 
 
+@pytest.mark.parametrize(
+    ("gammas", "falls"),
+    [
+        ((0.7, 100.0, 10.0, 0.6, 100.0, 0.9), True),
+        ((0.0, 100.0, 10.0, 0.6, 100.0, 0.9), False),
+        # Rises from 1.6 to 2.7 Nm as it would fall.
+        ((1.6, 1000.0, 14.0, 2.7, 14.0, 1.0), False),
+        ((1.6, 1000.0, 14.0, 2.7, 1000.0, 1.0), True),
+        ((0.02, 1000.0, 14.0, 2.7, 1000.0, 1.0), False),
+    ],
+)
+def test_friction_that_does_not_fall_with_speed_is_no_stribeck_friction(
+    gammas: tuple[float, ...], falls: bool
+):
+    values = {f"gamma{k}": value for k, value in enumerate(gammas, 1)}
+    assert StribeckFriction.is_itself(values) is falls
+    speed = np.linspace(0.0, 1.0, 20001)
+    one, two, three, four, five, _ = gammas
+    law = one * (np.tanh(two * speed) - np.tanh(three * speed)) + four * np.tanh(five * speed)
+    assert (np.ptp(law[law.argmax() :]) > 0.05 * law[-1]) is np.bool_(falls)
+
+
 def test_equation_56_at_table_1():
     w = np.full(12, 0.02)
     by_hand = (

@@ -10,6 +10,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 from recorded_arm import ARM, Course, Machine
 
+from benchmarks.recorded.course import inverse_dynamics
 from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
@@ -165,6 +166,29 @@ def test_noise_of_a_coarse_encoder_biases_no_inertia(bits: int) -> None:
     weight = deviations**-2 / (deviations**-2).sum()
     assert weight @ values == pytest.approx(1.0, abs=0.01)
     assert np.median(np.array(by_rough)[:, 0]) < 0.95
+
+
+def test_the_square_of_a_velocitys_noise_is_no_torque() -> None:
+    """Velocities by rounded angles are off by half a rad/s, whose square turns links outwards: the
+    inverse dynamics of such velocities asks for torques that no drive gives."""
+    machine = replace(ARM, period=0.001, duration=10.0)
+    course = machine.course(2)
+    motion = machine.predictor(by_angles(machine, course, 12, course.torque, 0)).motion
+    q, v, a = (
+        0.5 * (values[1:] + values[:-1])[2:-2]
+        for values in (course.position, course.velocity, course.acceleration)
+    )
+    rough = 0.5 * (motion.signals.joint_velocity[1:] + motion.signals.joint_velocity[:-1])[2:-2]
+    robot = machine.robot(machine.by_joint(machine.rotor_inertia))
+    needed = inverse_dynamics(robot, q, v, a)
+
+    def feigned(velocity: np.ndarray) -> np.ndarray:
+        return np.abs((inverse_dynamics(robot, q, velocity, a) - needed).mean(axis=0))
+
+    turning = feigned(rough) > 0.02
+    assert turning.sum() >= 2
+    by_steps = feigned(motion.steps.joint_velocity[2:-2])
+    assert (by_steps < 0.1 * feigned(rough))[turning].all()
 
 
 @pytest.mark.parametrize("bits", [11, 12])

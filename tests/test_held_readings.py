@@ -81,6 +81,28 @@ def test_a_coarse_encoder_and_a_channel_without_change_are_left_as_they_are():
         assert between_readings(values) is values
 
 
+def test_joints_in_coarse_steps_are_no_slow_sensor():
+    """Together they change almost every other row, now one and then the other; a sensor's clock
+    that is not the log's ticks after two rows or three."""
+    rng = np.random.default_rng(3)
+    apart = rng.choice([1, 2, 3], p=[0.3, 0.4, 0.3], size=1000)
+    rows = np.arange(apart.sum())
+    steps = np.searchsorted(np.cumsum(apart), rows, side="right")
+    coarse = np.stack([steps // 2, (steps + 1) // 2], axis=1).astype(float)
+    assert rows_per_reading(coarse) == 1
+    assert between_readings(coarse) is coarse
+    assert rows_per_reading(np.floor(rows / 2.5)) == pytest.approx(2.5, rel=0.02)
+
+
+def test_readings_in_rows_beside_each_other_are_kept():
+    """By a clock of three rows that is a row early once: neither reading is lost."""
+    rows = np.r_[np.arange(0, 300, 3), 301, np.arange(302, 602, 3)]
+    values = np.zeros(600)
+    values[rows[rows < 600]] = 1.0
+    values = np.cumsum(values)
+    assert {301, 302} <= set(rows_of_readings(values).tolist())
+
+
 def test_a_jump_between_readings_is_as_bad_as_the_noise_that_is_said():
     """Jumps of 7 at any time between two readings, against the integral of the line through
     these; all else is smooth."""

@@ -91,6 +91,20 @@ def test_outcomes(tmp_path: Path, said: dict, expected: str) -> None:
     assert outcome(one, said) == expected
 
 
+def test_what_a_link_has_is_said_of_its_joint(tmp_path: Path) -> None:
+    """About a vertical axis a centre of mass elsewhere is nothing but an inertia, as a rotor's."""
+    drawn = record(5, tmp_path)
+    hidden = (Hidden(("BodyCentreOfMass",), ("link_1",)),)
+    one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
+    for joint, confusable, expected in (
+        ("joint_1", ["BodyCentreOfMass"], "right"),
+        ("joint_2", ["BodyCentreOfMass"], "wrong"),
+        ("joint_1", ["BodyMass"], "wrong"),
+    ):
+        said = diagnosis("effect_found", ("ReflectedInertia", [joint], confusable))
+        assert outcome(one, said) == expected
+
+
 def test_what_does_not_show_is_not_missed(tmp_path: Path) -> None:
     drawn = record(5, tmp_path)
     hidden = (Hidden(("TorqueBias",), ("joint_3",)),)
@@ -98,10 +112,12 @@ def test_what_does_not_show_is_not_missed(tmp_path: Path) -> None:
     assert outcome(one, diagnosis("nothing_missing")) == "right"
 
 
-@pytest.mark.parametrize("number", [10, 17, 232])
+@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029])
 def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     """Nothing hidden, and angles alone that nobody tells the noise of; filtered velocities whose
-    torques have the noise that is told; the same where nobody tells it."""
+    torques have the noise that is told; the same where nobody tells it; a centre of mass of which
+    only the moment about one axis shows; a drag in one joint of two; friction that follows the load
+    of a link that is too light in the model, by torques in coarse steps."""
     drawn = record(number, tmp_path)
     found = diagnose(Predictor(drawn.scenario, drawn.log))
     assert outcome(drawn, diagnosis_json(found)) == "right"

@@ -45,6 +45,20 @@ def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
     ]
 
 
+def test_a_belief_in_what_does_not_show_leaves_the_rest_as_it_is() -> None:
+    """A column far below rounding, as the slope of a jump that no sample meets, and what is
+    believed of it in its own unit."""
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=(400, 1, 2))
+    white = white_of(3.0 * x[:, :, 0] + rng.normal(size=(400, 1)))
+    x[:, :, 1] *= 1e-25
+    both = Signature(np.array([0]), x, prior=np.array([0.0, 1e8]))
+    alone = Signature(np.array([0]), x[:, :, :1])
+    found, expected = (Regression(white).fit([s]).parameters[0] for s in (both, alone))
+    assert expected == pytest.approx(3.0, abs=0.3)
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_signature_that_shows_in_no_row_is_whitened_like_others() -> None:
     white = white_of(np.ones((20, 2)))
     nowhere = Signature(np.array([], dtype=int), np.zeros((20, 0, 3)), np.zeros((20, 0)))
