@@ -501,19 +501,19 @@ def _reduced(proposals: Proposals, judge: Judge, explanation: Explanation) -> It
     all joints where it may be, for not every joint shows what it has. Where it brings less than its
     parameters cost, it is not."""
     for effect in dict.fromkeys(c.effect for c in explanation.candidates):
-        smaller, everywhere = explanation, True
-        for key in [c.key for c in explanation.candidates if c.effect is effect]:
+        keys = [c.key for c in explanation.candidates if c.effect is effect]
+        smaller = explanation
+        for key in keys:
             # Others may have been moved to where they fit.
             member = next(c for c in smaller.candidates if c.key == key)
             found = next(_simpler(proposals, judge.after(smaller), smaller, member), None)
-            everywhere = found is not None
             if found is None:
                 break
             smaller = found
-        if everywhere:
+        else:
             yield smaller
         smaller = explanation
-        for key in [c.key for c in explanation.candidates if c.effect is effect]:
+        for key in keys:
             member = next(c for c in smaller.candidates if c.key == key)
             needless = _simpler(proposals, judge.after(smaller), smaller, member, if_needless=True)
             smaller = next(needless, smaller)
