@@ -607,8 +607,8 @@ def _with_another(
     the two explain more than the member with fewer parameters, or far more with as many."""
     fits, most = proposals.fits, len(explanation.solved.parameters)
     lost = max(0.0, smaller.deviance - explanation.deviance)
-    wanted = smaller.deviance - CATCHES_UP * lost
-    wider = best_additions(proposals, smaller, member.signature.rows, wanted)
+    largest = smaller.deviance - CATCHES_UP * lost
+    wider = best_additions(proposals, smaller, member.signature.rows, largest)
     # The laws are where they fit without it.
     for found in [e for e in wider if len(e.solved.parameters) <= most][:_ADDITIONS]:
         better = converged(fits, found)

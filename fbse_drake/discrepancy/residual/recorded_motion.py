@@ -25,6 +25,7 @@ from fbse_drake.discrepancy.residual.recorded_signals import (
     read_signals,
     steps,
     unbroken,
+    within_steps,
 )
 from fbse_drake.discrepancy.residual.recorded_velocity import Lateness
 from fbse_drake.discrepancy.residual.residual import Residual
@@ -115,8 +116,9 @@ class RecordedMotion:
     def steps_of(self, signals: SensorSignals) -> Instants:
         """Steps of other signals on the same grid; velocities without their noise, whose square
         would be a torque of its own."""
-        quiet = steps(self.without_velocity_noise(signals), self.timing)
-        return replace(steps(signals, self.timing), joint_velocity=quiet.joint_velocity)
+        velocity = self.without_velocity_noise(signals).joint_velocity
+        amid = within_steps(velocity, self.timing.motion_share)
+        return replace(steps(signals, self.timing), joint_velocity=amid)
 
     def low_passed(self, values: np.ndarray, corner: float) -> np.ndarray:
         """Samples (N, ...) through a low-pass without delay, gaps left out; as they are for 0
