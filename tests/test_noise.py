@@ -355,6 +355,29 @@ def test_blocks_of_differenced_angles_share_none() -> None:
     np.testing.assert_allclose(neighbours, -0.5, atol=0.1)
 
 
+def test_noise_of_a_machine_that_turns_does_not_add_up_to_nothing() -> None:
+    """Rates are differences of velocities, whose noise the next block takes off again, but by
+    another mass matrix: what is left of it is slow, and slow laws are told by what is slow."""
+    machine = replace(
+        ARM,
+        posture=(0.0, 0.8, 0.9, 0.0, 0.6, 0.0),
+        amplitude=(1.2, 1.0, 1.2, 1.5, 1.2, 1.5),
+        rotor_inertia=(0.1, 0.1, 0.05, 0.02, 0.02, 0.01),
+        torque_noise=(0.0,) * 6,
+    )
+    course, logs = machine.course(), 12
+    residuals = [machine.predictor(machine.log(course, seed=seed)).residual for seed in range(logs)]
+    white = WhitenedResidual(residuals[0])
+    y = np.array([[white.whiten(j, left.value[:, j]) for j in range(6)] for left in residuals])
+    # But for what is the same in all.
+    noise = (y - y.mean(axis=0)) * np.sqrt(logs / (logs - 1))
+    power = np.abs(np.fft.rfft(noise, axis=2)) ** 2 / noise.shape[2]
+    slow, fast = (power[:, :, part].mean(axis=(0, 2)) for part in (slice(1, 16), slice(16, None)))
+    np.testing.assert_allclose(fast, 1.0, atol=0.1)
+    # Of the 360 squares in the slow part of each joint. If nothing were left, it would be 1.3 to 3.
+    assert np.all((0.7 < slow) & (slow < 1.6)), slow
+
+
 @pytest.mark.parametrize("bits", [0, 12])
 def test_play_finer_than_the_steps_of_an_encoder_does_not_show(bits: int) -> None:
     predictor, _ = arm(1.0, bits=bits)

@@ -51,6 +51,39 @@ class Unseen:
         return Unseen(self.torque[instants], self.specific_force[instants], wrenches)
 
 
+@dataclass(frozen=True)
+class SensorNoise:
+    """What sensor noise puts into each row of one step, in M blocks of steps, to first order; (M,
+    rows) each, in the rows' units squared, times s^2 where velocities are meant.
+
+    Rates are differences of velocities: a row has S d/dt of them, with a sensitivity S that depends
+    on the posture. Summed over a block, S at its ends counts, and what it changes between.
+    """
+
+    # Variance of what is white.
+    white: np.ndarray
+    # Of S times the velocities' noise, where a block meets the next one.
+    at_end: np.ndarray
+    # Of the change of S between the centres of a block and the next one times that noise.
+    change: np.ndarray
+
+    def of_blocks(self, length: int, period: float) -> tuple[np.ndarray, np.ndarray]:
+        """Variance of averages over blocks of so many steps, and their covariance with the next
+        one's, (M, rows) each.
+
+        Args:
+            period: from one step to the next [s].
+        """
+        duration = length * period
+        at_start = np.concatenate([self.at_end[:1], self.at_end[:-1]])
+        changed = 0.5 * (self.change + np.concatenate([self.change[:1], self.change[:-1]]))
+        differenced = at_start + self.at_end + changed / length
+        variance = self.white / length + differenced / duration**2
+        covariance = -self.at_end / duration**2
+        covariance[-1] = 0.0
+        return variance, covariance
+
+
 class _Remembered:
     """A function of the plant's state, with its last results by the arrays that they depend on."""
 
@@ -275,38 +308,39 @@ class EquationOfMotion:
             accelerations[:, order[:3]], accelerations[:, order[3:6]] = w_dot, f
         return states, accelerations
 
-    def noise(
-        self, at: Instants, sensors: SensorsConfig, unseen: Unseen
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Variance that sensor noise puts into each row of one step, to first order.
+    def noise(self, at: Instants, sensors: SensorsConfig, unseen: Unseen) -> SensorNoise:
+        """What the sensors put into the rows.
 
         Args:
+            at: averages over blocks.
             unseen: what is as good as noise besides.
-
-        Returns:
-            Of what is white, and of the integral over time of what is differenced white noise, each
-            (M, rows), in the rows' units squared (the second times s^2).
         """
         M, motors = len(at.joint_position), at.motor_position.shape[1]
         rows = len(residual_rows(self.robot, motor_encoders=motors > 0))
-        white, differenced = np.zeros((M, rows)), np.zeros((M, rows))
-        white[:, rows - motors :] = sensors.deflection_noise**2
+        noise = SensorNoise(*np.zeros((3, M, rows)))
+        noise.white[:, rows - motors :] = sensors.deflection_noise**2
         for start in range(0, M, _AT_A_TIME):
-            part = slice(start, start + _AT_A_TIME)
-            outputs = white[part], differenced[part]
-            self._fill_noise(at.joint_position[part], sensors, unseen.part(part), *outputs)
-        return white, differenced
+            # With the next one, where there is any.
+            part = slice(start, start + _AT_A_TIME + 1)
+            white, sensitivity = self._noise_in(at.joint_position[part], sensors, unseen.part(part))
+            place = slice(start, start + len(white))
+            known = slice(0, white.shape[1])
+            noise.white[place, known] = white
+            following = np.concatenate([sensitivity[1:], sensitivity[-1:]])
+            noise.at_end[place, known] = (0.25 * (sensitivity + following) ** 2).sum(axis=2)
+            noise.change[place, known] = ((following - sensitivity) ** 2).sum(axis=2)
+        return noise
 
-    def _fill_noise(
-        self,
-        joint_position: np.ndarray,
-        sensors: SensorsConfig,
-        unseen: Unseen,
-        white: np.ndarray,
-        differenced: np.ndarray,
-    ) -> None:
-        """Fills what `noise` returns, in some postures."""
+    def _noise_in(
+        self, joint_position: np.ndarray, sensors: SensorsConfig, unseen: Unseen
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of all rows but those of transmissions, in M postures: variance of what is white, (M,
+        rows), and sensitivity to the noise of velocities of the unit deviation that they have, (M,
+        rows, velocities)."""
         robot, n, v = self.robot, joint_position.shape[1], len(self._order)
+        rows = len(residual_rows(robot))
+        white = np.zeros((len(joint_position), rows))
+        sensitivity = np.zeros((len(joint_position), rows, v))
         positions = np.tile(self._upright, (len(joint_position), 1))
         positions[:, robot.position_index] = joint_position
         gyro, accelerometer = sensors.imu.angular_velocity_noise, sensors.imu.acceleration_noise
@@ -322,9 +356,9 @@ class EquationOfMotion:
             white[:, :v] += accelerometer**2 * (H[:, :, 3:6] ** 2).sum(axis=2)
             white[:, :v] += np.einsum("mij,mj->mi", H[:, :, 3:6] ** 2, unseen.specific_force)
             H[:, :, :3] += H[:, :, 3:6] @ _skew(self.p_BI)
-        differenced[:, :v] = ((H * scale) ** 2).sum(axis=2)
+        sensitivity[:, :v] = H * scale
         if not floating:
-            return
+            return white, sensitivity
         place, relative = v, []
         for J, deviation, unseen_wrench in zip(
             self._jacobians(positions),
@@ -339,13 +373,14 @@ class EquationOfMotion:
             white[:, place + 3 : place + 6] += np.einsum(
                 "mij,mj->mi", J[:, 3:, 3:6] ** 2, unseen.specific_force
             )
-            differenced[:, place + 3 : place + 6] = ((J[:, 3:] * scale) ** 2).sum(axis=2)
+            sensitivity[:, place + 3 : place + 6] = J[:, 3:] * scale
             relative.append(np.einsum("mij,mik->mjk", J[:, 3:, 3:6], J[:, 3:]))
             place += 6
         for one, other in self._pairs:
             apart = (relative[one] - relative[other]) * scale
             white[:, place : place + 3] = (apart**2).sum(axis=2)
             place += 3
+        return white, sensitivity
 
 
 def joint_velocity_noise(sensors: SensorsConfig) -> float:

@@ -321,7 +321,8 @@ def noise_finding(motion: RecordedMotion, noise: Noise) -> HygieneFinding | None
     rows, n = motion.rows, len(motion.robot.joint_names)
     torque = motion.blocks.torque_command
     torque_noise = np.sqrt(motion.torque_variance(torque).mean(axis=0) + noise.white[:n])
-    worth = motion.step_noise[0].mean(axis=0) + motion.step_noise[1].mean(axis=0) > _ROUNDING
+    believed = motion.sensor_noise.white.mean(axis=0) + motion.sensor_noise.at_end.mean(axis=0)
+    worth = believed > _ROUNDING
     worth[:n] |= torque_noise > _NEGLIGIBLE * rms(torque, motion.known[:, :n])
     said = [int(k) for k in np.argsort(-noise.factor) if noise.factor[k] > 1 and worth[k]]
     names = [rows[k].name for k in said]

@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.equation_of_motion import (
     EquationOfMotion,
+    SensorNoise,
     Unseen,
     joint_velocity_noise,
 )
@@ -321,13 +322,12 @@ class RecordedMotion:
         )
 
     @cached_property
-    def step_noise(self) -> tuple[np.ndarray, np.ndarray]:
-        """Believed variance of a step's white noise and of the integral over time of what is
-        differenced white noise, (B, R) each."""
-        white, differenced = self.equation.noise(self.blocks, self.sensors_by_row, self._unseen)
+    def sensor_noise(self) -> SensorNoise:
+        """What is believed of the sensors' noise, in steps of each block."""
+        noise = self.equation.noise(self.blocks, self.sensors_by_row, self._unseen)
         torque = self.torque_variance(self.blocks.torque_command)
-        white[:, : torque.shape[1]] += torque
-        return white, differenced
+        noise.white[:, : torque.shape[1]] += torque
+        return noise
 
     @cached_property
     def residual(self) -> Residual:
@@ -352,11 +352,7 @@ class RecordedMotion:
             value = block_means(measured, self.length) + self.averages(value - measured)
         else:
             value = block_means(value, self.length)
-        white, differenced = self.step_noise
-        duration = self.length * self.period
-        variance = white / self.length + 2 * differenced / duration**2
-        covariance = -np.sqrt(differenced[:-1] * differenced[1:]) / duration**2
-        covariance = np.concatenate([covariance, np.zeros((1, covariance.shape[1]))])
+        variance, covariance = self.sensor_noise.of_blocks(self.length, self.period)
         return Residual(
             self.rows,
             self.time,

@@ -4,7 +4,8 @@ residuals, with the noise that the sensors put into them.
 All are averaged over blocks of time. Averages of one and the same window have one group delay,
 telescope what is differentiated, and leave noise whose covariance is known: white noise
 (accelerometer, forces) stays white, differenced noise (gyro, joint velocity) becomes a moving
-average of order one, so that each row's covariance is tridiagonal.
+average of order one, so that each row's covariance is tridiagonal. Its sum over blocks is not
+nothing, for the mass matrix that it goes through changes as the robot turns.
 """
 
 from dataclasses import dataclass, replace
