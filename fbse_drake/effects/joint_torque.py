@@ -113,6 +113,8 @@ class JointTorqueEffect(Effect):
     deflects: ClassVar[bool] = False
     # Does the torque depend on nothing but the velocity? (Then it is simulated faster.)
     of_velocity_alone: ClassVar[bool] = False
+    # Does it repeat with the angle, as the error of a rounded angle does?
+    repeats: ClassVar[bool] = False
     # Can it be told in a joint that rests, as what the drive makes of its command can?
     shows_at_rest: ClassVar[bool] = False
     # Simpler laws that it contains, the simplest first: a diagnosis names the smallest that holds.

@@ -33,6 +33,7 @@ class TorqueRipple(JointTorqueEffect):
     )
     signature: ClassVar[str] = "A wave over the joint angle, the same in both directions of motion."
     experiment: ClassVar[str] = "Move each joint slowly through a large angle."
+    repeats: ClassVar[bool] = True
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
         "sine": Parameter("Nm", linear=True, plausible=(-5.0, 5.0), bounds=(-np.inf, np.inf)),

@@ -8,7 +8,7 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
-from fbse_drake.discrepancy.diagnosis.proposals import grid_gain
+from fbse_drake.discrepancy.diagnosis.grid_sets import grid_gain
 from fbse_drake.discrepancy.identification.regression import bounded_least_squares
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary, FixedColumns
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
-from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
+from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets, grid_gain
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import (
     Regression,
@@ -22,6 +22,7 @@ from fbse_drake.discrepancy.identification.regression import (
     connected,
     leftover,
 )
+from fbse_drake.discrepancy.identification.rounding import chance_bound, noise_of_rounding
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import InertiaEffect
@@ -37,6 +38,8 @@ COMPLEXITY = 4.0
 _SYSTEMATIC = 0.5
 # Safety on what the noise in an effect's own columns may feign.
 _SPURIOUS = 3.0
+# What brings less than so many times what is required may be what rounded angles feign.
+DOUBTFUL = 5.0
 
 
 # Slopes with respect to nonlinear values are taken over this share of them.
@@ -199,6 +202,28 @@ class Fits:
         return np.stack(
             [self.white.whiten(row, values) for row, values in enumerate(realization.T)], axis=1
         )
+
+    @cached_property
+    def _rounding(self) -> np.ndarray:
+        return noise_of_rounding(self.dictionary.predictor.motion, self.white)
+
+    def feigned(self, candidate: Candidate) -> float:
+        """Drop of the deviance by a law that repeats with the angle that rounded angles feign, of
+        all its nonlinear values by those that suit best; 0 for others, and where angles are not
+        rounded."""
+        effect = candidate.effect
+        if not issubclass(effect, JointTorqueEffect) or not effect.repeats:
+            return 0.0
+        draws, bounds = self._rounding, [0.0]
+        for row in map(int, candidate.signature.rows if len(draws) else ()):
+            sets = self.grid(effect).sets[row]
+            right = sets.times(draws[:, :, row].T).reshape(*sets.gram.shape[:2], -1)
+            largest = [
+                grid_gain(candidate.parameters, sets.gram, of_draw).max()
+                for of_draw in np.moveaxis(right, 2, 0)
+            ]
+            bounds.append(chance_bound(np.array(largest), FALSE_ALARM / len(self.white.count)))
+        return max(bounds)
 
     @cached_property
     def threshold(self) -> np.ndarray:

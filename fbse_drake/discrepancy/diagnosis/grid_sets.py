@@ -1,5 +1,6 @@
 """Columns of the first grid of nonlinear values that a search tries."""
 
+from collections.abc import Mapping
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -10,6 +11,7 @@ from fbse_drake.discrepancy.identification.regression import (
     WhitenedResidual,
     columns_of,
 )
+from fbse_drake.effects.effect import Parameter
 
 
 class GridSets:
@@ -45,3 +47,22 @@ class GridSets:
         flat = self._columns.reshape(len(self._columns), -1)
         products = (flat.T @ twice).reshape(*self._columns.shape[1:], -1)
         return np.swapaxes(products, 0, 1).reshape(-1, whitened.shape[1])
+
+
+def grid_gain(
+    parameters: Mapping[str, Parameter], gram: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Drop of the sum of squares for each set of nonlinear values, shape (G,)."""
+    linear = [parameter for parameter in parameters.values() if parameter.linear]
+    if not linear:
+        return 2 * right[:, 0] - gram[:, 0, 0]
+    if right.shape[1] == 1:
+        theta = np.divide(
+            right[:, 0], gram[:, 0, 0], out=np.zeros(len(right)), where=gram[:, 0, 0] > 1e-12
+        )
+        theta = np.clip(theta, *linear[0].bounds)
+        return 2 * theta * right[:, 0] - theta**2 * gram[:, 0, 0]
+    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(
+        gram.shape[1]
+    ) + 1e-12 * np.eye(gram.shape[1])
+    return np.einsum("gp,gp->g", right, np.linalg.solve(gram + ridge, right[:, :, None])[:, :, 0])

@@ -6,11 +6,11 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import Alike, Fits
+from fbse_drake.discrepancy.diagnosis.grid_sets import grid_gain
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.actuation import TorqueBias
-from fbse_drake.effects.effect import Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -343,22 +343,3 @@ def _free(
         return whole
     left = (tuple(joint for joint in group if joint not in taken) for group in groups)
     return list(dict.fromkeys([*whole, *(group for group in left if len(group) > 1)]))
-
-
-def grid_gain(
-    parameters: Mapping[str, Parameter], gram: np.ndarray, right: np.ndarray
-) -> np.ndarray:
-    """Drop of the sum of squares for each set of nonlinear values, shape (G,)."""
-    linear = [parameter for parameter in parameters.values() if parameter.linear]
-    if not linear:
-        return 2 * right[:, 0] - gram[:, 0, 0]
-    if right.shape[1] == 1:
-        theta = np.divide(
-            right[:, 0], gram[:, 0, 0], out=np.zeros(len(right)), where=gram[:, 0, 0] > 1e-12
-        )
-        theta = np.clip(theta, *linear[0].bounds)
-        return 2 * theta * right[:, 0] - theta**2 * gram[:, 0, 0]
-    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(
-        gram.shape[1]
-    ) + 1e-12 * np.eye(gram.shape[1])
-    return np.einsum("gp,gp->g", right, np.linalg.solve(gram + ridge, right[:, :, None])[:, :, 0])

@@ -7,7 +7,7 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.dictionary import follows_torque
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
-from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, DOUBTFUL, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
 from fbse_drake.effects.effect import Effect, library
@@ -257,7 +257,10 @@ def _travel(fits: Fits, candidate: Candidate) -> np.ndarray:
 def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
     """Does a candidate bring more than chance to an explanation without it, with values that can
     be?"""
-    if base.deviance - wider.deviance < fits.required(added):
+    gained, required = base.deviance - wider.deviance, fits.required(added)
+    if gained < required:
+        return False
+    if gained < DOUBTFUL * required and gained < fits.feigned(added):
         return False
     if _may_be_misfit(fits, base, wider, added):
         return False

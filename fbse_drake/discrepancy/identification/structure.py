@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
+from fbse_drake.discrepancy.identification.rounding import chance_bound, noise_of_rounding
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 
 # Averages of a row from which on something is told of what is left in it; and from which on a test
@@ -24,6 +25,8 @@ _LOUD = 3.0
 # Drop of the held-out deviance at which a smooth function of several variables counts as found,
 # beside what is doubted about known laws.
 _DROP = 25.0
+# What is less than so many times that may be what rounded angles feign.
+_DOUBTFUL = 5.0
 # How many times as large as it was taken the doubt about known laws may be.
 _DOUBT = 3.0
 # Of which later averages what is left may tell something: not of the next one, with which noise is
@@ -81,8 +84,12 @@ def leftover_structure(
         else:
             everything = np.concatenate(list(variables.values()), axis=1)
             is_noise = usual < tolerated(white, k) or is_white(left[:, k], int(white.count[k]))
-            if is_noise and _drop(white, left, k, everything) < _DROP + _DOUBT * white.doubt[k]:
-                continue
+            if is_noise:
+                drop = _drop(white, left, k, everything)
+                if drop < _DROP + _DOUBT * white.doubt[k]:
+                    continue
+                if drop < _DOUBTFUL * _DROP and drop < _feigned(motion, white, k, everything):
+                    continue
         excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
         shares = {
             name: _explained(white, left, k, basis) / excess for name, basis in variables.items()
@@ -248,6 +255,14 @@ def _drop(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray
             - after / max(after, 1)
         )
     )
+
+
+def _feigned(motion: RecordedMotion, white: WhitenedResidual, row: int, basis: np.ndarray) -> float:
+    """What rounded angles make the deviance drop by a smooth function, see `rounding`; 0 where
+    angles are not rounded."""
+    draws = noise_of_rounding(motion, white)
+    drops = np.array([_drop(white, draw, row, basis) for draw in draws])
+    return chance_bound(drops, _FALSE_ALARM / draws.shape[2]) if len(drops) else 0.0
 
 
 def _explained(white: WhitenedResidual, left: np.ndarray, row: int, basis: np.ndarray) -> float:

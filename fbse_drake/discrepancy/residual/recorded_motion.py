@@ -51,6 +51,8 @@ _SETTLING, _ROLLING = 0.1, 0.03
 # Blocks of fewer samples share much of what is sampled at their ends, or angles that their
 # velocities are differenced from: their noise is not that of neighbours that are independent.
 _SHARING = 3
+# By how many draws it is found what the steps of encoders may feign.
+_DRAWS = 16
 
 
 class RecordedMotion:
@@ -164,11 +166,15 @@ class RecordedMotion:
         """Signals without frequencies in which the log has little but noise of the joints'
         velocities: in a regressor it would be the noise of the residual, which is the same (errors
         in variables)."""
-        velocity = [
-            self.low_passed(v, corner)
-            for v, corner in zip(signals.joint_velocity.T, self._velocity_corners, strict=True)
+        return replace(signals, joint_velocity=self.without_noise(signals.joint_velocity))
+
+    def without_noise(self, values: np.ndarray) -> np.ndarray:
+        """Values of the joints (N, n) without frequencies in which their velocities are noise."""
+        smooth = [
+            self.low_passed(column, corner)
+            for column, corner in zip(values.T, self._velocity_corners, strict=True)
         ]
-        return replace(signals, joint_velocity=np.stack(velocity, axis=1))
+        return np.stack(smooth, axis=1)
 
     @cached_property
     def _velocity_corners(self) -> list[float]:
@@ -188,6 +194,27 @@ class RecordedMotion:
         else:
             deviation = np.full(velocity.shape[1], noise)
         return noise_corners(velocity, deviation**2, self.period, of_rates=of_rates)
+
+    @cached_property
+    def rounding_noise(self) -> np.ndarray:
+        """What rounding adds to the residual if the steps of the joints' encoders began elsewhere,
+        K draws, (K, B, R); none where velocities are not had from angles that come in steps."""
+        step = np.array([step_of(column) for column in self.log["joint/position"].T])
+        rounded, draws = step > 0, []
+        differenced = differences_angles(self.recording, self.log)
+        angle = self.without_noise(self.signals.joint_position)[:, rounded] / step[rounded]
+        random = np.random.default_rng(0)
+        known = self.equation.residual(self.steps)
+        for _ in range(_DRAWS if differenced and rounded.any() else 0):
+            moved = angle + random.random(angle.shape[1])
+            error = np.zeros(self.signals.joint_position.shape)
+            error[:, rounded] = (np.round(moved) - moved) * step[rounded]
+            error = self.low_passed(error, self.recording.cutoff)
+            rate = np.gradient(error, self.period, axis=0)
+            velocity = self.signals.joint_velocity + rate
+            noisier = self.steps_of(replace(self.signals, joint_velocity=velocity))
+            draws.append(block_means(self.equation.residual(noisier) - known, self.length))
+        return np.array(draws).reshape(len(draws), len(self.time), len(self.rows))
 
     @cached_property
     def time(self) -> np.ndarray:
