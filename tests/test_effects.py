@@ -22,24 +22,33 @@ def resolved(effect: JointTorqueEffect, joints: int = 12) -> ResolvedJointTorque
 
 
 @pytest.mark.parametrize(
-    ("gammas", "falls"),
+    ("gammas", "reached", "falls"),
     [
-        ((0.7, 100.0, 10.0, 0.6, 100.0, 0.9), True),
-        ((0.0, 100.0, 10.0, 0.6, 100.0, 0.9), False),
+        ((0.7, 100.0, 10.0, 0.6, 100.0, 0.9), 1.0, True),
+        ((0.0, 100.0, 10.0, 0.6, 100.0, 0.9), 1.0, False),
         # Rises from 1.6 to 2.7 Nm as it would fall.
-        ((1.6, 1000.0, 14.0, 2.7, 14.0, 1.0), False),
-        ((1.6, 1000.0, 14.0, 2.7, 1000.0, 1.0), True),
-        ((0.02, 1000.0, 14.0, 2.7, 1000.0, 1.0), False),
+        ((1.6, 1000.0, 14.0, 2.7, 14.0, 1.0), 1.0, False),
+        ((1.6, 1000.0, 14.0, 2.7, 1000.0, 1.0), 1.0, True),
+        ((0.02, 1000.0, 14.0, 2.7, 1000.0, 1.0), 1.0, False),
+        # What falls over all speeds alike is less viscous friction, of a joint that is no faster.
+        ((0.4, 600.0, 0.5, 1.2, 80.0, 1.0), 1.0, False),
+        ((0.4, 600.0, 0.5, 1.2, 80.0, 1.0), 6.0, True),
     ],
 )
 def test_friction_that_does_not_fall_with_speed_is_no_stribeck_friction(
-    gammas: tuple[float, ...], falls: bool
+    gammas: tuple[float, ...], reached: float, falls: bool
 ):
     values = {f"gamma{k}": value for k, value in enumerate(gammas, 1)}
-    assert StribeckFriction.is_itself(values) is falls
-    speed = np.linspace(0.0, 1.0, 20001)
+    assert StribeckFriction.is_itself(values, reached) is falls
+    speed = np.linspace(0.0, reached, 20001)
     one, two, three, four, five, _ = gammas
     law = one * (np.tanh(two * speed) - np.tanh(three * speed)) + four * np.tanh(five * speed)
+
+    def slope(amount: float, gamma: float) -> float:
+        return amount * gamma * (1.0 - np.tanh(gamma * reached) ** 2)
+
+    # But for the straight line that a viscous friction would be.
+    law -= (slope(one, two) - slope(one, three) + slope(four, five)) * speed
     assert (np.ptp(law[law.argmax() :]) > 0.05 * law[-1]) is np.bool_(falls)
 
 

@@ -215,13 +215,16 @@ class StribeckFriction(JointTorqueEffect):
     gamma6: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
-    def is_itself(values: Mapping[str, float]) -> bool:
-        """Does it fall with speed, viscous friction aside?"""
+    def is_itself(values: Mapping[str, float], reached: float) -> bool:
+        """Does it fall with speed, viscous friction aside? Of that is all that is a straight line
+        at the speed that was reached."""
+        gamma1, gamma4 = values["gamma1"], values["gamma4"]
         rises, falls, coulomb = (values[name] for name in ("gamma2", "gamma3", "gamma5"))
-        speed = np.geomspace(0.1 / max(rises, coulomb), 10.0 / min(falls, coulomb), 200)
-        friction = values["gamma1"] * (np.tanh(rises * speed) - np.tanh(falls * speed))
-        friction += values["gamma4"] * np.tanh(coulomb * speed)
-        return bool(friction.max() > (1.0 + _LEAST_FALL) * values["gamma4"])
+        speed = np.geomspace(min(0.1 / max(rises, coulomb), 0.1 * reached), reached, 200)
+        friction = gamma1 * (np.tanh(rises * speed) - np.tanh(falls * speed))
+        friction += gamma4 * np.tanh(coulomb * speed)
+        friction -= np.gradient(friction, speed)[-1] * speed
+        return bool(friction.max() > (1.0 + _LEAST_FALL) * friction[-1])
 
     @staticmethod
     def basis(

@@ -201,9 +201,9 @@ class JointTorqueEffect(Effect):
         return None
 
     @staticmethod
-    def is_itself(values: Mapping[str, float]) -> bool:  # noqa: ARG004
+    def is_itself(values: Mapping[str, float], reached: float) -> bool:  # noqa: ARG004
         """Is it with these values of its parameters what it is called, and not another shape of a
-        law that it contains?"""
+        law that it contains, up to the speed that a joint reached [rad/s] or [m/s]?"""
         return True
 
     @classmethod

@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, FALSE_ALARM, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import CATCHES_UP, Proposals
@@ -270,7 +271,7 @@ class Judge:
             not worse[rows].any()
             and self._stands_out(rest, whole, rows, _LEAST_OF_REST)
             and not _is_beyond_its_range(member)
-            and _is_itself(whole, member)
+            and _is_itself(fits.dictionary, whole, member)
             and self._is_all_of_it(rest, whole, member)
             and is_shown(fits, whole.as_fitted(member))
             and is_significant(fits, rest, fits.explain([*rest.candidates, member]), member)
@@ -458,10 +459,14 @@ def _is_beyond_its_range(member: Candidate) -> bool:
     )
 
 
-def _is_itself(whole: Explanation, member: Candidate) -> bool:
+def _is_itself(dictionary: Dictionary, whole: Explanation, member: Candidate) -> bool:
     """See `JointTorqueEffect.is_itself`."""
     effect = member.effect
-    return not issubclass(effect, JointTorqueEffect) or effect.is_itself(whole.values(member)[0])
+    if not issubclass(effect, JointTorqueEffect):
+        return True
+    joints = dictionary.predictor.joints_of(member.signature.rows)
+    reached = float(dictionary.speed[joints].max())
+    return effect.is_itself(whole.values(member)[0], reached)
 
 
 def _on_fewer_targets(

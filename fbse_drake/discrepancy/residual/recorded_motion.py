@@ -200,21 +200,18 @@ class RecordedMotion:
         """What rounding adds to the residual if the steps of the joints' encoders began elsewhere,
         K draws, (K, B, R); none where velocities are not had from angles that come in steps."""
         step = np.array([step_of(column) for column in self.log["joint/position"].T])
-        rounded, draws = step > 0, []
-        differenced = differences_angles(self.recording, self.log)
-        angle = self.without_noise(self.signals.joint_position)[:, rounded] / step[rounded]
-        random = np.random.default_rng(0)
-        known = self.equation.residual(self.steps)
-        for _ in range(_DRAWS if differenced and rounded.any() else 0):
-            moved = angle + random.random(angle.shape[1])
-            error = np.zeros(self.signals.joint_position.shape)
-            error[:, rounded] = (np.round(moved) - moved) * step[rounded]
-            error = self.low_passed(error, self.recording.cutoff)
-            rate = np.gradient(error, self.period, axis=0)
-            velocity = self.signals.joint_velocity + rate
+        if not step.any() or not differences_angles(self.recording, self.log):
+            return np.zeros((0, len(self.time), len(self.rows)))
+        angle, random = self.without_noise(self.signals.joint_position), np.random.default_rng(0)
+        counts = np.divide(angle, step, out=np.zeros_like(angle), where=step > 0)
+        value, draws = self.equation.residual(self.steps), []
+        for _ in range(_DRAWS):
+            moved = counts + random.random(len(step))
+            error = self.low_passed((np.round(moved) - moved) * step, self.recording.cutoff)
+            velocity = self.signals.joint_velocity + np.gradient(error, self.period, axis=0)
             noisier = self.steps_of(replace(self.signals, joint_velocity=velocity))
-            draws.append(block_means(self.equation.residual(noisier) - known, self.length))
-        return np.array(draws).reshape(len(draws), len(self.time), len(self.rows))
+            draws.append(block_means(self.equation.residual(noisier) - value, self.length))
+        return np.array(draws)
 
     @cached_property
     def time(self) -> np.ndarray:
