@@ -235,3 +235,25 @@ def test_a_gain_pays_for_no_noise_that_its_regressor_has_not() -> None:
     )
     assert found.targets == ("axis_4",)
     assert "TorqueGain" in {found.effect, *found.confusable_with}
+
+
+@pytest.mark.parametrize(("bits", "worst"), [(12, 1.5), (14, 0.5), (20, 0.1)])
+def test_the_load_of_a_joint_has_little_of_the_noise_of_the_residual(
+    bits: int, worst: float
+) -> None:
+    """What the links get is the command less what the residual shows, which by a coarse encoder is
+    many times the friction that is in it: that noise would be in the load."""
+    machine = replace(ARM, period=2e-3, duration=6.0, torque_noise=(0.01,) * 6)
+    course, step = machine.course(), 2 * np.pi / 2**bits
+    friction = np.array([20.0, 20.0, 10.0, 2.0, 2.0, 1.0]) * np.tanh(course.velocity / 0.05)
+    log = machine.log(course, course.torque + friction)
+    channels = {name: log[name] for name in ("time", "joint/torque_command")}
+    channels["joint/position"] = step * np.round(log["joint/position"] / step)
+    scenario = replace(machine.scenario, sensors=SensorsConfig())
+    load = Predictor(scenario, replace(log, channels=channels)).joint_motion.load
+    assert np.all(rms(load - course.torque) < worst * rms(friction))
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Of each column."""
+    return np.sqrt((values**2).mean(axis=0))

@@ -166,9 +166,11 @@ class Reading:
 
     def _loss_at(self, time: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
-        three blocks, (M, n)."""
+        three blocks, (M, n); without frequencies in which velocities are noise, which is that of
+        the residual."""
         loss = smoothed(self.motion.residual.value[:, : len(self.robot.joint_names)])
-        return np.stack([np.interp(time, self.motion.time, c) for c in loss.T], axis=1)
+        at = np.stack([np.interp(time, self.motion.time, c) for c in loss.T], axis=1)
+        return self.motion.without_noise(at)
 
 
 def is_read(effect: Effect | type[Effect], recording: RecordingConfig) -> bool:
