@@ -38,8 +38,6 @@ COMPLEXITY = 4.0
 _SYSTEMATIC = 0.5
 # Safety on what the noise in an effect's own columns may feign.
 _SPURIOUS = 3.0
-# What brings less than so many times what is required may be what rounded angles feign.
-DOUBTFUL = 5.0
 
 
 # Slopes with respect to nonlinear values are taken over this share of them.

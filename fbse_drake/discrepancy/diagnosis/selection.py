@@ -7,9 +7,10 @@ import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.dictionary import follows_torque
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
-from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, DOUBTFUL, MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import polished
+from fbse_drake.discrepancy.identification.rounding import DOUBTFUL
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.effects.joint_torque import JointTorqueEffect

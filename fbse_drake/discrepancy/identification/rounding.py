@@ -7,11 +7,13 @@ the angle or of the velocity. By how much is found from angles that are rounded 
 """
 
 import numpy as np
+from scipy.stats import gumbel_r
 
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 
-_EULER = 0.5772
+# What brings less than so many times what is required may be what rounded angles feign.
+DOUBTFUL = 5.0
 
 
 def noise_of_rounding(motion: RecordedMotion, white: WhitenedResidual) -> np.ndarray:
@@ -34,4 +36,4 @@ def chance_bound(largest: np.ndarray, probability: float) -> float:
     """What the largest of many exceeds with this probability only, by some draws of it, (K,), to
     which its distribution is fitted (E. J. Gumbel, "Statistics of Extremes", 1958)."""
     scale = np.sqrt(6.0) / np.pi * largest.std(ddof=1)
-    return float(largest.mean() - scale * (_EULER + np.log(-np.log1p(-probability))))
+    return float(gumbel_r.isf(probability, largest.mean() - np.euler_gamma * scale, scale))

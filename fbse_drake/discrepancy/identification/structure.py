@@ -8,7 +8,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.identification.rounding import chance_bound, noise_of_rounding
+from fbse_drake.discrepancy.identification.rounding import (
+    DOUBTFUL,
+    chance_bound,
+    noise_of_rounding,
+)
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 
 # Averages of a row from which on something is told of what is left in it; and from which on a test
@@ -25,8 +29,6 @@ _LOUD = 3.0
 # Drop of the held-out deviance at which a smooth function of several variables counts as found,
 # beside what is doubted about known laws.
 _DROP = 25.0
-# What is less than so many times that may be what rounded angles feign.
-_DOUBTFUL = 5.0
 # How many times as large as it was taken the doubt about known laws may be.
 _DOUBT = 3.0
 # Of which later averages what is left may tell something: not of the next one, with which noise is
@@ -88,7 +90,7 @@ def leftover_structure(
                 drop = _drop(white, left, k, everything)
                 if drop < _DROP + _DOUBT * white.doubt[k]:
                     continue
-                if drop < _DOUBTFUL * _DROP and drop < _feigned(motion, white, k, everything):
+                if drop < DOUBTFUL * _DROP and drop < _feigned(motion, white, k, everything):
                     continue
         excess = max(usual**2 - 1.0, 1e-3) * white.count[k]
         shares = {
