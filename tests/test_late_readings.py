@@ -11,7 +11,8 @@ from scipy.signal import lfilter
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.effects.actuation import TorqueReadingLag
+from fbse_drake.discrepancy.diagnosis.search import best_search
+from fbse_drake.effects.actuation import TorqueBias, TorqueReadingLag
 from fbse_drake.effects.effect import library
 from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.scenario import RecordingConfig
@@ -42,15 +43,24 @@ def diagnosis_of(seed: int, late: float, friction: float, *, by_clock: bool = Fa
     size = np.sqrt((course.torque**2).mean(axis=0))
     given = course.torque + friction * size * np.tanh(course.velocity / 0.02)
     if by_clock:
-        samples = round(late * 1e3)
-        read = np.concatenate([given[:1].repeat(samples, axis=0), given[: len(given) - samples]])
+        read = late_by_clock(replace(course, torque=given), late)
     else:
         kept = np.exp(-1e-3 / late) if late else 0.0
         read, _ = lfilter([1 - kept], [1, -kept], given, axis=0, zi=kept * given[:1])
-    every = slice(None, None, 4)
-    rare = Course(*(values[every] for values in vars(course).values()))
-    log = MACHINE.log(rare, read[every], seed)
+    log = MACHINE.log(rarely(course), read[::4], seed)
     return diagnose(MACHINE.predictor(log), [library()[name] for name in TRIED])
+
+
+def late_by_clock(course: Course, late: float) -> np.ndarray:
+    """The torques of a course, at 1 kHz, as a clock that is late [s] has them."""
+    samples = round(late * 1e3)
+    first = course.torque[:1].repeat(samples, axis=0)
+    return np.concatenate([first, course.torque[: len(course.torque) - samples]])
+
+
+def rarely(course: Course) -> Course:
+    """As it is recorded, at 250 Hz."""
+    return Course(*(values[::4] for values in vars(course).values()))
 
 
 def found(diagnosis: Diagnosis) -> dict[str, set[str]]:
@@ -88,9 +98,8 @@ def test_a_model_that_knows_of_late_torques_reads_them_in_time():
     """Friction that jumps leaves noise when both are in the model."""
     course, late, size = course_of(2), 0.004, 30.0 * np.array(MACHINE.torque_noise)
     given = course.torque + size * np.tanh(course.velocity / 0.005)
-    read = np.concatenate([given[:1].repeat(4, axis=0), given[:-4]])
-    rare = Course(*(values[::4] for values in vars(course).values()))
-    log = MACHINE.log(rare, read[::4], 2)
+    read = late_by_clock(replace(course, torque=given), late)
+    log = MACHINE.log(rarely(course), read[::4], 2)
     friction = CoulombFriction(coulomb=MACHINE.by_joint(tuple(size)), transition={"all": 0.005})
     errors = []
     for effects in (
@@ -102,6 +111,31 @@ def test_a_model_that_knows_of_late_torques_reads_them_in_time():
         errors.append(np.sqrt((residual.value**2).mean(axis=0)) / residual.noise_floor)
     assert (errors[0] > 2.0).all()
     assert (errors[1] < 1.1).all()
+
+
+def test_what_is_late_in_one_joint_is_read_in_time_in_all_that_are():
+    """Though it is small beside that joint's torque, for it carries a load."""
+    course, late, load = course_of(3), 0.004, 350.0
+    read = course.torque.copy()
+    read[:, :2] = late_by_clock(course, late)[:, :2] + [load, 0.0]
+    carrying = TorqueBias(bias={"axis_1": load})
+    model = replace(MACHINE.scenario.model, effects={"load": carrying})
+    log = MACHINE.log(rarely(course), read[::4], 3)
+    predictor = Predictor(replace(MACHINE.scenario, model=model), log)
+    effects = [library()[name] for name in ("CoulombFriction", "TorqueReadingLag")]
+    best = best_search(Dictionary(predictor, effects), effects)
+    assert best.late is not None
+    read_earlier = best.late.effect.time_constant
+    assert read_earlier == {
+        "axis_1": pytest.approx(late, rel=0.15),
+        "axis_2": pytest.approx(late, rel=0.15),
+    }
+    assert best.search.error < 1.0
+    small, matters = diagnose(predictor, effects).ranking
+    assert (small.effect, small.targets) == ("TorqueReadingLag", ("axis_1",))
+    assert (matters.effect, matters.targets) == ("TorqueReadingLag", ("axis_2",))
+    assert (small.too_small, small.chosen) == (True, False)
+    assert (matters.too_small, matters.chosen) == (False, True)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])

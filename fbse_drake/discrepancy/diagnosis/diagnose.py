@@ -388,9 +388,11 @@ def _late_findings(late: LateTorques) -> list[Finding]:
         member: fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
     }
+    tolerance = fits.dictionary.predictor.scenario.identify.tolerance
+    matters = [member for member, share in late.members.items() if not share < tolerance]
     return [
-        replace(finding, share=late.members[member])
-        for member, finding in _members(fits, final, without, late.equal, late.members)
+        replace(finding, too_small=member not in matters, share=late.members[member])
+        for member, finding in _members(fits, final, without, late.equal, matters)
         if member in late.members
     ]
 
