@@ -259,16 +259,18 @@ def test_angles_that_are_differenced_have_the_noise_of_their_steps(bits: int) ->
     np.testing.assert_allclose(spread, 1.0, atol=0.3)
 
 
-def left_in_a_row(white: float, wave: float, seed: int, sensors: float = 1.0) -> Residual:
-    """Noise as of differenced velocities, of a variance beside the believed 1, with white noise and
-    a wave beside."""
+def left_in_a_row(
+    white: float, wave: float, seed: int, sensors: float = 1.0, believed: float = 0.0
+) -> Residual:
+    """Noise as of differenced velocities, of a variance beside the believed 1, with white noise, of
+    which so much is believed, and a wave beside."""
     residual, random = arm(0.0)[0].motion.residual, np.random.default_rng(seed)
     blocks = len(residual.time)
     steps = np.sqrt(0.5 * sensors) * np.diff(random.standard_normal(blocks + 1))
     value = np.zeros_like(residual.value)
     value[:, 0] = steps + np.sqrt(white) * random.standard_normal(blocks)
     value[:, 0] += wave * np.sin(0.7 * np.arange(blocks))
-    variance, covariance = np.ones_like(value), np.full_like(value, -0.5)
+    variance, covariance = np.full_like(value, 1.0 + believed), np.full_like(value, -0.5)
     return replace(residual, value=value, variance=variance, covariance=covariance)
 
 
@@ -297,6 +299,18 @@ def test_sensors_may_be_less_noisy_than_they_look() -> None:
     assert len(white) == 10
     assert np.mean(white) == pytest.approx(0.05, rel=0.1)
     assert np.mean(sensors) == pytest.approx(0.4, rel=0.05)
+
+
+def test_white_noise_is_found_behind_sensors_that_are_less_noisy_than_believed() -> None:
+    """In all there is no more noise than is believed: only what is slow is more."""
+    left = [left_in_a_row(0.15, 0.0, seed, 0.4, believed=0.05) for seed in range(10)]
+    assert all((WhitenedResidual(row).y[:, 0] ** 2).mean() < 1.0 for row in left)
+    found = [likeliest_noise(row, 5, [0]) for row in left]
+    white = [noise.white[0] / 5 + 0.05 * noise.sensors[0] for noise in found if noise is not None]
+    assert len(white) == 10
+    assert np.mean(white) == pytest.approx(0.15, rel=0.1)
+    quieter = [left_in_a_row(0.02, 0.0, seed, 0.4, believed=0.05) for seed in range(10)]
+    assert [likeliest_noise(row, 5, [0]) for row in quieter] == [None] * 10
 
 
 def test_noise_that_is_found_twice_adds_up() -> None:

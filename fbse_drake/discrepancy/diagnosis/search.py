@@ -3,7 +3,7 @@
 They are begun anew for what is learned of the log on the way.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
@@ -28,6 +28,7 @@ from fbse_drake.discrepancy.identification.inertial import IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import (
     Structure,
+    is_white,
     leftover_structure,
     noisy_rows,
     tolerated,
@@ -85,7 +86,8 @@ class LateTorques:
 
     fits: Fits
     explanation: Explanation
-    # With their sizes, and by place of a member rivals that explain as much.
+    # With their sizes, also where they are too small to matter: left unread, what they leave there
+    # would be explained by something else. By place of a member rivals that explain as much.
     members: Mapping[Candidate, float]
     equal: Mapping[int, Sequence[Explanation]]
 
@@ -126,15 +128,14 @@ class LateTorques:
 
 
 def _late_torques(search: Search) -> LateTorques | None:
-    """What a search found to come late, as far as it matters."""
+    """What a search found to come late, if it matters in any joint."""
     fits, final = search.proposals.fits, search.path[-1]
     significance = fits.dictionary.significance
     tolerance = fits.dictionary.predictor.scenario.identify.tolerance
-    shares = {
+    members = {
         c: significance.share(final, c) for c in final.candidates if c.effect is TorqueReadingLag
     }
-    members = {c: share for c, share in shares.items() if not share < tolerance}
-    if search.partial is not None or not members:
+    if search.partial is not None or all(share < tolerance for share in members.values()):
         return None
     return LateTorques(fits, final, members, indistinguishable(fits, search.alternatives, final))
 
@@ -285,17 +286,19 @@ def _raise_if_noise_alone(fits: Fits, explanation: Explanation) -> None:
     predictor, white, left = fits.dictionary.predictor, fits.white, fits.leftover(explanation)
     motion = predictor.motion
 
-    def noise_of(rows: Sequence[int]) -> Noise | None:
-        telling = [row for row in rows if white.count[row] >= _TELLING]
-        return _more_noise(predictor, white, left, telling)
+    telling = np.flatnonzero(white.count >= _TELLING).tolist()
+
+    def noise_of(rows: Collection[int]) -> Noise | None:
+        return _more_noise(predictor, white, left, [row for row in telling if row in rows])
 
     size = np.sqrt((left**2).sum(axis=0) / np.maximum(white.count, 1))
-    known = np.flatnonzero(white.count).tolist()
+    louder = {row for row in telling if size[row] > tolerated(white, row)}
+    correlated = {row for row in telling if not is_white(left[:, row], int(white.count[row]))}
     # Mostly there is more than noise, which is found out sooner than what it lives in.
-    if noise_of([row for row in known if size[row] > tolerated(white, row)]) is None:
+    if noise_of(louder | correlated) is None:
         return
-    noise = noise_of([structure.index for structure in leftover_structure(motion, white, left)])
-    if noise is None:
+    living = {structure.index for structure in leftover_structure(motion, white, left)}
+    if (noise := noise_of(living | correlated)) is None:
         return
     # What is small beside the noise may live in something all the same.
     noisier = WhitenedResidual(

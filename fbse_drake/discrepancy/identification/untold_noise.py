@@ -26,7 +26,7 @@ _ROUNDING = 1e-18
 def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noise | None:
     """Noise of rows in which nothing but noise is left, by maximum likelihood: how many times there
     is that of the sensors, and how much white noise beside; None if none of these rows has more
-    than is believed, or what is left is not such noise.
+    than is believed, in all or of what is slow, or what is left is not such noise.
 
     Args:
         length: of a block [steps].
@@ -36,10 +36,11 @@ def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noi
     least = chi2.isf(_FALSE_ALARM / max(1, len(rows)), 2)
     for row in rows:
         left = _Left.of(residual, row)
-        louder = np.sqrt((left.whitened(1.0, 0.0) ** 2).mean())
+        more, beside = left.likeliest()
+        # Of sensors that are believed to be noisier than they are, torques that are hide behind it.
+        louder = max(left.loudness, left.slow_factor(more, beside))
         if louder <= 1.0:
             continue
-        more, beside = left.likeliest()
         gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
         if gained > least and left.is_noise(more, beside):
             sensors[row], white[row], factor[row] = more, beside * length, louder
@@ -70,6 +71,16 @@ class _Left:
 
     def whitened(self, more: float, beside: float) -> np.ndarray:
         return solve_banded((1, 0), self._factor(more, beside), self.value)
+
+    @property
+    def loudness(self) -> float:
+        """Root mean square, in multiples of the noise as it is believed."""
+        return float(np.sqrt((self.whitened(1.0, 0.0) ** 2).mean()))
+
+    def slow_factor(self, more: float, beside: float) -> float:
+        """How many times as large as it is believed that noise is in averages over a long time."""
+        believed = float((self.variance + 2 * self.covariance).mean())
+        return float(np.sqrt(more + beside / max(believed, _ROUNDING)))
 
     def is_noise(self, more: float, beside: float) -> bool:
         """Is nothing but that noise left?"""
