@@ -6,12 +6,11 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
-from pydrake.math import RotationMatrix
-from scipy.ndimage import shift
-from scipy.spatial.transform import Rotation
 
-from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read, smoothed
-from fbse_drake.discrepancy.identification.inertial import inertia_addition, inertial_regressor
+from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read
+from fbse_drake.discrepancy.diagnosis.regressors import Regressors, noisier_signals
+from fbse_drake.discrepancy.diagnosis.standing_soles import StandingSoles
+from fbse_drake.discrepancy.identification.inertial import inertia_addition
 from fbse_drake.discrepancy.identification.regression import Signature
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.equation_of_motion import (
@@ -19,19 +18,14 @@ from fbse_drake.discrepancy.residual.equation_of_motion import (
     joint_velocity_noise,
 )
 from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
-from fbse_drake.discrepancy.residual.recorded_signals import Instants, averaged, within_steps
+from fbse_drake.discrepancy.residual.recorded_signals import within_steps
 from fbse_drake.discrepancy.residual.recorded_velocity import velocity_error
-from fbse_drake.discrepancy.residual.residual import Residual, rms
-from fbse_drake.discrepancy.residual.rows import foot_pairs
+from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import (
     ContactEffect,
-    FootCreep,
     GroundCompliance,
     GroundSlope,
-    PadContact,
-    pad_contact,
-    spring_force,
 )
 from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.geometry import GeometryEffect
@@ -43,12 +37,10 @@ from fbse_drake.effects.joint_torque import (
     basis_over_time,
     deflection_over_time,
 )
-from fbse_drake.effects.sensor import SensorEffect, SensorSignals
+from fbse_drake.effects.sensor import SensorEffect
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
-from fbse_drake.robot.plant import gravity_on_slope
 from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
-from fbse_drake.sensors.foot_force import force_noise
 
 # What is uncertain about the velocity at which a law holds, as a multiple of the velocity's change
 # within the step, squared.
@@ -99,7 +91,6 @@ class Predictor:
         ]
         self._given_noise, self._more_noise = noise, more_noise
         self._memories: dict[tuple[type[SensorEffect], bytes], np.ndarray] = {}
-        self._regressors: dict[tuple[str, bool], np.ndarray] = {}
         self._motions_of_joint: dict[tuple[int, int, bool], JointMotion] = {}
 
     def of(self, scenario: Scenario) -> "Predictor":
@@ -181,13 +172,21 @@ class Predictor:
             if not is_read(known.effect, self.motion.recording):
                 residual = residual.minus(self.predict(known))
         if self.robot.has_floating_base:
-            residual = residual.minus(self._on_slope(self._believed_slope))
-            residual = residual.minus(self.ground_gives_way())
-            residual = replace(
-                residual,
-                variance=residual.variance + self.sinking_variance / self._contact.stiffness**2,
-            )
+            residual = residual.minus(self._soles.on_slope(self._believed_slope))
+            residual = residual.minus(self._soles.on_believed_ground())
+            sinking = self._soles.sinking_variance / self._soles.contact.stiffness**2
+            residual = replace(residual, variance=residual.variance + sinking)
         return self.doubted(residual, self._known)
+
+    @cached_property
+    def _soles(self) -> StandingSoles:
+        return StandingSoles(self.motion, self.scenario)
+
+    @cached_property
+    def _believed_slope(self) -> np.ndarray:
+        """Of the model's ground, (2,) [rad], see `Ground.slope`."""
+        known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
+        return np.sum([self.scenario.ground.slope, *known], axis=0)
 
     def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
         """A residual that is less certain because effects were taken off it.
@@ -204,36 +203,9 @@ class Predictor:
             float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance
         )
         if softer:
-            nominal = 1.0 / self._contact.stiffness
-            doubt += ((nominal + softer) ** 2 - nominal**2) * self.sinking_variance
+            nominal = 1.0 / self._soles.contact.stiffness
+            doubt += ((nominal + softer) ** 2 - nominal**2) * self._soles.sinking_variance
         return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
-
-    @cached_property
-    def sinking_variance(self) -> np.ndarray:
-        """What the noise of the force sensors puts into the predicted sinking of the soles, per
-        unit of compliance squared, (R,).
-
-        Of a noise that is added to the measured forces once more. A robot that does not stand has
-        no soles that sink.
-        """
-        if not self.robot.has_floating_base:
-            return np.zeros(self.rows)
-        force = self.motion.signals.pad_force
-        noise = force_noise(
-            self.motion.sensors_by_row.foot_force, self.robot, len(force), np.random.default_rng(0)
-        )
-        motions = [
-            [
-                GroundCompliance.sole_motion(f, pads, self._sample_time)
-                for f, pads in self._split_feet(forces)
-            ]
-            for forces in (force, force + noise)
-        ]
-        clean, noisy = (
-            self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both])
-            for both in motions
-        )
-        return np.nan_to_num(rms(noisy - clean, self.motion.known) ** 2)
 
     def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
         """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
@@ -325,7 +297,7 @@ class Predictor:
     @cached_property
     def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
         """The same if the sensors' noise were in it once more."""
-        noisier = self.reading.joint_motion_of(self._noisier_signals)
+        noisier = self.reading.joint_motion_of(self._noisier_regressors.signals)
         return cache(partial(_joined, self.motion.recording, self._loaded(noisier)))
 
     def _loaded(self, motion: JointMotion) -> JointMotion:
@@ -467,7 +439,7 @@ class Predictor:
             values = np.repeat(nonlinear[:, None], len(rows), axis=1)
             return Signature(rows, np.moveaxis(self.joint_columns(effect, values, rows), 0, 2))
         if issubclass(effect, ContactEffect):
-            values = self._contact_columns(effect)
+            values = self._soles.columns(effect)
         else:
             point = self._expansion_point(effect, target)
             if point is not None:
@@ -491,112 +463,24 @@ class Predictor:
         return np.stack(columns, axis=2)
 
     @cached_property
-    def _smooth_blocks(self) -> Instants:
-        """Averages at which derivatives are taken."""
-        return self._smoothed(self.motion.quiet_blocks)
-
-    def _smooth_blocks_of(self, signals: SensorSignals) -> Instants:
-        """The same of other signals."""
-        return self._smoothed(self.motion.quiet_blocks_of(signals))
-
-    def _smoothed(self, blocks: Instants) -> Instants:
-        """Averages with accelerations that are smoothed further, for their noise is in the residual
-        too. Not those of a recording that is low-passed: little noise is left in them, and
-        smoothing would take motion."""
-        if self.motion.recording.cutoff > 0:
-            return blocks
-        smooth = {
-            name: smoothed(getattr(blocks, name))
-            for name in ("joint_acceleration", "angular_acceleration")
-        }
-        return replace(blocks, **smooth)
+    def _regressors(self) -> Regressors:
+        return Regressors(self.motion, self.motion.signals)
 
     @cached_property
-    def _residual_at_blocks(self) -> np.ndarray:
-        return self.motion.equation.residual(self._smooth_blocks)
-
-    def _but_for_noise(self, blocks: Instants) -> Instants:
-        """Averages with accelerations from which only noise is taken: of what smoothing takes off,
-        the share is left that noise does not explain, by joint and axis (N. Wiener,
-        "Extrapolation, Interpolation, and Smoothing of Stationary Time Series", 1949).
-
-        Smoothing would make an impact smaller, and a place larger that is told by impacts.
-        """
-        smoothed, motion, sensors = self._smoothed(blocks), self.motion, self.motion.sensors
-        noise = {
-            "joint_acceleration": joint_velocity_noise(sensors),
-            "angular_acceleration": sensors.imu.angular_velocity_noise,
-        }
-        result = {}
-        for name, deviation in noise.items():
-            smooth = getattr(smoothed, name)
-            rough = getattr(blocks, name) - smooth
-            # Velocities at both ends of three blocks count 1, -3, 3 and -1 quarters.
-            noisy = 1.25 * (deviation / (motion.length * motion.period)) ** 2
-            power = np.maximum(np.mean(rough**2, axis=0), noisy)
-            share = np.divide(noisy, power, out=np.zeros_like(power), where=power > 0)
-            result[name] = smooth + rough * (1.0 - share)
-        return replace(blocks, **result)
-
-    @cached_property
-    def _with_little_noise(self) -> tuple[Instants, np.ndarray]:
-        """Averages but for noise, and their residual."""
-        blocks = self._but_for_noise(self.motion.blocks)
-        return blocks, self.motion.equation.residual(blocks)
-
-    @cached_property
-    def _with_little_more_noise(self) -> tuple[Instants, np.ndarray]:
+    def _noisier_regressors(self) -> Regressors:
         """The same if the sensors' noise were in the signals once more."""
-        blocks = self._but_for_noise(self._noisier_blocks)
-        return blocks, self.motion.equation.residual(blocks)
+        return Regressors(self.motion, noisier_signals(self.motion, self.noise))
 
-    @cached_property
-    def _noisier_signals(self) -> SensorSignals:
-        """The signals if the sensors' noise were in them once more."""
-        motion, random = self.motion, np.random.default_rng(0)
-        sensors = motion.sensors_by_row
-        noise = {
-            "joint_velocity": joint_velocity_noise(sensors),
-            "specific_force": sensors.imu.acceleration_noise,
-            "angular_velocity": sensors.imu.angular_velocity_noise,
-        }
-        more = {name: getattr(motion.signals, name) for name in noise}
-        added = {
-            name: values + noise[name] * random.standard_normal(values.shape)
-            for name, values in more.items()
-        }
-        noisy_force = motion.signals.pad_force + force_noise(
-            sensors.foot_force, self.robot, len(motion.signals.pad_force), random
-        )
-        torque = motion.signals.torque_command
-        deviation = np.sqrt(motion.torque_variance(torque) + self.noise.white[: torque.shape[1]])
-        noisy_torque = torque + deviation * random.standard_normal(torque.shape)
-        return replace(motion.signals, pad_force=noisy_force, torque_command=noisy_torque, **added)
-
-    @cached_property
-    def _noisier_blocks(self) -> Instants:
-        return averaged(self.motion.steps_of(self._noisier_signals), self.motion.length)
-
-    @cached_property
+    @property
     def noise_realization(self) -> np.ndarray:
         """What that noise adds to the residual, (B, R)."""
-        return self.motion.equation.residual(self._noisier_blocks) - self.motion.equation.residual(
-            self.motion.blocks
-        )
+        return self._noisier_regressors.residual - self._regressors.residual
 
     def _expansion_point(self, effect: type[Effect], target: str) -> np.ndarray | None:
         """Values about which the signature of an effect is taken first, (p,); None for zeros."""
         if not issubclass(effect, InertiaEffect) or effect.acts_on != "body":
             return None
         return effect.expansion_point(self.robot.body(target))
-
-    @cached_property
-    def _noisier_residual_at_blocks(self) -> np.ndarray:
-        return self.motion.equation.residual(self._noisier_smooth_blocks)
-
-    @cached_property
-    def _noisier_smooth_blocks(self) -> Instants:
-        return self._smooth_blocks_of(self._noisier_signals)
 
     def noise_in(
         self,
@@ -640,15 +524,10 @@ class Predictor:
 
     def _inertia_addition(self, effect: InertiaEffect, *, noisier: bool = False) -> np.ndarray:
         """What an inertia effect adds to the residual, (B, R)."""
-        blocks = self._noisier_smooth_blocks if noisier else self._smooth_blocks
-
-        def regressor(body: str) -> np.ndarray:
-            key = (body, noisier)
-            if key not in self._regressors:
-                self._regressors[key] = inertial_regressor(self.motion.equation, blocks, body)
-            return self._regressors[key]
-
-        added = inertia_addition(self.motion.equation, blocks, effect, regressor)
+        regressors = self._noisier_regressors if noisier else self._regressors
+        added = inertia_addition(
+            self.motion.equation, regressors.smooth_blocks, effect, regressors.of_body
+        )
         return np.pad(added, ((0, 0), (0, self.rows - added.shape[1])))
 
     def signature_near(
@@ -727,20 +606,19 @@ class Predictor:
             return self._inertia_addition(changed, noisier=noisier)
         if issubclass(effect, GroundSlope):
             here = self._believed_slope
-            return self._on_slope(here + linear) - self._on_slope(here)
+            return self._soles.on_slope(here + linear) - self._soles.on_slope(here)
+        regressors = self._noisier_regressors if noisier else self._regressors
         if issubclass(effect, GeometryEffect):
-            blocks, before = self._with_little_more_noise if noisier else self._with_little_noise
-            return before - self._with(changed).residual(blocks)
+            return regressors.impact_residual - self._with(changed).residual(
+                regressors.impact_blocks
+            )
         # By taking the effect off the signals.
-        motion, resolved = self.motion, changed.resolve(self.robot.description)
-        if noisier:
-            read, before = self._noisier_signals, self._noisier_residual_at_blocks
-            memory = self.reading.remembered(resolved, read)
-        else:
-            read, before = motion.signals, self._residual_at_blocks
-            memory = self._memory(effect, resolved)
+        resolved, read = changed.resolve(self.robot.description), regressors.signals
+        memory = (
+            self.reading.remembered(resolved, read) if noisier else self._memory(effect, resolved)
+        )
         signals = self.reading.undone(resolved, memory, read)
-        return before - motion.equation.residual(self._smooth_blocks_of(signals))
+        return regressors.smooth_residual - Regressors(self.motion, signals).smooth_residual
 
     def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone,
@@ -749,162 +627,6 @@ class Predictor:
         if key not in self._memories:
             self._memories[key] = self.reading.remembered(resolved)
         return self._memories[key]
-
-    def _contact_columns(self, effect: type[ContactEffect]) -> np.ndarray:
-        """By the motion of the standing soles that the effect predicts, (B, R, p)."""
-        if not self.robot.has_floating_base:
-            return np.zeros((len(self.motion.time), self.rows, len(effect.parameters)))
-        motions = [
-            effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces
-        ]
-        return np.moveaxis(
-            np.array(
-                [
-                    self._sole_rows([(r[k], d[k]) for r, d in motions])
-                    for k in range(len(motions[0][0]))
-                ]
-            ),
-            0,
-            2,
-        )
-
-    @cached_property
-    def _sample_time(self) -> np.ndarray:
-        return (
-            self.motion.start
-            + np.arange(len(self.motion.signals.joint_position)) * self.motion.period
-        )
-
-    @cached_property
-    def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        return self._split_feet(self.motion.signals.pad_force)
-
-    def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Force (N, P, 3) on the pads of each foot, of which the normal component is their springs'
-        share, and places (P, 3) of these; in the axes of its contact, see `_contact_rotations`."""
-        pads, force = self.motion.equation.pads, pad_force.copy()
-        for foot, R_LF in self._point_feet.items():
-            of_foot = pads.foot == foot
-            force[:, of_foot] = np.einsum("nij,npj->npi", R_LF, force[:, of_foot])
-        force[:, :, 2] = spring_force(force[:, :, 2], self._contact, self.motion.period)
-        return list(zip(pads.split(force), pads.split(pads.position), strict=True))
-
-    def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Kinematic rows for soles that move like this.
-
-        Args:
-            motions: rotation vector and displacement of each sole against level, still ground, in
-                the axes of its contact, (N, 3) each.
-        """
-        motion, length, period = self.motion, self.motion.length, self.motion.period
-        result = np.zeros((len(motion.time), self.rows))
-        # A force that is the mean over some time before its row tells of a sole in that time, a
-        # sampled one of that instant; where that is in a step of the residual, and the motion's
-        # rate there.
-        reading, step = (t / period for t in (motion.timing.reading, motion.timing.integration))
-        posture, rate = 0.5 + 0.5 * reading - step, 0.5 * reading - 1.5 * step
-        place = next(k for k, row in enumerate(motion.rows) if row.kind == "kinematic")
-        velocities = []
-        for rotation, displacement in motions:
-            turning, moving = (
-                np.diff(values, axis=0, append=values[-1:]) / period
-                for values in (rotation, displacement)
-            )
-            g = self.motion.equation.gravity
-            # R_WF^T g z for a sole turned by the rotation vector, less g z.
-            tilt = g * np.stack([-rotation[:, 1], rotation[:, 0], 0 * rotation[:, 0]], axis=1)
-            change = _later(moving, posture) - _later(moving, posture - 1)
-            result[:, place : place + 3] = block_means(_later(turning, rate)[:-1], length)
-            result[:, place + 3 : place + 6] = block_means(
-                (_later(tilt, posture) + change / period)[:-1], length
-            )
-            velocities.append(block_means(_later(moving, rate)[:-1], length))
-            place += 6
-        moving = [
-            np.einsum("bij,bj->bi", R_BC, v)
-            for R_BC, v in zip(self._contact_rotations, velocities, strict=True)
-        ]
-        for one, other in foot_pairs(self.robot):
-            result[:, place : place + 3] = moving[one] - moving[other]
-            place += 3
-        return result
-
-    @cached_property
-    def _contact_rotations(self) -> list[np.ndarray]:
-        """Axes of each foot's contact in every block, (B, 3, 3), in base axes: those of its sole;
-        of a point foot, which stands at any angle, level ones."""
-        rotations = self.motion.equation.sole_rotations(self.motion.blocks.joint_position)
-        for foot in self._point_feet:
-            rotations[foot] = np.broadcast_to(self._level, rotations[foot].shape)
-        return rotations
-
-    @cached_property
-    def _point_feet(self) -> dict[int, np.ndarray]:
-        """R_LF of every point foot in level axes L, (N, 3, 3)."""
-        points = [k for k, leg in enumerate(self.robot.description.legs.values()) if leg.is_point]
-        if not points:
-            return {}
-        equation = self.motion.equation
-        rotations = equation.sole_rotations(self.motion.signals.joint_position)
-        return {foot: self._level.T @ rotations[foot] for foot in points}
-
-    @cached_property
-    def _level(self) -> np.ndarray:
-        """R_BL of axes whose z is up in the mean over the log; a base without tilt has them
-        itself."""
-        motion = self.motion
-        up = motion.equation.R_BI @ motion.signals.specific_force.mean(axis=0)
-        return RotationMatrix.MakeFromOneVector(up, 2).matrix()
-
-    @cached_property
-    def _contact(self) -> PadContact:
-        return pad_contact(
-            self.scenario.believed.description, self.scenario.ground, self.scenario.plant
-        )
-
-    @cached_property
-    def _believed_slope(self) -> np.ndarray:
-        """Of the model's ground, (2,) [rad], see `Ground.slope`."""
-        known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
-        return np.sum([self.scenario.ground.slope, *known], axis=0)
-
-    @cached_property
-    def _headings(self) -> np.ndarray:
-        """Angle about the vertical by which each sole is turned from where the base headed when the
-        log began, (B, feet) [rad]; by the gyro, and the vertical of a base that does not tilt."""
-        equation, blocks, up = self.motion.equation, self.motion.blocks, self._level[:, 2]
-        rate = blocks.angular_velocity @ equation.R_BI.T @ up
-        turned = (np.cumsum(rate) - 0.5 * rate) * self.motion.length * self.motion.period
-        ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
-        headings = [
-            np.arctan2(R_BF[:, :, 0] @ np.cross(up, ahead), R_BF[:, :, 0] @ ahead)
-            for R_BF in equation.sole_rotations(blocks.joint_position)
-        ]
-        return turned[:, None] + np.stack(headings, axis=1)
-
-    def _on_slope(self, slope: np.ndarray) -> np.ndarray:
-        """What standing soles read beyond what they do on level ground, (B, R).
-
-        Args:
-            slope: see `Ground.slope`, (2,) [rad].
-        """
-        result = np.zeros((len(self.motion.time), self.rows))
-        if not self.robot.has_floating_base or not slope.any():
-            return result
-        up = np.array([0.0, 0.0, self.motion.equation.gravity])
-        more = gravity_on_slope(up, slope.tolist()) - up
-        place = next(k for k, row in enumerate(self.motion.rows) if row.kind == "kinematic")
-        for heading in self._headings.T:
-            R_FW = Rotation.from_euler("z", -heading[:, None])
-            result[:, place + 3 : place + 6] = R_FW.apply(more)
-            place += 6
-        return result
-
-    def ground_gives_way(self) -> np.ndarray:
-        """What the model's own ground adds: it gives way a little under the soles and lets them
-        creep, (B, R)."""
-        sinking = self._contact_columns(GroundCompliance)[:, :, 0] / self._contact.stiffness
-        return sinking + self._contact.creep * self._contact_columns(FootCreep)[:, :, 0]
 
 
 def _joined(recording: RecordingConfig, motion: JointMotion, steps: int) -> JointMotion:
@@ -922,11 +644,6 @@ def _in_steps(recording: RecordingConfig, values: np.ndarray) -> np.ndarray:
     """Values (N - 1, ...) of every step: those of samples (N, ...) are averaged between neighbours,
     as torques that are sampled."""
     return within_steps(values, 0.5) if recording.is_sampled else values
-
-
-def _later(values: np.ndarray, samples: float) -> np.ndarray:
-    """Samples (N, 3) so much later, interpolated; the ends are held."""
-    return shift(values, (-samples, 0), order=1, mode="nearest")
 
 
 def _without_rounding(values: np.ndarray) -> np.ndarray:

@@ -1,0 +1,218 @@
+"""What soles that stand read of the ground: that it gives way, lets them creep, and slopes.
+
+The rows of a residual that soles have to do with are those of their own motion, and of that
+between them; see `fbse_drake.discrepancy.residual.rows`.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from pydrake.math import RotationMatrix
+from scipy.ndimage import shift
+from scipy.spatial.transform import Rotation
+
+from fbse_drake.discrepancy.residual.blocks import block_means
+from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
+from fbse_drake.discrepancy.residual.residual import rms
+from fbse_drake.discrepancy.residual.rows import foot_pairs
+from fbse_drake.effects.contact import (
+    ContactEffect,
+    FootCreep,
+    GroundCompliance,
+    PadContact,
+    pad_contact,
+    spring_force,
+)
+from fbse_drake.robot.plant import gravity_on_slope
+from fbse_drake.scenario import Scenario
+from fbse_drake.sensors.foot_force import force_noise
+
+
+class StandingSoles:
+    """The feet of a robot over one log, on the ground that a scenario believes in."""
+
+    def __init__(self, motion: RecordedMotion, scenario: Scenario):
+        self._motion, self._scenario, self._robot = motion, scenario, motion.robot
+        # Blocks and rows of the residual.
+        self._shape = len(motion.time), len(motion.rows)
+
+    def columns(self, effect: type[ContactEffect]) -> np.ndarray:
+        """What an effect adds to the residual per unit of each of its parameters, by the motion of
+        the standing soles that it predicts, (B, R, p)."""
+        if not self._robot.has_floating_base:
+            return np.zeros((*self._shape, len(effect.parameters)))
+        motions = [
+            effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces
+        ]
+        columns = [
+            self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))
+        ]
+        return np.stack(columns, axis=2)
+
+    @cached_property
+    def _sample_time(self) -> np.ndarray:
+        samples = np.arange(len(self._motion.signals.joint_position))
+        return self._motion.start + samples * self._motion.period
+
+    @cached_property
+    def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return self._split_feet(self._motion.signals.pad_force)
+
+    def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Force (N, P, 3) on the pads of each foot, of which the normal component is their springs'
+        share, and places (P, 3) of these; in the axes of its contact, see `_contact_rotations`."""
+        pads, force = self._motion.equation.pads, pad_force.copy()
+        for foot, R_LF in self._point_feet.items():
+            of_foot = pads.foot == foot
+            force[:, of_foot] = np.einsum("nij,npj->npi", R_LF, force[:, of_foot])
+        force[:, :, 2] = spring_force(force[:, :, 2], self.contact, self._motion.period)
+        return list(zip(pads.split(force), pads.split(pads.position), strict=True))
+
+    def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Kinematic rows for soles that move like this.
+
+        Args:
+            motions: rotation vector and displacement of each sole against level, still ground, in
+                the axes of its contact, (N, 3) each.
+        """
+        motion, gravity = self._motion, self._motion.equation.gravity
+        length, period = motion.length, motion.period
+        result = np.zeros(self._shape)
+        # A force that is the mean over some time before its row tells of a sole in that time, a
+        # sampled one of that instant; where that is in a step of the residual, and the motion's
+        # rate there.
+        reading, step = (t / period for t in (motion.timing.reading, motion.timing.integration))
+        posture, rate = 0.5 + 0.5 * reading - step, 0.5 * reading - 1.5 * step
+        place = next(k for k, row in enumerate(motion.rows) if row.kind == "kinematic")
+        velocities = []
+        for rotation, displacement in motions:
+            turning, moving = (
+                np.diff(values, axis=0, append=values[-1:]) / period
+                for values in (rotation, displacement)
+            )
+            # R_WF^T g z for a sole turned by the rotation vector, less g z.
+            around_x, around_y, _ = rotation.T
+            tilt = gravity * np.stack([-around_y, around_x, 0 * around_x], axis=1)
+            change = _later(moving, posture) - _later(moving, posture - 1)
+            result[:, place : place + 3] = block_means(_later(turning, rate)[:-1], length)
+            result[:, place + 3 : place + 6] = block_means(
+                (_later(tilt, posture) + change / period)[:-1], length
+            )
+            velocities.append(block_means(_later(moving, rate)[:-1], length))
+            place += 6
+        in_base = [
+            np.einsum("bij,bj->bi", R_BC, v)
+            for R_BC, v in zip(self._contact_rotations, velocities, strict=True)
+        ]
+        for one, other in foot_pairs(self._robot):
+            result[:, place : place + 3] = in_base[one] - in_base[other]
+            place += 3
+        return result
+
+    @cached_property
+    def _contact_rotations(self) -> list[np.ndarray]:
+        """Axes of each foot's contact in every block, (B, 3, 3), in base axes: those of its sole;
+        of a point foot, which stands at any angle, level ones."""
+        rotations = self._motion.equation.sole_rotations(self._motion.blocks.joint_position)
+        for foot in self._point_feet:
+            rotations[foot] = np.broadcast_to(self._level, rotations[foot].shape)
+        return rotations
+
+    @cached_property
+    def _point_feet(self) -> dict[int, np.ndarray]:
+        """R_LF of every point foot in level axes L, (N, 3, 3)."""
+        points = [k for k, leg in enumerate(self._robot.description.legs.values()) if leg.is_point]
+        if not points:
+            return {}
+        equation = self._motion.equation
+        rotations = equation.sole_rotations(self._motion.signals.joint_position)
+        return {foot: self._level.T @ rotations[foot] for foot in points}
+
+    @cached_property
+    def _level(self) -> np.ndarray:
+        """R_BL of axes whose z is up in the mean over the log; a base without tilt has them
+        itself."""
+        motion = self._motion
+        up = motion.equation.R_BI @ motion.signals.specific_force.mean(axis=0)
+        return RotationMatrix.MakeFromOneVector(up, 2).matrix()
+
+    @cached_property
+    def contact(self) -> PadContact:
+        """Of the pads under the feet with the ground."""
+        return pad_contact(
+            self._scenario.believed.description, self._scenario.ground, self._scenario.plant
+        )
+
+    @cached_property
+    def _headings(self) -> np.ndarray:
+        """Angle about the vertical by which each sole is turned from where the base headed when the
+        log began, (B, feet) [rad]; by the gyro, and the vertical of a base that does not tilt."""
+        equation, blocks, up = self._motion.equation, self._motion.blocks, self._level[:, 2]
+        rate = blocks.angular_velocity @ equation.R_BI.T @ up
+        turned = (np.cumsum(rate) - 0.5 * rate) * self._motion.length * self._motion.period
+        ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        headings = [
+            np.arctan2(R_BF[:, :, 0] @ np.cross(up, ahead), R_BF[:, :, 0] @ ahead)
+            for R_BF in equation.sole_rotations(blocks.joint_position)
+        ]
+        return turned[:, None] + np.stack(headings, axis=1)
+
+    def on_slope(self, slope: np.ndarray) -> np.ndarray:
+        """What standing soles read beyond what they do on level ground, (B, R).
+
+        Args:
+            slope: see `Ground.slope`, (2,) [rad].
+        """
+        result = np.zeros(self._shape)
+        if not self._robot.has_floating_base or not slope.any():
+            return result
+        up = np.array([0.0, 0.0, self._motion.equation.gravity])
+        more = gravity_on_slope(up, slope.tolist()) - up
+        place = next(k for k, row in enumerate(self._motion.rows) if row.kind == "kinematic")
+        for heading in self._headings.T:
+            R_FW = Rotation.from_euler("z", -heading[:, None])
+            result[:, place + 3 : place + 6] = R_FW.apply(more)
+            place += 6
+        return result
+
+    def on_believed_ground(self) -> np.ndarray:
+        """What the model's own ground adds: it gives way a little under the soles and lets them
+        creep, (B, R)."""
+        sinking = self.columns(GroundCompliance)[:, :, 0] / self.contact.stiffness
+        return sinking + self.contact.creep * self.columns(FootCreep)[:, :, 0]
+
+    @cached_property
+    def sinking_variance(self) -> np.ndarray:
+        """What the noise of the force sensors puts into the predicted sinking of the soles, per
+        unit of compliance squared, (R,).
+
+        Of a noise that is added to the measured forces once more. A robot that does not stand has
+        no soles that sink.
+        """
+        if not self._robot.has_floating_base:
+            return np.zeros(self._shape[1])
+        force = self._motion.signals.pad_force
+        noise = force_noise(
+            self._motion.sensors_by_row.foot_force,
+            self._robot,
+            len(force),
+            np.random.default_rng(0),
+        )
+        motions = [
+            [
+                GroundCompliance.sole_motion(f, pads, self._sample_time)
+                for f, pads in self._split_feet(forces)
+            ]
+            for forces in (force, force + noise)
+        ]
+        clean, noisy = (
+            self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both])
+            for both in motions
+        )
+        return np.nan_to_num(rms(noisy - clean, self._motion.known) ** 2)
+
+
+def _later(values: np.ndarray, samples: float) -> np.ndarray:
+    """Samples (N, 3) so much later, interpolated; the ends are held."""
+    return shift(values, (-samples, 0), order=1, mode="nearest")
