@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from benchmarks.recorded.cases import record
 from fbse_drake import Log, Scenario
@@ -13,6 +14,8 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.identification.rounding import chance_bound
+from fbse_drake.discrepancy.residual.blocks import block_means
+from fbse_drake.discrepancy.residual.recorded_velocity import Lateness
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.effects.transmission import TorqueRipple
 
@@ -89,6 +92,32 @@ def test_what_angles_feign_is_nothing_where_velocities_are_measured(rail: Rail) 
         TorqueRipple, ("joint_1",), np.array([60.0]), fits.remainder(fits.explain([]))
     )
     assert fits.feigned(candidate) == 0.0
+
+
+@pytest.mark.parametrize("speed", [0.3, 3.0])
+def test_rounding_shows_in_velocities_behind_a_filter(speed: float) -> None:
+    """A recorder takes differences of rounded angles at 20 kHz, filters them, and writes every
+    hundredth: of a joint that moves by so many steps from row to row, which is more slowly than
+    the filter follows, and faster."""
+    late, period, every = 3e-3, 5e-3, 100
+    time = np.arange(0.0, 60.0, period / every)
+    counts = speed / period * (time + 0.3 * np.sin(time)) + 0.4
+    kept = np.exp(-period / every / late)
+    rate = np.gradient(np.round(counts) - counts, period / every)
+    error = lfilter([1 - kept], [1, -kept], rate)[::every, None]
+    lateness = Lateness(np.array([late]), np.array([1e-5]))
+    # In time again, as what was recorded is.
+    error, known = lateness.in_time(error, np.ones(len(error), dtype=bool), period)
+    starts = np.random.default_rng(0).random(8)
+    drawn = [lateness.rounding_error(counts[::every, None] + start, period) for start in starts]
+
+    def powers(values: np.ndarray) -> list[float]:
+        """Of the error, and of its means over ten rows."""
+        inside = values[known][20:, 0]
+        return [float(np.mean(block_means(inside, size) ** 2)) for size in (1, 10)]
+
+    found = np.mean([powers(values) for values in drawn], axis=0)
+    np.testing.assert_allclose(found, powers(error), rtol=0.25)
 
 
 def test_the_largest_of_many_is_bounded_by_some_draws_of_it() -> None:

@@ -28,7 +28,7 @@ from fbse_drake.discrepancy.residual.recorded_signals import (
     unbroken,
     within_steps,
 )
-from fbse_drake.discrepancy.residual.recorded_velocity import Lateness
+from fbse_drake.discrepancy.residual.recorded_velocity import Lateness, rounding_error
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.discrepancy.residual.rows import foot_pairs, residual_rows
 from fbse_drake.discrepancy.residual.white_noise import noise_corners, step_of
@@ -198,17 +198,26 @@ class RecordedMotion:
     @cached_property
     def rounding_noise(self) -> np.ndarray:
         """What rounding adds to the residual if the steps of the joints' encoders began elsewhere,
-        K draws, (K, B, R); none where velocities are not had from angles that come in steps."""
+        K draws, (K, B, R); none where velocities are not had from angles that come in steps.
+
+        Velocities that come late behind such angles are taken to be had from them by a filter.
+        """
         step = np.array([step_of(column) for column in self.log["joint/position"].T])
-        if not step.any() or not differences_angles(self.recording, self.log):
+        differenced = differences_angles(self.recording, self.log)
+        step = np.where(differenced | (self.lateness.seconds > 0), step, 0.0)
+        if not step.any():
             return np.zeros((0, len(self.time), len(self.rows)))
         angle, random = self.without_noise(self.signals.joint_position), np.random.default_rng(0)
         counts = np.divide(angle, step, out=np.zeros_like(angle), where=step > 0)
         value, draws = self.equation.residual(self.steps), []
         for _ in range(_DRAWS):
             moved = counts + random.random(len(step))
-            error = self.low_passed((np.round(moved) - moved) * step, self.recording.cutoff)
-            velocity = self.signals.joint_velocity + np.gradient(error, self.period, axis=0)
+            if differenced:
+                rate = np.gradient(rounding_error(moved), self.period, axis=0)
+            else:
+                rate = self.lateness.rounding_error(moved, self.period)
+            error = self.low_passed(rate * step, self.recording.cutoff)
+            velocity = self.signals.joint_velocity + error
             noisier = self.steps_of(replace(self.signals, joint_velocity=velocity))
             draws.append(block_means(self.equation.residual(noisier) - value, self.length))
         return np.array(draws)

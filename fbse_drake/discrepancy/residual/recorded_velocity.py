@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
-from scipy.signal import savgol_filter
+from scipy.signal import lfilter, savgol_filter
 from scipy.stats import t as student
 
 from fbse_drake.discrepancy.residual.blocks import block_means
@@ -25,6 +25,8 @@ _LATEST = 0.05
 # Angles are smoothed by polynomials of this order over times of these lengths [s], and velocities
 # over this one.
 _ORDER, _SMOOTHING, _SMOOTHED = 3, (0.02, 0.05, 0.1, 0.2), 0.1
+# A filter of velocities is taken to read so many angles for each velocity that is recorded.
+_FINER = 16
 # A velocity that is a difference of the angles that it stands beside differs from that by less than
 # this share of what two such differences differ by.
 _SAME = 0.1
@@ -118,6 +120,28 @@ class Lateness:
             result[:, joint] = np.interp(at, samples, velocity[:, joint])
             weight = np.minimum(weight, np.interp(at, samples, known, left=0.0, right=0.0))
         return result, weight == 1.0
+
+    def rounding_error(self, counts: np.ndarray, period: float) -> np.ndarray:
+        """What rounding adds to velocities that come late by a filter of first order behind rounded
+        angles, which it reads much oftener than it writes, when they are in time again [counts/s].
+
+        Args:
+            counts: angles in steps of their encoders, (N, n).
+        """
+        samples, error = np.arange(len(counts)), np.zeros_like(counts)
+        fine = np.arange((len(counts) - 1) * _FINER + 1) / _FINER
+        for joint in np.flatnonzero(self.seconds > 0):
+            late = self.seconds[joint]
+            rounded = rounding_error(np.interp(fine, samples, counts[:, joint]))
+            kept = np.exp(-period / _FINER / late)
+            slow, _ = lfilter([1.0 - kept], [1.0, -kept], rounded, zi=kept * rounded[:1])
+            error[:, joint] = ((rounded - slow) / late)[::_FINER]
+        return self.in_time(error, np.ones(len(counts), dtype=bool), period)[0]
+
+
+def rounding_error(counts: np.ndarray) -> np.ndarray:
+    """Of angles in steps of their encoders, in such steps."""
+    return np.round(counts) - counts
 
 
 def velocity_error(
