@@ -234,9 +234,8 @@ def diagnose(
     partial, final, fits = search.partial, path[-1], proposals.fits
     white, dictionary = fits.white, fits.dictionary
     predictor, significance = dictionary.predictor, dictionary.significance
-    tolerance = predictor.scenario.identify.tolerance
     shares = {c: significance.share(final, c) for c in final.candidates}
-    matters = [c for c, share in shares.items() if not share < tolerance]
+    matters = [c for c, share in shares.items() if significance.matters(share)]
     without = {
         c: fits.explain([other for other in final.candidates if other is not c])
         for c in final.candidates
@@ -388,8 +387,8 @@ def _late_findings(late: LateTorques) -> list[Finding]:
         member: fits.explain([c for c in final.candidates if c is not member])
         for member in final.candidates
     }
-    tolerance = fits.dictionary.predictor.scenario.identify.tolerance
-    matters = [member for member, share in late.members.items() if not share < tolerance]
+    significance = fits.dictionary.significance
+    matters = [member for member, share in late.members.items() if significance.matters(share)]
     return [
         replace(finding, too_small=member not in matters, share=late.members[member])
         for member, finding in _members(fits, final, without, late.equal, matters)

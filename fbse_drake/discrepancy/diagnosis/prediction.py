@@ -471,7 +471,7 @@ class Predictor:
         """The same if the sensors' noise were in the signals once more."""
         return Regressors(self.motion, noisier_signals(self.motion, self.noise))
 
-    @property
+    @cached_property
     def noise_realization(self) -> np.ndarray:
         """What that noise adds to the residual, (B, R)."""
         return self._noisier_regressors.residual - self._regressors.residual

@@ -131,11 +131,10 @@ def _late_torques(search: Search) -> LateTorques | None:
     """What a search found to come late, if it matters in any joint."""
     fits, final = search.proposals.fits, search.path[-1]
     significance = fits.dictionary.significance
-    tolerance = fits.dictionary.predictor.scenario.identify.tolerance
     members = {
         c: significance.share(final, c) for c in final.candidates if c.effect is TorqueReadingLag
     }
-    if search.partial is not None or all(share < tolerance for share in members.values()):
+    if search.partial is not None or not any(map(significance.matters, members.values())):
         return None
     return LateTorques(fits, final, members, indistinguishable(fits, search.alternatives, final))
 
@@ -252,11 +251,10 @@ def _searched(
     final, inertia = consistent(proposals.fits, path[-1])
     path[-1], remaining, left = added(proposals.fits, final)
     significance = proposals.fits.dictionary.significance
-    tolerance = predictor.scenario.identify.tolerance
     structures = leftover_structure(predictor.motion, remaining, left)
 
     def matters(row: int) -> bool:
-        return not significance.left_share(row, left, remaining) < tolerance
+        return significance.matters(significance.left_share(row, left, remaining))
 
     unexplained = [structure for structure in structures if matters(structure.index)]
     noisy = noisy_rows(predictor.motion, remaining, left, structures)

@@ -23,6 +23,7 @@ class Significance:
         how fast single joints turn and move them, and by gravity; deflections by how they vary, for
         the zero of a second encoder may be anywhere.
         """
+        self._tolerance = predictor.scenario.identify.tolerance
         motion, equation = predictor.motion, predictor.motion.equation
         blocks, rows = motion.blocks, motion.residual.rows
         self._known = motion.known
@@ -47,6 +48,10 @@ class Significance:
             known = motion.known[:, -motors:]
             mean = np.average(deflection, axis=0, weights=np.maximum(known, 1e-12))
             self._sizes[-motors:] = rms(deflection - mean, known)
+
+    def matters(self, share: float) -> bool:
+        """Is a share large enough to matter, see `IdentifyConfig.tolerance`, or not known?"""
+        return not share < self._tolerance
 
     def share(self, explanation: Explanation, candidate: Candidate) -> float:
         """Largest root mean square of what a member of an explanation adds to a row, as a share of

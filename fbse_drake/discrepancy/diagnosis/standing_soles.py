@@ -51,6 +51,11 @@ class StandingSoles:
         return np.stack(columns, axis=2)
 
     @cached_property
+    def _first_row(self) -> int:
+        """Place of the soles' first row; the others follow."""
+        return next(k for k, row in enumerate(self._motion.rows) if row.kind == "kinematic")
+
+    @cached_property
     def _sample_time(self) -> np.ndarray:
         samples = np.arange(len(self._motion.signals.joint_position))
         return self._motion.start + samples * self._motion.period
@@ -84,7 +89,7 @@ class StandingSoles:
         # rate there.
         reading, step = (t / period for t in (motion.timing.reading, motion.timing.integration))
         posture, rate = 0.5 + 0.5 * reading - step, 0.5 * reading - 1.5 * step
-        place = next(k for k, row in enumerate(motion.rows) if row.kind == "kinematic")
+        place = self._first_row
         velocities = []
         for rotation, displacement in motions:
             turning, moving = (
@@ -169,7 +174,7 @@ class StandingSoles:
             return result
         up = np.array([0.0, 0.0, self._motion.equation.gravity])
         more = gravity_on_slope(up, slope.tolist()) - up
-        place = next(k for k, row in enumerate(self._motion.rows) if row.kind == "kinematic")
+        place = self._first_row
         for heading in self._headings.T:
             R_FW = Rotation.from_euler("z", -heading[:, None])
             result[:, place + 3 : place + 6] = R_FW.apply(more)

@@ -25,8 +25,8 @@ _LATEST = 0.05
 # Angles are smoothed by polynomials of this order over times of these lengths [s], and velocities
 # over this one.
 _ORDER, _SMOOTHING, _SMOOTHED = 3, (0.02, 0.05, 0.1, 0.2), 0.1
-# A filter of velocities is taken to read so many angles for each velocity that is recorded.
-_FINER = 16
+# A recorder that filters velocities is taken to read so many angles while its filter lags.
+_READINGS = 8
 # A velocity that is a difference of the angles that it stands beside differs from that by less than
 # this share of what two such differences differ by.
 _SAME = 0.1
@@ -129,13 +129,14 @@ class Lateness:
             counts: angles in steps of their encoders, (N, n).
         """
         samples, error = np.arange(len(counts)), np.zeros_like(counts)
-        fine = np.arange((len(counts) - 1) * _FINER + 1) / _FINER
         for joint in np.flatnonzero(self.seconds > 0):
             late = self.seconds[joint]
+            finer = int(np.ceil(_READINGS * period / late))
+            fine = np.arange((len(counts) - 1) * finer + 1) / finer
             rounded = rounding_error(np.interp(fine, samples, counts[:, joint]))
-            kept = np.exp(-period / _FINER / late)
+            kept = np.exp(-period / finer / late)
             slow, _ = lfilter([1.0 - kept], [1.0, -kept], rounded, zi=kept * rounded[:1])
-            error[:, joint] = ((rounded - slow) / late)[::_FINER]
+            error[:, joint] = ((rounded - slow) / late)[::finer]
         return self.in_time(error, np.ones(len(counts), dtype=bool), period)[0]
 
 
