@@ -83,6 +83,7 @@ from .effects.contact import FootCreep as FootCreep
 from .effects.contact import GroundCompliance as GroundCompliance
 from .effects.contact import GroundSlope as GroundSlope
 from .effects.counterbalance import Counterbalance as Counterbalance
+from .effects.geometry import BaseTilt as BaseTilt
 from .effects.geometry import GeometryEffect as GeometryEffect
 from .effects.geometry import ImuPosition as ImuPosition
 from .effects.geometry import LinkLength as LinkLength

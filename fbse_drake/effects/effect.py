@@ -152,6 +152,8 @@ class Effect(ABC):
     needs_motor: ClassVar[bool] = False
     # It is of a joint's second encoder, on the motor's side.
     needs_motor_encoder: ClassVar[bool] = False
+    # It is of a base that is fixed to the world.
+    needs_fixed_base: ClassVar[bool] = False
     # It is of torques that were measured: those that a controller commands are known as they are.
     needs_sampled_torque: ClassVar[bool] = False
     # What these do it does with the other sign: where both are, only the difference shows.

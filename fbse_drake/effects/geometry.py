@@ -1,4 +1,4 @@
-"""Effects on a robot's shape: where the model has its joints and its IMU.
+"""Effects on a robot's shape: where the model has its joints and its IMU, and how it is mounted.
 
 The same lines change the plant that is simulated, the model that is believed, and the model that
 the diagnosis tries out.
@@ -22,7 +22,7 @@ _SHORTEST_LINK = 0.02
 @dataclass(frozen=True)
 class GeometryEffect(Effect):
     """Base of the effects on a robot's shape; a subclass moves joints against the bodies that carry
-    them, or the IMU."""
+    them, or the IMU, or tilts a base that is fixed."""
 
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "body"
     # Does a file of links and joints say it?
@@ -52,7 +52,7 @@ def shifts(effects: Mapping[str, Effect], robot: Robot) -> Shifts:
         InputError: unknown body, a value out of bounds.
     """
     joints: dict[str, np.ndarray] = {}
-    imu = np.zeros(3)
+    imu, tilt = np.zeros(3), np.zeros(2)
     for name, effect in effects.items():
         if not isinstance(effect, GeometryEffect):
             continue
@@ -61,9 +61,10 @@ def shifts(effects: Mapping[str, Effect], robot: Robot) -> Shifts:
             for target, of_target in zip(values.targets, values.linear.T, strict=True):
                 moved = effect.shifts(robot, target, of_target)
                 imu += moved.imu
+                tilt += moved.tilt
                 for joint, shift in moved.joints.items():
                     joints[joint] = joints.get(joint, 0.0) + shift
-    return Shifts(joints, imu)
+    return Shifts(joints, imu, tilt)
 
 
 @in_library
@@ -131,6 +132,35 @@ class ImuPosition(GeometryEffect):
     @staticmethod
     def shifts(robot: Robot, target: str, values: np.ndarray) -> Shifts:  # noqa: ARG004
         return Shifts(imu=values)
+
+
+@in_library
+@dataclass(frozen=True)
+class BaseTilt(GeometryEffect):
+    """A base that is fixed is not mounted level: it is turned by a rotation vector about world x
+    and y. The world's frame stays fixed to the mount, and gravity is turned."""
+
+    description: ClassVar[str] = "The mount of a machine on a fixed base is not level."
+    signature: ClassVar[str] = (
+        "Torque in all joints as of gravity from another direction, also in those whose axes the "
+        "model has upright."
+    )
+    experiment: ClassVar[str] = "Move all joints slowly through many postures."
+    acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
+    needs_fixed_base: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, Parameter]] = {
+        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi))
+        for axis in "xy"
+    }
+    # Links stay as they are.
+    in_links: ClassVar[bool] = False
+
+    x: float = 0.0
+    y: float = 0.0
+
+    @staticmethod
+    def shifts(robot: Robot, target: str, values: np.ndarray) -> Shifts:  # noqa: ARG004
+        return Shifts(tilt=values)
 
 
 def _next_joint(robot: Robot, body: str) -> tuple[Joint, np.ndarray] | None:

@@ -17,6 +17,8 @@ from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 
 _ANY = (-np.inf, np.inf)
+# How much larger an offset of an encoder may be where nobody would fall by it.
+_UNHOMED = 5.0
 # An effect that has no opposite is taken off the signals until they would be read as they were but
 # for this share of the largest reading, and so often at most.
 _UNDONE, _MOST_UNDOINGS = 1e-9, 50
@@ -623,6 +625,15 @@ class EncoderOffset(ShiftOrTurn):
     }
 
     offset: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
+        """A machine on a fixed base moves all the same where its joints were not homed; a robot on
+        its feet would fall."""
+        parameters = super().parameters_on(robot, target)
+        if robot.has_floating_base:
+            return parameters
+        return {name: parameter.enlarged(_UNHOMED) for name, parameter in parameters.items()}
 
     @staticmethod
     def reading(

@@ -98,6 +98,14 @@ class PlantDynamics:
         world = self._plant.world_frame()
         return self._context, JacobianWrtVariable.kV, frame, np.zeros(3), world, frame
 
+    def gravity_forces(self) -> Quantity:
+        """Generalized forces per acceleration of gravity along each axis of the world, (3,
+        velocities) [kg, kg m]."""
+        plant, context, world = self._plant, self._context, self._plant.world_frame()
+        mass, how = plant.CalcTotalMass(context), (JacobianWrtVariable.kV, world, world)
+        calculate = plant.CalcJacobianCenterOfMassTranslationalVelocity
+        return Quantity((3, plant.num_velocities()), lambda _: mass * calculate(context, *how))
+
     def mass_matrix(self) -> Quantity:
         """Of the plant, (velocities, velocities)."""
         size, calculate = self._plant.num_velocities(), self._plant.CalcMassMatrix

@@ -346,7 +346,7 @@ def grasp_map(pad_positions: np.ndarray) -> np.ndarray:
     return np.concatenate([np.concatenate([moment, np.eye(3)]) for moment in moments], axis=1)
 
 
-def gravity_on_slope(gravity: np.ndarray, slope: Sequence[float]) -> np.ndarray:
+def gravity_on_slope(gravity: np.ndarray, slope: Sequence[float] | np.ndarray) -> np.ndarray:
     """Gravity as a world has it that is fixed to sloping ground, (3,) [m/s^2].
 
     Args:
@@ -356,14 +356,28 @@ def gravity_on_slope(gravity: np.ndarray, slope: Sequence[float]) -> np.ndarray:
     return Rotation.from_rotvec([*slope, 0.0]).inv().apply(gravity)
 
 
+def slope_of_gravity(gravity: np.ndarray) -> np.ndarray:
+    """The slope on which level ground's gravity pulls like that, (2,) [rad]; see
+    `gravity_on_slope`."""
+    down = gravity / np.linalg.norm(gravity)
+    across = np.array([-down[1], down[0]])
+    size = np.linalg.norm(across)
+    if size == 0.0:
+        return np.array([0.0 if down[2] < 0 else np.pi, 0.0])
+    return across / size * np.arctan2(size, -down[2])
+
+
 @dataclass(frozen=True)
 class Shifts:
-    """How far parts of a robot are from where its model has them [m]."""
+    """How far parts of a robot are from where its model has them."""
 
-    # Joints in the frames of the bodies that carry them, (3,) by name.
+    # Joints in the frames of the bodies that carry them, (3,) by name [m].
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
-    # The IMU in its own axes, (3,).
+    # The IMU in its own axes, (3,) [m].
     imu: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # Of a base that is fixed: by what rotation vector about world x and y it is not level, (2,)
+    # [rad].
+    tilt: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
 def make_robot(
@@ -425,9 +439,12 @@ def make_robot(
         _add_ground(plant, ground)
         for side, leg in names.legs.items():
             _add_corners(plant, side, leg, ground)
-        if gantry_height is None:
-            gravity = plant.mutable_gravity_field()
-            gravity.set_gravity_vector(gravity_on_slope(gravity.gravity_vector(), ground.slope))
+    if gantry_height is not None:
+        _tilt_world(plant, shifts.tilt)
+    elif shifts.tilt.any():
+        raise InputError("effects: only a base that is fixed can be mounted tilted")
+    elif ground is not None:
+        _tilt_world(plant, ground.slope)
     plant.Finalize()
     if builder is None:
         # A builder that never builds is never freed.
@@ -621,6 +638,12 @@ def _shift_joints(plant: MultibodyPlant, shifts: Mapping[str, np.ndarray]) -> No
         again.set_velocity_limits(joint.velocity_lower_limits(), joint.velocity_upper_limits())
         plant.RemoveJoint(joint)
         plant.AddJoint(again)
+
+
+def _tilt_world(plant: MultibodyPlant, slope: Sequence[float] | np.ndarray) -> None:
+    """Turns gravity as a world has it that is fixed to what a robot stands on."""
+    field = plant.mutable_gravity_field()
+    field.set_gravity_vector(gravity_on_slope(field.gravity_vector(), slope))
 
 
 def _shift_imu(plant: MultibodyPlant, names: RobotDescription, shift: np.ndarray) -> None:

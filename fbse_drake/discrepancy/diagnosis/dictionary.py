@@ -264,6 +264,8 @@ class Dictionary:
             return []
         if effect.needs_sampled_torque and self.per_step:
             return []
+        if effect.needs_fixed_base and self.predictor.robot.has_floating_base:
+            return []
         return {
             "joint": [
                 joint

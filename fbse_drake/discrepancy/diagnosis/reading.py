@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.residual.noise import measured_noise, measured_senso
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.recorded_signals import Instants, within_steps
 from fbse_drake.discrepancy.residual.servo import with_command
+from fbse_drake.discrepancy.residual.time_stamps import sampled_evenly
 from fbse_drake.discrepancy.residual.white_noise import noise_corners
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
@@ -47,7 +48,9 @@ class Reading:
         with located("model: "):
             self.robot = build_robot(scenario.believed)
         log = with_command(scenario, log, self.robot.description)
-        sensors, self.noisier_channels = measured_sensors(scenario.sensors, scenario.recording, log)
+        sensors, self.noisier_channels = measured_sensors(
+            scenario.sensors, scenario.recording, sampled_evenly(log)
+        )
         self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
         # By how much torques are read earlier than the log has them, (n,) [s].
         self.late_torques = np.zeros(len(self.robot.joint_names))

@@ -167,6 +167,7 @@ _RECIPES = {
     "Payload": Recipe((0.3, 4.0), _load),
     "LinkLength": Recipe((2e-3, 1e-2), _signed("length")),
     "GroundSlope": Recipe((4e-3, 4e-2), _vector("xy")),
+    "BaseTilt": Recipe((4e-3, 4e-2), _vector("xy")),
     "GroundCompliance": Recipe((5e-7, 5e-6), _one("compliance")),
     "FootCreep": Recipe((1e-3, 2e-2), _one("creep")),
     "FootForceGain": Recipe((5e-3, 0.1), _signed("gain")),
@@ -394,9 +395,9 @@ def _hidden_effect(
 
 
 def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
-    """Can the robot have it, and its log show it? In a gantry, only in its joints; feet creep only
-    if the contact solver lets them, few robots have second encoders, and commands are no
-    measurements."""
+    """Can the robot have it, and its log show it? In a gantry, only in its joints or its mount;
+    feet creep only if the contact solver lets them, few robots have second encoders, and commands
+    are no measurements."""
     if effect.needs_motor_encoder and scenario.sensors.motor_encoders is None:
         return False
     if effect.needs_sampled_torque and not scenario.recording.is_sampled:
@@ -406,7 +407,7 @@ def _possible(effect: type[Effect], scenario: Scenario, robot: Robot) -> bool:
         "similar",
     ):
         return False
-    return effect.acts_on == "joint" or robot.has_floating_base
+    return effect.acts_on == "joint" or robot.has_floating_base != effect.needs_fixed_base
 
 
 def _targets(

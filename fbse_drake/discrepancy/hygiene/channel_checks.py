@@ -72,15 +72,20 @@ def check_sampling(evidence: Evidence) -> Iterable[HygieneFinding]:
             "nothing is said about them"
         )
         yield remark("gap", "warning" if share > _MANY_GAPS else "note", "time", lost, "s", text)
-    jitter = float(np.std(steps[~gaps]) / evidence.period)
+    stamps = evidence.motion.stamps
+    is_even = stamps is not evidence.log.time
+    jitter = float(np.std(np.diff(stamps)[~gaps]) / evidence.period)
     if jitter > _JITTER:
-        text = (
-            f"the period of {1e3 * evidence.period:.4g} ms scatters by {100 * jitter:.2g} %; "
-            "channels are interpolated on an even grid, which smoothes their noise"
+        meaning = (
+            "the angles show that the samples do not, so they are taken to be even"
+            if is_even
+            else "channels are interpolated on an even grid, which smoothes their noise"
         )
+        scatters = f"scatters by {100 * jitter:.2g} %; {meaning}"
+        text = f"the period of {1e3 * evidence.period:.4g} ms {scatters}"
         yield remark(
             "jitter",
-            "warning" if jitter > _STRONG_JITTER else "note",
+            "warning" if jitter > _STRONG_JITTER and not is_even else "note",
             "time",
             jitter * evidence.period,
             "s",

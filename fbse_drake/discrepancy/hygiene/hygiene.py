@@ -23,6 +23,7 @@ _CHECKS = (*channel_checks.CHECKS, *model_checks.CHECKS)
 _WHOLE_LOG = (
     "clock_offset",
     "dead_torque",
+    "mount",
     "not_a_torque",
     "ringing",
     "swapped_joints",

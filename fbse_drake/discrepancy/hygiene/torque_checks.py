@@ -1,5 +1,5 @@
-"""Checks of the torques: is the channel dead, its sign reversed or lost, its unit wrong, its clock
-off, is it a torque at all?
+"""Checks of the torques: does gravity pull from elsewhere, is the channel dead, its sign reversed
+or lost, its unit wrong, its clock off, is it a torque at all?
 
 Nothing is asserted that friction, inertia, a counterbalance, an encoder offset or a load could
 explain as well; see `torque_readings`. All tests together call a good log wrong with the
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fbse_drake.discrepancy.hygiene.channel_checks import CLIPPED_SHARE
+from fbse_drake.discrepancy.hygiene.mount_check import Mount, another_mount
 from fbse_drake.discrepancy.hygiene.torque_readings import (
     FALSE_ALARM,
     TRANSITION,
@@ -29,10 +30,12 @@ from fbse_drake.discrepancy.residual.evidence import (
     remarks,
 )
 from fbse_drake.effects.actuation import TorqueReadingLag
+from fbse_drake.effects.geometry import BaseTilt
 
 CHANNEL = "joint/torque_command"
-# Tests of each joint: its sign is reversed or lost, it is dead, its unit or its clock is wrong.
-_TESTS = 5
+# Tests of each joint: gravity is another, its sign is reversed or lost, it is dead, its unit or its
+# clock is wrong.
+_TESTS = 6
 # A torque in another unit is off by more than this factor; by more than the smaller one its scale
 # is doubtful.
 _ANOTHER_UNIT, _DOUBTFUL = 3.0, 1.3
@@ -43,8 +46,9 @@ _DEAD = 0.05
 _BETTER = 0.8
 # What the model needs is this many times the sensors' noise, or nothing is said.
 _VISIBLE = 2.0
-# Largest clock offset that is looked for [blocks], and the smallest that counts [samples, blocks].
-_LARGEST_OFFSET, _SMALLEST_OFFSET = 5, (1.5, 0.25)
+# Largest clock offset that one joint may have by itself and that all may have [blocks], and the
+# smallest that counts [samples, blocks].
+_LARGEST_OFFSET, _LARGEST_OF_ALL, _SMALLEST_OFFSET = 5, 40, (1.5, 0.25)
 # What the model needs, in another unit and with friction, explains at least so much of a torque's
 # variance.
 _EXPLAINED = 0.5
@@ -73,11 +77,26 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
     torques, found = JointTorques(evidence), _Found()
     motors = np.flatnonzero(evidence.robot.description.has_motor).tolist()
     tested = [k for k in motors if _is_visible(evidence, torques, k)]
+    mount = another_mount(evidence, torques, tested, level(torques))
+    if mount is not None:
+        yield _mount_finding(mount)
+        return
     for k in tested:
         _test(evidence, torques, k, found)
     yield from _findings(evidence, found)
     wrong = {*found.reversed, *found.lost, *found.dead, *found.duty}
     yield from _clock(evidence, torques, [k for k in tested if evidence.joints[k] not in wrong])
+
+
+def _mount_finding(mount: Mount) -> HygieneFinding:
+    x, y = mount.tilt
+    text = (
+        "gravity pulls from elsewhere than the model says, as if the base were mounted tilted by "
+        f"{np.degrees(mount.angle):.0f} deg; what the model needs is wrong in all joints "
+        f"({BaseTilt.__name__} with x: {x:.3g} and y: {y:.3g} among the model's effects allows "
+        "for it)"
+    )
+    return remark("mount", "untrustworthy", CHANNEL, mount.angle, "rad", text)
 
 
 def _is_visible(evidence: Evidence, torques: JointTorques, k: int) -> bool:
@@ -232,8 +251,12 @@ def _clock(
     evidence: Evidence, torques: JointTorques, places: list[int]
 ) -> Iterable[HygieneFinding]:
     """Torques that come before or after the motion that they make."""
-    places = [k for k in places if torques.known[:, k].sum() > 4 * _LARGEST_OFFSET]
     offsets = {evidence.joints[k]: _lateness(evidence, torques, k) for k in places}
+    # By itself no joint has a clock that is off so far: something else is wrong with it.
+    largest = _LARGEST_OFFSET * evidence.motion.length * evidence.period
+    far = [joint for joint, seconds in offsets.items() if abs(seconds) > largest]
+    if len(far) <= 0.5 * len(places):
+        offsets |= dict.fromkeys(far, 0.0)
     late = {joint: seconds for joint, seconds in offsets.items() if seconds > 0}
     early = [-seconds for seconds in offsets.values() if seconds < 0]
     if late:
@@ -262,24 +285,29 @@ def _clock(
 
 
 def _lateness(evidence: Evidence, torques: JointTorques, k: int) -> float:
-    """By how much a torque is late [s], negative if it is early; 0 where that is not sure."""
+    """By how much a torque is late [s], negative if it is early; 0 where that is not sure, and
+    where nothing within reach or the other sign fits best."""
     columns, length = torques.columns(k), evidence.motion.length
     stretch = torques.stretches(k)
-    inner = slice(_LARGEST_OFFSET, len(stretch) - _LARGEST_OFFSET)
-    offsets = [length * k for k in range(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1)]
-
-    def late_by(samples: int) -> np.ndarray:
-        return torques.late(k, columns, samples).left[inner]
-
-    spread = [late_by(samples).var() for samples in offsets]
-    best = int(np.argmin(spread))
-    samples = float(offsets[best])
-    if 0 < best < len(offsets) - 1:
-        before, here, after = spread[best - 1 : best + 2]
-        samples += 0.5 * length * float((before - after) / (before - 2 * here + after))
+    for largest in (_LARGEST_OFFSET, _LARGEST_OF_ALL):
+        if len(stretch) <= 4 * largest:
+            return 0.0
+        inner = slice(largest, len(stretch) - largest)
+        offsets = [length * k for k in range(-largest, largest + 1)]
+        left = [torques.late(k, columns, samples).left[inner] for samples in offsets]
+        spread = [one.var() for one in left]
+        best = int(np.argmin(spread))
+        if 0 < best < len(offsets) - 1:
+            break
+    else:
+        return 0.0
+    before, here, after = spread[best - 1 : best + 2]
+    samples = offsets[best] + 0.5 * length * float((before - after) / (before - 2 * here + after))
     if abs(samples) < max(_SMALLEST_OFFSET[0], _SMALLEST_OFFSET[1] * length):
         return 0.0
-    gains = gain(late_by(0), late_by(round(samples)))
+    if torques.scaled(k, columns, sign=-1.0).left[inner].var() < here:
+        return 0.0
+    gains = gain(left[largest], torques.late(k, columns, round(samples)).left[inner])
     # The best of several is the best by chance more often than one.
     sure = len(offsets) * chance(gains, stretch[inner]) < level(torques)
     return samples * evidence.period if sure else 0.0

@@ -9,6 +9,7 @@ time (Vuong 1989, "Likelihood ratio tests for model selection and non-nested hyp
 Econometrica 57), with Student's t.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -134,6 +135,12 @@ class JointTorques:
         # Of a block [s].
         self.duration = evidence.motion.length * evidence.period
         self._stretch = (np.arange(len(self.torque)) * self.duration / STRETCH).astype(int)
+
+    def with_more(self, needed: np.ndarray) -> "JointTorques":
+        """The same if the model needed so much more, (B, n) [Nm]."""
+        changed = copy(self)
+        changed.needed = self.needed + needed
+        return changed
 
     @cached_property
     def known(self) -> np.ndarray:

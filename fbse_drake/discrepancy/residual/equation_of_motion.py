@@ -246,6 +246,14 @@ class EquationOfMotion:
             [joints, -generalized[:, : self._joints.start], *kinematic_rows], axis=1
         )
 
+    def gravity_torques(self, at: Instants) -> np.ndarray:
+        """What gravity gives each joint of a machine on a fixed base per acceleration along each
+        axis of the world, (M, n, 3) [kg m]."""
+        states, _ = self.plant_motion(at)
+        positions = states[:, : self.robot.plant.num_positions()]
+        (forces,) = self.dynamics.evaluated([self.dynamics.gravity_forces()], positions)
+        return np.swapaxes(forces[:, :, self._order], 1, 2)
+
     def joint_shares(self, at: Instants) -> np.ndarray:
         """Spatial velocity [angular, linear] that each joint gives each sole, in its frame.
 

@@ -31,6 +31,7 @@ from fbse_drake.discrepancy.residual.recorded_signals import (
 from fbse_drake.discrepancy.residual.recorded_velocity import Lateness, rounding_error
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.discrepancy.residual.rows import foot_pairs, residual_rows
+from fbse_drake.discrepancy.residual.time_stamps import sampled_evenly
 from fbse_drake.discrepancy.residual.white_noise import noise_corners, step_of
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
@@ -78,6 +79,9 @@ class RecordedMotion:
         Raises:
             InputError: a log that does not fit the model, or one that is too short.
         """
+        # Before its samples are taken to be even.
+        self.stamps = log.time
+        log = sampled_evenly(log)
         self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period

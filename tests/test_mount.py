@@ -1,0 +1,150 @@
+"""Machines that are not mounted as their model says: a little, which is an effect, or on a wall,
+which the hygiene says. Truth: gravity weighed body by body, and plans of tilted arms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.spatial.transform import Rotation
+
+from fbse_drake import InputError, load_scenario
+from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.hygiene.hygiene import inspect
+from fbse_drake.discrepancy.residual.evidence import HygieneFinding
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.geometry import BaseTilt
+from fbse_drake.effects.inertia import Payload
+from fbse_drake.log import Log
+from fbse_drake.robot.plant import gravity_on_slope, slope_of_gravity
+from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, build_robot
+
+TILT = (0.04, -0.03)
+
+
+def arm_that_moves(**effects: Effect) -> tuple[Scenario, Log]:
+    """An arm with these effects as it was planned to move, with noise of its torques, and a
+    scenario whose model has none."""
+    scenario = load_scenario("bsc_arm", overrides=["duration=8", "log.period=0.01"])
+    bare = dataclasses.replace(scenario.robot, effects={})
+    real = dataclasses.replace(bare, effects=effects)
+    log = planned_log(dataclasses.replace(scenario, robot=real, model=real))
+    torque = log["joint/torque_command"]
+    noisy = torque + 0.3 * np.random.default_rng(5).standard_normal(torque.shape)
+    recording = RecordingConfig(rows="instantaneous", torque_noise={"all": 0.3})
+    believed = dataclasses.replace(scenario, robot=bare, model=bare, recording=recording)
+    return believed, Log(log.channels | {"joint/torque_command": noisy}, log.meta)
+
+
+def test_on_a_tilted_mount_every_body_weighs_in_another_direction() -> None:
+    """The torques that hold an arm at rest are those of its bodies' weights, each on its lever."""
+    turned = Rotation.from_rotvec([*TILT, 0.0])
+    for tilt, gravity in (((0.0, 0.0), [0, 0, -9.81]), (TILT, turned.inv().apply([0, 0, -9.81]))):
+        arm = build_robot(RobotConfig("arm", effects={"mount": BaseTilt(*tilt)}))
+        plant, context = arm.plant, arm.plant.CreateDefaultContext()
+        arm.set_joint_positions(context, np.array([0.3, 0.5, -0.4, 0.2, 0.7, -0.1]))
+        expected = np.zeros(plant.num_velocities())
+        for name in arm.body_names:
+            body, at = arm.body(name), arm.body(name).CalcCenterOfMassInBodyFrame(context)
+            J = plant.CalcJacobianTranslationalVelocity(
+                context, JacobianWrtVariable.kV, body.body_frame(), at, *[plant.world_frame()] * 2
+            )
+            expected += J.T @ (body.get_mass(context) * np.asarray(gravity))
+        found = plant.CalcGravityGeneralizedForces(context)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(found).max() > 10.0
+
+
+def test_robots_on_their_feet_have_no_mount() -> None:
+    with pytest.raises(InputError, match="only a base that is fixed can be mounted tilted"):
+        build_robot(RobotConfig(effects={"mount": BaseTilt(*TILT)}))
+    hanging = build_robot(RobotConfig(gantry_height=1.0, effects={"mount": BaseTilt(*TILT)}))
+    assert hanging.plant.gravity_field().gravity_vector()[1] == pytest.approx(
+        -9.81 * 0.04, rel=0.01
+    )
+
+
+def test_a_tilted_mount_is_found_and_nothing_else() -> None:
+    scenario, log = arm_that_moves(mount=BaseTilt(*TILT))
+    found = diagnose(Predictor(scenario, log))
+    assert [(f.effect, f.targets) for f in found.chosen] == [("BaseTilt", ("robot",))]
+    assert found.verdict == "effect_found"
+    assert not found.chosen[0].confusable_with
+    for axis, tilt in zip("xy", TILT, strict=True):
+        estimate = found.chosen[0].parameters[axis]
+        assert estimate.value == pytest.approx(tilt, abs=1e-3)
+        assert estimate.interval[0] <= tilt <= estimate.interval[1]
+
+
+def test_a_mount_whose_tilt_is_known_is_taken_for_granted() -> None:
+    """And a level one has none, so nothing is found in it."""
+    scenario, log = arm_that_moves(mount=BaseTilt(*TILT))
+    told = dataclasses.replace(scenario.believed, effects={"mount": BaseTilt(*TILT)})
+    level, level_log = arm_that_moves()
+    for believed, of_log in ((dataclasses.replace(scenario, model=told), log), (level, level_log)):
+        assert diagnose(Predictor(believed, of_log)).verdict == "nothing_missing"
+
+
+def test_a_large_tilt_is_found_where_it_is_and_not_along_its_slope() -> None:
+    """Gravity turns by sines and cosines: by a quarter of a radian 3 % of it are not linear."""
+    scenario, log = arm_that_moves(mount=BaseTilt(0.2, 0.15))
+    (found,) = diagnose(Predictor(scenario, log)).chosen
+    assert found.effect == "BaseTilt"
+    assert [found.parameters[a].value for a in "xy"] == pytest.approx([0.2, 0.15], abs=1e-3)
+
+
+def about_torques(scenario: Scenario, log: Log) -> list[HygieneFinding]:
+    """What the hygiene says of the torques."""
+    findings = inspect(Predictor(scenario, log).motion).findings
+    return [finding for finding in findings if finding.channel == "joint/torque_command"]
+
+
+def with_friction(log: Log) -> Log:
+    """The same of joints with a twentieth of their torque of friction."""
+    torque, v = log["joint/torque_command"], log["joint/velocity"]
+    loss = 0.05 * torque.std(axis=0) * (np.tanh(v / 0.01) + v / v.std(axis=0))
+    return Log(log.channels | {"joint/torque_command": torque + loss}, log.meta)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, np.pi / 2), (np.pi, 0.0), (0.5, -0.3), (-1.2, 1.2)])
+def test_an_arm_on_a_wall_is_said_to_be_there(tilt: tuple[float, float]) -> None:
+    """And where the model has it there, nothing is said."""
+    scenario, log = arm_that_moves(mount=BaseTilt(*tilt))
+    log = with_friction(log)
+    (found,) = about_torques(scenario, log)
+    assert (found.kind, found.severity, found.where) == ("mount", "untrustworthy", ())
+    assert found.size == pytest.approx(np.hypot(*tilt), abs=0.02)
+    told = dataclasses.replace(scenario.believed, effects={"mount": BaseTilt(*tilt)})
+    assert about_torques(dataclasses.replace(scenario, model=told), log) == []
+    with pytest.raises(InputError, match=r"BaseTilt with x: .* allows for it"):
+        inspect(Predictor(scenario, log).motion).trusted(scenario, Predictor(scenario, log).robot)
+
+
+def test_what_is_no_mount_is_not_called_one() -> None:
+    """Reversed signs, another unit, a heavy load, a counterbalance; and a small tilt."""
+    scenario, log = arm_that_moves()
+    log = with_friction(log)
+    torque, q = log["joint/torque_command"], log["joint/position"]
+
+    def read_as(torque: np.ndarray) -> Log:
+        return Log(log.channels | {"joint/torque_command": torque}, log.meta)
+
+    balanced = torque.copy()
+    balanced[:, 1] += 150.0 * np.sin(q[:, 1] - 0.4)
+    loaded = with_friction(arm_that_moves(load=Payload({"link_6": 8.0}, z={"link_6": 0.1}))[1])
+    tilted = with_friction(arm_that_moves(mount=BaseTilt(0.2, 0.1))[1])
+    decoys = (read_as(-torque), read_as(2.5 * torque), read_as(balanced), loaded, tilted)
+    for decoy in decoys:
+        assert "mount" not in {finding.kind for finding in about_torques(scenario, decoy)}
+    assert about_torques(scenario, decoys[0])[0].kind == "torque_sign"
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.2), (-1.5, 0.4), (np.pi, 0.0)])
+def test_a_slope_is_told_by_the_gravity_on_it(slope: tuple[float, float]) -> None:
+    gravity = gravity_on_slope(np.array([0.0, 0.0, -9.81]), slope)
+    again = gravity_on_slope(np.array([0.0, 0.0, -9.81]), slope_of_gravity(gravity))
+    np.testing.assert_allclose(again, gravity, atol=1e-12)
+    if np.hypot(*slope) < np.pi:
+        np.testing.assert_allclose(slope_of_gravity(gravity), slope, atol=1e-12)
