@@ -23,12 +23,15 @@ _CHECKS = (*channel_checks.CHECKS, *model_checks.CHECKS)
 _WHOLE_LOG = (
     "clock_offset",
     "dead_torque",
+    "joint_direction",
+    "joint_zero",
     "mount",
     "not_a_torque",
     "ringing",
     "swapped_joints",
     "torque_scale",
     "torque_sign",
+    "without_gravity",
 )
 _ORDER = ("untrustworthy", "warning", "note")
 

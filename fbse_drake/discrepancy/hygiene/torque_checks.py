@@ -1,18 +1,18 @@
-"""Checks of the torques: does gravity pull from elsewhere, is the channel dead, its sign reversed
-or lost, its unit wrong, its clock off, is it a torque at all?
+"""Checks of the torques: is the machine set up otherwise, is the channel dead, its sign reversed or
+lost, its unit wrong, its clock off, is it a torque at all?
 
 Nothing is asserted that friction, inertia, a counterbalance, an encoder offset or a load could
 explain as well; see `torque_readings`. All tests together call a good log wrong with the
 probability `torque_readings.FALSE_ALARM`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fbse_drake.discrepancy.hygiene.channel_checks import CLIPPED_SHARE
-from fbse_drake.discrepancy.hygiene.mount_check import Mount, another_mount
+from fbse_drake.discrepancy.hygiene.setup_check import Setup, other_setups
 from fbse_drake.discrepancy.hygiene.torque_readings import (
     FALSE_ALARM,
     TRANSITION,
@@ -30,11 +30,10 @@ from fbse_drake.discrepancy.residual.evidence import (
     remarks,
 )
 from fbse_drake.effects.actuation import TorqueReadingLag
-from fbse_drake.effects.geometry import BaseTilt
 
 CHANNEL = "joint/torque_command"
-# Tests of each joint: gravity is another, its sign is reversed or lost, it is dead, its unit or its
-# clock is wrong.
+# Tests of each joint: the setup is another, its sign is reversed or lost, it is dead, its unit or
+# its clock is wrong.
 _TESTS = 6
 # A torque in another unit is off by more than this factor; by more than the smaller one its scale
 # is doubtful.
@@ -77,9 +76,9 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
     torques, found = JointTorques(evidence), _Found()
     motors = np.flatnonzero(evidence.robot.description.has_motor).tolist()
     tested = [k for k in motors if _is_visible(evidence, torques, k)]
-    mount = another_mount(evidence, torques, tested, level(torques))
-    if mount is not None:
-        yield _mount_finding(mount)
+    setups = other_setups(evidence, motors, level(torques))
+    if setups:
+        yield from map(_setup_finding, setups)
         return
     for k in tested:
         _test(evidence, torques, k, found)
@@ -88,15 +87,12 @@ def check_torque(evidence: Evidence) -> Iterable[HygieneFinding]:
     yield from _clock(evidence, torques, [k for k in tested if evidence.joints[k] not in wrong])
 
 
-def _mount_finding(mount: Mount) -> HygieneFinding:
-    x, y = mount.tilt
-    text = (
-        "gravity pulls from elsewhere than the model says, as if the base were mounted tilted by "
-        f"{np.degrees(mount.angle):.0f} deg; what the model needs is wrong in all joints "
-        f"({BaseTilt.__name__} with x: {x:.3g} and y: {y:.3g} among the model's effects allows "
-        "for it)"
-    )
-    return remark("mount", "untrustworthy", CHANNEL, mount.angle, "rad", text)
+def _setup_finding(setups: Sequence[Setup]) -> HygieneFinding:
+    """The best of several setups, and those that are as good."""
+    best = setups[0]
+    text = "; or ".join(setup.text for setup in setups)
+    text += "; what the model needs is wrong in all joints"
+    return remark(best.kind, "untrustworthy", CHANNEL, best.size, best.unit, text)
 
 
 def _is_visible(evidence: Evidence, torques: JointTorques, k: int) -> bool:

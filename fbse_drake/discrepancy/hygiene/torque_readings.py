@@ -20,7 +20,7 @@ from scipy.stats import t as student
 from fbse_drake.discrepancy.identification.inertial import inertial_regressor
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.evidence import Evidence
-from fbse_drake.discrepancy.residual.recorded_signals import Instants
+from fbse_drake.discrepancy.residual.recorded_signals import Instants, averaged
 
 # Probability that any reading of any torque of a log that is as recorded is called wrong.
 FALSE_ALARM = 1e-3
@@ -118,23 +118,28 @@ def chance(gains: np.ndarray, stretch: np.ndarray) -> float:
 class JointTorques:
     """Torques of a log beside what the model needs, and what else they may consist of."""
 
-    def __init__(self, evidence: Evidence, blocks: Instants | None = None):
+    def __init__(self, evidence: Evidence, blocks: Instants | None = None, length: int = 1):
         """Nothing is fitted yet.
 
         Args:
             blocks: channels in another order, say; by default those of the log.
+            length: so many blocks of the log are averaged; `blocks` are already.
         """
-        self._evidence, n = evidence, len(evidence.joints)
-        self._blocks = evidence.motion.blocks if blocks is None else blocks
-        self.torque = self._blocks.torque_command
+        self._evidence, self._length, n = evidence, length, len(evidence.joints)
+        self.blocks = blocks or averaged(evidence.motion.blocks, length)
+        self.torque = self.blocks.torque_command
         if blocks is None:
-            self.needed = evidence.link_torque
+            self.needed = block_means(evidence.link_torque, length)
         else:
             residual = evidence.motion.equation.residual(blocks, kinematic=False)
             self.needed = self.torque - residual[:, :n]
-        # Of a block [s].
-        self.duration = evidence.motion.length * evidence.period
+        # From one block to the next [s].
+        self.duration = length * evidence.motion.length * evidence.period
         self._stretch = (np.arange(len(self.torque)) * self.duration / STRETCH).astype(int)
+
+    def of(self, blocks: Instants) -> "JointTorques":
+        """Of other channels in the same blocks."""
+        return JointTorques(self._evidence, blocks, self._length)
 
     def with_more(self, needed: np.ndarray) -> "JointTorques":
         """The same if the model needed so much more, (B, n) [Nm]."""
@@ -152,7 +157,7 @@ class JointTorques:
             at_end = (column == column.min()) | (column == column.max())
             if at_end.sum() > _OFTEN and at_end.mean() < _MOSTLY:
                 known[:, k] &= ~at_end[: len(known) * length].reshape(-1, length).any(axis=1)
-        return known
+        return block_means(known, self._length) == 1.0
 
     def stretches(self, k: int) -> np.ndarray:
         """Stretch of time of each known block of a joint."""
@@ -185,7 +190,7 @@ class JointTorques:
             everything: crooked encoders and a load at the end of the machine too, which take
                 longer.
         """
-        at, joint = self._blocks, self._evidence.joints[k]
+        at, joint = self.blocks, self._evidence.joints[k]
         q, v, a = at.joint_position[:, k], at.joint_velocity[:, k], at.joint_acceleration[:, k]
         parts = [
             ("a bias", np.ones_like(q), -np.inf, np.inf),
@@ -208,12 +213,12 @@ class JointTorques:
     def _offsets(self) -> np.ndarray:
         """Change of what the model needs per angle that is read too much, (B, n, n)."""
         equation, n = self._evidence.motion.equation, self.torque.shape[1]
-        here = equation.residual(self._blocks, kinematic=False)[:, :n]
+        here = equation.residual(self.blocks, kinematic=False)[:, :n]
         result = np.empty((len(here), n, n))
         for joint in range(n):
-            moved = self._blocks.joint_position.copy()
+            moved = self.blocks.joint_position.copy()
             moved[:, joint] -= _SMALL_ANGLE
-            at = replace(self._blocks, joint_position=moved)
+            at = replace(self.blocks, joint_position=moved)
             there = equation.residual(at, kinematic=False)[:, :n]
             result[:, :, joint] = (here - there) / _SMALL_ANGLE
         return result
@@ -227,7 +232,7 @@ class JointTorques:
             return np.zeros((len(self.torque), n, 0))
         plant = evidence.robot.plant
         last = plant.GetJointByName(evidence.joints[-1]).child_body().name()
-        return inertial_regressor(evidence.motion.equation, self._blocks, last)[:, :n, :4]
+        return inertial_regressor(evidence.motion.equation, self.blocks, last)[:, :n, :4]
 
     def as_recorded(self, k: int, columns: Columns) -> Reading:
         """What the model needs, and nothing but the columns beside it."""

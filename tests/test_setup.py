@@ -1,7 +1,9 @@
-"""Machines that are not mounted as their model says: a little, which is an effect, or on a wall,
-which the hygiene says. Truth: gravity weighed body by body, and plans of tilted arms."""
+"""Machines that are not set up as their model says: tilted a little, which is an effect, or mounted
+on a wall, or with joints that count otherwise, which the hygiene says. Truth: gravity weighed body
+by body, plans of tilted arms, and channels that are counted anew."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from fbse_drake.discrepancy.residual.evidence import HygieneFinding
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.geometry import BaseTilt
 from fbse_drake.effects.inertia import Payload
+from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import gravity_on_slope, slope_of_gravity
 from fbse_drake.scenario import RecordingConfig, RobotConfig, Scenario, build_robot
@@ -108,6 +111,24 @@ def with_friction(log: Log) -> Log:
     return Log(log.channels | {"joint/torque_command": torque + loss}, log.meta)
 
 
+ANOTHER = {
+    "mount": "gravity pulls from elsewhere than the model says, by",
+    "joint_direction": "axis_3 counts its angle and torque the other way than the model does",
+    "joint_zero": r"axis_2 counts its angle from another zero than the model does, by 90 deg",
+    "without_gravity": "torques are without what gravity needs",
+}
+
+
+def counted(log: Log, joint: int, *, sign: float = 1.0, zero: float = 0.0) -> Log:
+    """The same of a joint that counts its angle and torque the other way, or from another zero."""
+    channels = dict(log.channels)
+    for name in ("joint/position", "joint/velocity", "joint/torque_command"):
+        channels[name] = channels[name].copy()
+        channels[name][:, joint] *= sign
+    channels["joint/position"][:, joint] += zero
+    return Log(channels, log.meta)
+
+
 @pytest.mark.parametrize("tilt", [(0.0, np.pi / 2), (np.pi, 0.0), (0.5, -0.3), (-1.2, 1.2)])
 def test_an_arm_on_a_wall_is_said_to_be_there(tilt: tuple[float, float]) -> None:
     """And where the model has it there, nothing is said."""
@@ -122,8 +143,40 @@ def test_an_arm_on_a_wall_is_said_to_be_there(tilt: tuple[float, float]) -> None
         inspect(Predictor(scenario, log).motion).trusted(scenario, Predictor(scenario, log).robot)
 
 
-def test_what_is_no_mount_is_not_called_one() -> None:
-    """Reversed signs, another unit, a heavy load, a counterbalance; and a small tilt."""
+def test_joints_that_count_otherwise_are_named() -> None:
+    """Also two at a time, one after the other; and what allows for another zero does."""
+    scenario, log = arm_that_moves()
+    log = with_friction(log)
+    turned, moved = counted(log, 2, sign=-1.0), counted(log, 1, zero=np.pi / 2)
+    for kind, wrong in (("joint_direction", turned), ("joint_zero", moved)):
+        (found,) = about_torques(scenario, wrong)
+        assert (found.kind, found.severity) == (kind, "untrustworthy")
+        assert re.search(ANOTHER[kind], found.text)
+        assert "; or " not in found.text
+    both = about_torques(scenario, counted(turned, 1, zero=np.pi / 2))
+    assert {finding.kind for finding in both} == {"joint_direction", "joint_zero"}
+    known = {"zero": EncoderOffset({"axis_2": np.pi / 2})}
+    told = dataclasses.replace(scenario.believed, effects=known)
+    assert about_torques(dataclasses.replace(scenario, model=told), moved) == []
+
+
+def test_torques_without_those_of_gravity_are_said_to_be_so() -> None:
+    scenario, log = arm_that_moves()
+    arm, q = build_robot(scenario.believed), log["joint/position"]
+    context = arm.plant.CreateDefaultContext()
+    torque = with_friction(log)["joint/torque_command"].copy()
+    for row, posture in zip(torque, q, strict=True):
+        arm.set_joint_positions(context, posture)
+        row += arm.plant.CalcGravityGeneralizedForces(context)[arm.velocity_index]
+    (found,) = about_torques(
+        scenario, Log(log.channels | {"joint/torque_command": torque}, log.meta)
+    )
+    assert found.kind == "without_gravity"
+    assert re.search(ANOTHER["without_gravity"], found.text)
+
+
+def test_the_usual_setup_is_not_called_another() -> None:
+    """With reversed torques, another unit, a heavy load, a counterbalance; and a small tilt."""
     scenario, log = arm_that_moves()
     log = with_friction(log)
     torque, q = log["joint/torque_command"], log["joint/position"]
@@ -133,12 +186,15 @@ def test_what_is_no_mount_is_not_called_one() -> None:
 
     balanced = torque.copy()
     balanced[:, 1] += 150.0 * np.sin(q[:, 1] - 0.4)
+    coupled = torque.copy()
+    coupled[:, 2] += torque[:, 1]
     loaded = with_friction(arm_that_moves(load=Payload({"link_6": 8.0}, z={"link_6": 0.1}))[1])
     tilted = with_friction(arm_that_moves(mount=BaseTilt(0.2, 0.1))[1])
-    decoys = (read_as(-torque), read_as(2.5 * torque), read_as(balanced), loaded, tilted)
-    for decoy in decoys:
-        assert "mount" not in {finding.kind for finding in about_torques(scenario, decoy)}
-    assert about_torques(scenario, decoys[0])[0].kind == "torque_sign"
+    reversed_ = read_as(-torque)
+    others = (read_as(2.5 * torque), read_as(balanced), read_as(coupled), loaded, tilted)
+    for decoy in (reversed_, *others):
+        assert not {finding.kind for finding in about_torques(scenario, decoy)} & set(ANOTHER)
+    assert about_torques(scenario, reversed_)[0].kind == "torque_sign"
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.2), (-1.5, 0.4), (np.pi, 0.0)])
