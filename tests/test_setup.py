@@ -111,6 +111,31 @@ def with_friction(log: Log) -> Log:
     return Log(log.channels | {"joint/torque_command": torque + loss}, log.meta)
 
 
+def test_an_encoder_that_was_homed_badly_is_found() -> None:
+    """By 3 deg, which would make a robot fall and moves an arm's centre of mass by a centimetre."""
+    scenario, log = arm_that_moves()
+    found = diagnose(Predictor(scenario, counted(log, 2, zero=0.05))).chosen
+    assert [(f.effect, f.targets) for f in found] == [("EncoderOffset", ("axis_3",))]
+    low, high = found[0].parameters["offset"].interval
+    assert low <= 0.05 <= high
+    assert high - low < 5e-3
+
+
+def test_torques_that_come_very_late_are_said_to_be_so_late() -> None:
+    """And one alone, which wants to be as late because something else is wrong with it, is not."""
+    scenario, log = arm_that_moves()
+    log = with_friction(log)
+    torque, samples = log["joint/torque_command"], 15
+    late = np.concatenate([np.repeat(torque[:1], samples, axis=0), torque[:-samples]])
+    (found,) = about_torques(scenario, Log(log.channels | {"joint/torque_command": late}, log.meta))
+    assert (found.kind, found.where) == ("clock_offset", ())
+    assert found.size == pytest.approx(samples * log.meta["period"], abs=0.01)
+    alone = torque.copy()
+    alone[:, 2] = late[:, 2]
+    one = Log(log.channels | {"joint/torque_command": alone}, log.meta)
+    assert "clock_offset" not in {finding.kind for finding in about_torques(scenario, one)}
+
+
 ANOTHER = {
     "mount": "gravity pulls from elsewhere than the model says, by",
     "joint_direction": "axis_3 counts its angle and torque the other way than the model does",

@@ -258,10 +258,16 @@ def _clock(
     if late:
         where = () if len(late) > 0.5 * len(places) else tuple(late)
         seconds = float(np.median([*late.values()]))
+        # A clock is that of all joints.
+        cause = (
+            "by its clock, by a filter before it was recorded or by a transmission that gives way"
+            if where
+            else "by its clock or by a filter before it was recorded, for no mechanism does that"
+        )
         text = (
             f"{', '.join(where)}{' ' if where else ''}comes {1e3 * seconds:.3g} ms late against "
-            "the motion that it makes, by its clock or by a filter before it was recorded, for no "
-            "mechanism does that; accelerations will look like friction and the other way round"
+            f"the motion that it makes, {cause}; accelerations will look like friction and the "
+            "other way round"
         )
         # A short one is looked for as an effect.
         motion = evidence.motion
