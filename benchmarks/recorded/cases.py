@@ -16,6 +16,7 @@ from benchmarks.recorded.course import Course, inverse_dynamics, swings
 from benchmarks.recorded.machine import Machine, random_machine
 from benchmarks.recorded.physics import Hidden, random_physics
 from benchmarks.recorded.recorder import Recorder, random_recorder
+from benchmarks.recorded.setup import random_setup, stamped
 from fbse_drake import Log, Scenario
 from fbse_drake.campaign.steps import Material
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
@@ -94,6 +95,9 @@ def record(number: int, folder: Path) -> Recording:
 
     known = course(believed, "believed")
     hidden = random_physics(random, believed, known)
+    # Of its own, so that all else of a number stays what it was.
+    of_setup = np.random.default_rng([number, 72])
+    hidden += random_setup(of_setup, believed)
     machine = believed
     for physics in hidden:
         machine = physics.change(machine)
@@ -112,7 +116,10 @@ def record(number: int, folder: Path) -> Recording:
         sensors=sensors,
         recording=recording,
     )
-    log = recorder.log(random, believed.joints, real, np.asarray(torque))
+    shown = real
+    for physics in hidden:
+        shown = physics.read(shown)
+    log = stamped(of_setup, recorder.log(random, believed.joints, shown, np.asarray(torque)))
     return Recording(believed, recorder, hidden, scenario, log)
 
 

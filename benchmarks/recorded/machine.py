@@ -1,10 +1,12 @@
 """Serial machines that nobody built: any number of joints about any axes."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fbse_drake.files import write_text
 from fbse_drake.robot.plant import Robot, make_robot
@@ -52,6 +54,8 @@ class Machine:
     rotor_inertia: tuple[float, ...]
     posture: tuple[float, ...]
     amplitude: tuple[float, ...]
+    # Rotation vector about x and y by which it is not mounted level [rad].
+    tilt: tuple[float, float] = (0.0, 0.0)
 
     @property
     def joints(self) -> list[str]:
@@ -62,7 +66,7 @@ class Machine:
 
     def description(self, folder: Path) -> Path:
         """Writes the robot's description and its URDF into a folder."""
-        write_text(folder / "machine.urdf", _urdf(self.links))
+        write_text(folder / "machine.urdf", _urdf(self.links, self.tilt))
         lines = ["urdf: machine.urdf", "base: base", "fixed_base: true"]
         write_text(
             folder / "machine.yaml", "\n".join([*lines, f"joints: [{', '.join(self.joints)}]", ""])
@@ -116,7 +120,7 @@ def _link(random: np.random.Generator, number: int, scale: float) -> Link:
     )
 
 
-def _urdf(links: tuple[Link, ...]) -> str:
+def _urdf(links: tuple[Link, ...], tilt: tuple[float, float]) -> str:
     robot = ElementTree.Element("robot", name="machine")
     ElementTree.SubElement(robot, "link", name="base")
     for before, link in zip(("base", *(link.name for link in links)), links, strict=False):
@@ -131,7 +135,9 @@ def _urdf(links: tuple[Link, ...]) -> str:
         joint = ElementTree.SubElement(robot, "joint", name=link.joint, type=kind)
         ElementTree.SubElement(joint, "parent", link=before)
         ElementTree.SubElement(joint, "child", link=link.name)
-        ElementTree.SubElement(joint, "origin", xyz=_text(link.origin))
+        mount = Rotation.from_rotvec([*tilt, 0.0] if before == "base" else np.zeros(3))
+        turned = {"xyz": _text(mount.apply(link.origin)), "rpy": _text(mount.as_euler("xyz"))}
+        ElementTree.SubElement(joint, "origin", turned)
         ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
         limits = {"lower": "-6.3", "upper": "6.3", "effort": "1e5", "velocity": "100"}
         ElementTree.SubElement(joint, "limit", limits)
@@ -139,5 +145,5 @@ def _urdf(links: tuple[Link, ...]) -> str:
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-def _text(vector: tuple[float, float, float]) -> str:
+def _text(vector: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in vector)

@@ -31,6 +31,8 @@ class Hidden:
     change: Callable[[Machine], Machine] = field(default=lambda machine: machine)
     # What the drives are told to give that the joints shall get a torque, (N, n).
     told: Callable[[np.ndarray], np.ndarray] = field(default=lambda torque: torque)
+    # What encoders read of a course.
+    read: Callable[[Course], Course] = field(default=lambda course: course)
 
 
 def random_physics(
