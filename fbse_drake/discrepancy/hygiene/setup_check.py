@@ -35,6 +35,10 @@ _UNEXPLAINED = 0.05
 _BETTER = 0.5
 # Setups that are worse than the best by chance more often than this are named as well.
 _AS_GOOD = 0.01
+# Averages without which nothing is said of a joint.
+_FEWEST = 20
+# What is left of an exact log is rounding, as a share of the torque.
+_ROUNDING = 1e-9
 # How often another setup is looked for beside one that was found.
 _MOST_SETUPS = 3
 # Averages in a stretch of time: longer ones than elsewhere, for gravity is slow.
@@ -64,16 +68,18 @@ def other_setups(evidence: Evidence, places: Sequence[int], level: float) -> lis
         places: of joints whose torque is looked at.
         level: largest probability of a false alarm.
     """
-    if evidence.robot.has_floating_base or not places:
+    if evidence.robot.has_floating_base:
         return []
     duration = evidence.motion.length * evidence.period
     length = max(1, round(STRETCH / duration / _IN_A_STRETCH))
     torques = JointTorques(evidence, length=length)
+    moved = (torques.known.sum(axis=0) >= _FEWEST) & (np.ptp(torques.torque, axis=0) > 0)
+    places = [k for k in places if moved[k]]
     before, unexplained = {k: _best_reading(torques, k) for k in places}, None
     found: list[list[Setup]] = []
     chain: list[list[Setup]] = []
-    while len(chain) < _MOST_SETUPS and (left := _unexplained(torques, places)):
-        unexplained = unexplained or left
+    while len(chain) < _MOST_SETUPS and (missed := _unexplained(torques, places)):
+        unexplained = unexplained or missed
         alternatives = list(_alternatives(evidence, torques, places))
         best = min(alternatives, key=lambda setup: _size_left(setup.torques, places))
         after = _readings(best.torques, places)
@@ -182,7 +188,7 @@ def _fitted_gravity(
         q, _ = np.linalg.qr(beside[known] / np.linalg.norm(beside[known], axis=0).clip(1e-300))
         missing, pulls = (part - q @ (q.T @ part) for part in (missing, pulls))
         left = missing - pulls @ np.linalg.lstsq(pulls, missing)[0]
-        deviation = max(float(left.std()), 1e-300)
+        deviation = float(left.std()) + _ROUNDING * float(np.abs(torques.torque[known, k]).max())
         values.append(pulls / deviation)
         targets.append(missing / deviation)
     # With the same squares in three rows.
@@ -192,11 +198,11 @@ def _fitted_gravity(
     def gravity(angles: np.ndarray) -> np.ndarray:
         return strength * Rotation.from_euler("yz", angles).apply([0.0, 0.0, -1.0])
 
-    def left(angles: np.ndarray) -> float:
+    def misfit(angles: np.ndarray) -> float:
         return float(np.linalg.norm(target - r @ (gravity(angles) - believed)))
 
-    start = min(map(np.array, itertools.product(_ANGLES[:7], _ANGLES)), key=left)
-    return gravity(minimize(left, start, method="Nelder-Mead").x)
+    start = min(map(np.array, itertools.product(_ANGLES[:7], _ANGLES)), key=misfit)
+    return gravity(minimize(misfit, start, method="Nelder-Mead").x)
 
 
 def _other_direction(evidence: Evidence, torques: JointTorques, joint: int) -> Iterator[Setup]:
