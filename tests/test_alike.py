@@ -6,11 +6,13 @@ file.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import swinging_legs
 
+from benchmarks.recorded.cases import record
 from fbse_drake import Log, Scenario
 from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
@@ -100,3 +102,13 @@ def test_a_limit_leaves_nothing_of_what_is_commanded_beyond_it(
         return sign * steepness * np.maximum(along - limit, 0.0)
 
     assert set(alternatives(diagnosis_of(swing, loss, "TorqueBias", "TorqueSaturation"))) == named
+
+
+def test_a_fit_in_the_model_is_not_compared_with_linear_ones(tmp_path: Path) -> None:
+    """A drive that gives too little torque, which less inertia explains as well as long as both are
+    linear; what that leaves when it is in the model says nothing of what the other would."""
+    recording = record(14054, tmp_path)
+    (gain,) = (hidden for hidden in recording.hidden if hidden.names == ("TorqueGain",))
+    found = diagnose(Predictor(recording.scenario, recording.log)).chosen
+    said = [{f.effect, *f.confusable_with} for f in found if f.targets == gain.targets]
+    assert any("TorqueGain" in names for names in said)

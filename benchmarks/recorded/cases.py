@@ -63,13 +63,16 @@ class Recording:
     @property
     def truth(self) -> Mapping[str, set[str]]:
         """Effects that rightly say something about a target. What a link has may look like what its
-        joint could have, and is then said of the joint."""
+        joint could have, and is then said of the joint; and the first joint's zero is the mount's,
+        about its axis."""
         joint_of = {link.name: link.joint for link in self.machine.links}
         found: dict[str, set[str]] = {}
         for hidden in self.hidden:
             for target in hidden.targets:
                 for name in hidden.names:
-                    for place in {target, joint_of.get(target, target)}:
+                    first = self.machine.joints[0]
+                    twin = {first: "robot", "robot": first}.get(target, target)
+                    for place in {target, joint_of.get(target, target), twin}:
                         found.setdefault(place, set()).update((name, *_FRICTION.get(name, ())))
         if self.recorder.late:
             for joint in self.machine.joints:

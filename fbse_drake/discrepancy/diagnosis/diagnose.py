@@ -250,9 +250,10 @@ def diagnose(
             if unexplained and not final.candidates:
                 left = np.array([structure.index for structure in unexplained])
                 guesses = single_guesses(proposals, left)
+            linear = search.linear
             if dictionary.inertia is not None:
-                alternatives = rivals(proposals, final)
-            equal = indistinguishable(fits, alternatives, final)
+                alternatives, linear = rivals(proposals, final), final
+            equal = indistinguishable(fits, alternatives, linear)
             if experiments is None or not experiments.serve(predictor.scenario):
                 experiments = Experiments(predictor.scenario)
             for k, effect in enumerate(dictionary.effects):

@@ -57,7 +57,9 @@ class Search:
     proposals: Proposals
     # The last is what was found, when it is in the model.
     path: list[Explanation]
-    # By member of the last, where they were looked for.
+    # The same before it was: linear, as the alternatives of its members are.
+    linear: Explanation
+    # By its member, where they were looked for.
     alternatives: dict[int, list[Explanation]]
     # Sum of squares of each row before anything is explained, (R,).
     before: np.ndarray
@@ -136,7 +138,8 @@ def _late_torques(search: Search) -> LateTorques | None:
     }
     if search.partial is not None or not any(map(significance.matters, members.values())):
         return None
-    return LateTorques(fits, final, members, indistinguishable(fits, search.alternatives, final))
+    equal = indistinguishable(fits, search.alternatives, search.linear)
+    return LateTorques(fits, final, members, equal)
 
 
 def _with_torques_in_time(
@@ -248,7 +251,8 @@ def _searched(
             path[-1], alternatives = _settled_and_frugal(proposals, path[-1])
     except Interrupted as stop:
         partial = str(stop)
-    final, inertia = consistent(proposals.fits, path[-1])
+    linear = path[-1]
+    final, inertia = consistent(proposals.fits, linear)
     path[-1], remaining, left = added(proposals.fits, final)
     significance = proposals.fits.dictionary.significance
     structures = leftover_structure(predictor.motion, remaining, left)
@@ -262,6 +266,7 @@ def _searched(
     return Search(
         proposals,
         path,
+        linear,
         alternatives,
         before,
         inertia,
