@@ -180,6 +180,9 @@ def test_joints_that_count_otherwise_are_named() -> None:
         assert "; or " not in found.text
     both = about_torques(scenario, counted(turned, 1, zero=np.pi / 2))
     assert {finding.kind for finding in both} == {"joint_direction", "joint_zero"}
+    on_a_wall = counted(with_friction(arm_that_moves(mount=BaseTilt(0.0, 1.2))[1]), 2, sign=-1.0)
+    both = about_torques(scenario, on_a_wall)
+    assert {finding.kind for finding in both} == {"joint_direction", "mount"}
     known = {"zero": EncoderOffset({"axis_2": np.pi / 2})}
     told = dataclasses.replace(scenario.believed, effects=known)
     assert about_torques(dataclasses.replace(scenario, model=told), moved) == []

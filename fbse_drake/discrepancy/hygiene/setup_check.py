@@ -156,16 +156,15 @@ def _other_gravity(
     evidence: Evidence, torques: JointTorques, places: Sequence[int]
 ) -> Iterator[Setup]:
     """A machine that is mounted elsewhere, or whose torques are without those of gravity."""
-    believed = evidence.robot.plant.gravity_field().gravity_vector()
-    per_gravity = evidence.motion.equation.gravity_torques(torques.blocks)
     text = (
         "torques are without what gravity needs, as where a controller takes off what it "
         "compensates"
     )
-    yield Setup("without_gravity", text, 0.0, "1", torques.with_more(per_gravity @ believed))
-    gravity = _fitted_gravity(torques, places, per_gravity, believed)
-    tilt, strength = slope_of_gravity(gravity), float(np.linalg.norm(believed))
-    angle = float(np.arccos(np.clip(gravity @ believed / strength**2, -1.0, 1.0)))
+    yield Setup("without_gravity", text, 0.0, "1", torques.under(np.zeros(3)))
+    believed = evidence.robot.plant.gravity_field().gravity_vector()
+    gravity = _fitted_gravity(torques, places, float(np.linalg.norm(believed)))
+    tilt = slope_of_gravity(gravity)
+    angle = float(np.arccos(np.clip(gravity @ believed / (believed @ believed), -1.0, 1.0)))
     if angle < _LARGE_TILT:
         return
     text = (
@@ -173,18 +172,17 @@ def _other_gravity(
         f"another mount ({BaseTilt.__name__} with x: {tilt[0]:.3g} and y: {tilt[1]:.3g} among the "
         "model's effects allows for it)"
     )
-    yield Setup("mount", text, angle, "rad", torques.with_more(-per_gravity @ (gravity - believed)))
+    yield Setup("mount", text, angle, "rad", torques.under(gravity))
 
 
-def _fitted_gravity(
-    torques: JointTorques, places: Sequence[int], per_gravity: np.ndarray, believed: np.ndarray
-) -> np.ndarray:
-    """Gravity of the model's strength from where it fits best, (3,) [m/s^2]: least squares of all
-    joints, each weighed by what is left of it, beside whatever else its torque may consist of."""
+def _fitted_gravity(torques: JointTorques, places: Sequence[int], strength: float) -> np.ndarray:
+    """Gravity of this strength [m/s^2] from where it fits best, (3,): least squares of all joints,
+    each weighed by what is left of it, beside whatever else its torque may consist of."""
     values, targets = [], []
     for k in places:
         known, beside = torques.known[:, k], torques.columns(k).values
-        missing, pulls = (torques.torque - torques.needed)[known, k], -per_gravity[known, k]
+        missing = (torques.torque - torques.needed)[known, k]
+        pulls = -torques.per_gravity[known, k]
         q, _ = np.linalg.qr(beside[known] / np.linalg.norm(beside[known], axis=0).clip(1e-300))
         missing, pulls = (part - q @ (q.T @ part) for part in (missing, pulls))
         left = missing - pulls @ np.linalg.lstsq(pulls, missing)[0]
@@ -193,13 +191,13 @@ def _fitted_gravity(
         targets.append(missing / deviation)
     # With the same squares in three rows.
     q, r = np.linalg.qr(np.concatenate(values))
-    target, strength = q.T @ np.concatenate(targets), float(np.linalg.norm(believed))
+    target = q.T @ np.concatenate(targets)
 
     def gravity(angles: np.ndarray) -> np.ndarray:
         return strength * Rotation.from_euler("yz", angles).apply([0.0, 0.0, -1.0])
 
     def misfit(angles: np.ndarray) -> float:
-        return float(np.linalg.norm(target - r @ (gravity(angles) - believed)))
+        return float(np.linalg.norm(target - r @ (gravity(angles) - torques.gravity)))
 
     start = min(map(np.array, itertools.product(_ANGLES[:7], _ANGLES)), key=misfit)
     return gravity(minimize(misfit, start, method="Nelder-Mead").x)

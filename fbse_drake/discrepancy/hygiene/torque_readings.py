@@ -9,7 +9,6 @@ time (Vuong 1989, "Likelihood ratio tests for model selection and non-nested hyp
 Econometrica 57), with Student's t.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -118,14 +117,22 @@ def chance(gains: np.ndarray, stretch: np.ndarray) -> float:
 class JointTorques:
     """Torques of a log beside what the model needs, and what else they may consist of."""
 
-    def __init__(self, evidence: Evidence, blocks: Instants | None = None, length: int = 1):
+    def __init__(
+        self,
+        evidence: Evidence,
+        blocks: Instants | None = None,
+        length: int = 1,
+        more_gravity: np.ndarray | None = None,
+    ):
         """Nothing is fitted yet.
 
         Args:
             blocks: channels in another order, say; by default those of the log.
             length: so many blocks of the log are averaged; `blocks` are already.
+            more_gravity: beyond the model's, on a fixed base, (3,) [m/s^2]; by default none.
         """
         self._evidence, self._length, n = evidence, length, len(evidence.joints)
+        self._more_gravity = more_gravity
         self.blocks = blocks or averaged(evidence.motion.blocks, length)
         self.torque = self.blocks.torque_command
         if blocks is None:
@@ -133,19 +140,31 @@ class JointTorques:
         else:
             residual = evidence.motion.equation.residual(blocks, kinematic=False)
             self.needed = self.torque - residual[:, :n]
+        if more_gravity is not None:
+            self.needed = self.needed - self.per_gravity @ more_gravity
         # From one block to the next [s].
         self.duration = length * evidence.motion.length * evidence.period
         self._stretch = (np.arange(len(self.torque)) * self.duration / STRETCH).astype(int)
 
     def of(self, blocks: Instants) -> "JointTorques":
         """Of other channels in the same blocks."""
-        return JointTorques(self._evidence, blocks, self._length)
+        return JointTorques(self._evidence, blocks, self._length, self._more_gravity)
 
-    def with_more(self, needed: np.ndarray) -> "JointTorques":
-        """The same if the model needed so much more, (B, n) [Nm]."""
-        changed = copy(self)
-        changed.needed = self.needed + needed
-        return changed
+    @cached_property
+    def gravity(self) -> np.ndarray:
+        """What is taken for gravity, (3,) [m/s^2]."""
+        of_model = self._evidence.robot.plant.gravity_field().gravity_vector()
+        return of_model if self._more_gravity is None else of_model + self._more_gravity
+
+    @cached_property
+    def per_gravity(self) -> np.ndarray:
+        """See `EquationOfMotion.gravity_torques`, (B, n, 3)."""
+        return self._evidence.motion.equation.gravity_torques(self.blocks)
+
+    def under(self, gravity: np.ndarray) -> "JointTorques":
+        """The same under another gravity."""
+        more = gravity - self._evidence.robot.plant.gravity_field().gravity_vector()
+        return JointTorques(self._evidence, self.blocks, self._length, more)
 
     @cached_property
     def known(self) -> np.ndarray:
