@@ -33,7 +33,7 @@ _UNEXPLAINED = 0.05
 # Another setup leaves at most this share of the variance of what any other reading of such torques
 # leaves, in the mean of the joints.
 _BETTER = 0.5
-# Setups that are worse than the best by chance more often than this are named as well.
+# Setups that are worse than the best by chance more often than this are as good.
 _AS_GOOD = 0.01
 # Averages without which nothing is said of a joint.
 _FEWEST = 20
@@ -83,6 +83,8 @@ def other_setups(evidence: Evidence, places: Sequence[int], level: float) -> lis
         alternatives = list(_alternatives(evidence, torques, places))
         best = min(alternatives, key=lambda setup: _size_left(setup.torques, places))
         after = _readings(best.torques, places)
+        if _chance(best.torques, _readings(torques, places), after) > _AS_GOOD:
+            break
         as_good = [
             setup
             for setup in alternatives
