@@ -36,8 +36,9 @@ diagnosis looks for all of them.
 Pictures of joint effects show the torque that is lost in one joint that swings fast and slowly
 under a load that comes in steps, over time, velocity, angle and commanded torque: where the points
 lie on one line, the effect depends on nothing else. Those of all other effects show what the
-effect adds to the [residual](../missing_physics.md) of a walk of 3.5 s, in its three strongest
-rows, as multiples of the sensors' noise there. Linear parameters are a tenth of the largest
+effect adds to the [residual](../missing_physics.md) of a walk of 3.5 s, or of legs that swing in a
+gantry where the base has to be fixed, in its three strongest rows, as multiples of the sensors'
+noise there. Linear parameters are a tenth of the largest
 plausible ones, others as usual. The pictures are drawn by the effects' own code when these pages
 are built.
 

@@ -1,7 +1,8 @@
 """Pictures of what each effect of the library looks like, made by the effects themselves.
 
 A joint torque effect is shown on one joint that moves and is loaded as `_exercise` says; any other
-by what the diagnosis predicts that it adds to the residual of a short walk.
+by what the diagnosis predicts that it adds to the residual of a short walk, or of legs that swing
+in a gantry.
 """
 
 import io
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 
 from fbse_drake import load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.dictionary import usual_values
+from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.geometry import GeometryEffect
@@ -94,8 +96,16 @@ def _walk(*, motor_encoders: bool = False) -> Predictor:
     return Predictor(scenario, simulate(scenario).log)
 
 
+@cache
+def _swing() -> Predictor:
+    scenario = load_scenario("leg_swing_gantry", overrides=["duration=3.5"])
+    return Predictor(scenario, planned_log(scenario))
+
+
 def _residual(effect: type[Effect]) -> Figure:
-    predictor = _walk(motor_encoders=effect.needs_motor_encoder)
+    predictor = (
+        _swing() if effect.needs_fixed_base else _walk(motor_encoders=effect.needs_motor_encoder)
+    )
     residual = predictor.residual
     found = predictor.signature(effect, _target(effect), usual_values(effect))
     added = found.offset + found.values @ _sizes(effect)
