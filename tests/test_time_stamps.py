@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fbse_drake import load_scenario
+from fbse_drake.discrepancy.diagnosis import reading
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
-from fbse_drake.discrepancy.residual import recorded_motion
 from fbse_drake.discrepancy.residual.time_stamps import sampled_evenly
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig
@@ -70,6 +70,6 @@ def test_the_residual_of_an_arm_is_that_of_even_samples(monkeypatch: pytest.Monk
     (note,) = (finding for finding in inspect(found).findings if finding.kind == "jitter")
     assert note.severity == "note"
     assert "taken to be even" in note.text
-    monkeypatch.setattr(recorded_motion, "sampled_evenly", lambda log: log)
+    monkeypatch.setattr(reading, "sampled_evenly", lambda log: log)
     by_stamps = Predictor(scenario, scattered).motion.residual.value
     assert (np.abs(by_stamps).max(axis=0) > 10 * left).all()

@@ -65,14 +65,14 @@ class Recording:
         """Effects that rightly say something about a target. What a link has may look like what its
         joint could have, and is then said of the joint; and the first joint's zero is the mount's,
         about its axis."""
-        joint_of = {link.name: link.joint for link in self.machine.links}
+        first = self.machine.joints[0]
+        alike = {link.name: link.joint for link in self.machine.links}
+        alike |= {first: "robot", "robot": first}
         found: dict[str, set[str]] = {}
         for hidden in self.hidden:
             for target in hidden.targets:
                 for name in hidden.names:
-                    first = self.machine.joints[0]
-                    twin = {first: "robot", "robot": first}.get(target, target)
-                    for place in {target, joint_of.get(target, target), twin}:
+                    for place in {target, alike.get(target, target)}:
                         found.setdefault(place, set()).update((name, *_FRICTION.get(name, ())))
         if self.recorder.late:
             for joint in self.machine.joints:

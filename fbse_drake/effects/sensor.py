@@ -18,7 +18,7 @@ from fbse_drake.robot.plant import Robot
 
 _ANY = (-np.inf, np.inf)
 # How much larger an offset of an encoder may be where nobody would fall by it.
-_UNHOMED = 5.0
+_UNHOMED = 10.0
 # An effect that has no opposite is taken off the signals until they would be read as they were but
 # for this share of the largest reading, and so often at most.
 _UNDONE, _MOST_UNDOINGS = 1e-9, 50

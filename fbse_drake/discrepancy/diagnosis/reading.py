@@ -48,10 +48,11 @@ class Reading:
         with located("model: "):
             self.robot = build_robot(scenario.believed)
         log = with_command(scenario, log, self.robot.description)
-        sensors, self.noisier_channels = measured_sensors(
-            scenario.sensors, scenario.recording, sampled_evenly(log)
+        stamps, log = log.time, sampled_evenly(log)
+        sensors, self.noisier_channels = measured_sensors(scenario.sensors, scenario.recording, log)
+        self.motion = RecordedMotion(
+            self.robot, sensors, scenario.recording, log, self.left_out, stamps
         )
-        self.motion = RecordedMotion(self.robot, sensors, scenario.recording, log, self.left_out)
         # By how much torques are read earlier than the log has them, (n,) [s].
         self.late_torques = np.zeros(len(self.robot.joint_names))
         # What came last into the readings goes first.

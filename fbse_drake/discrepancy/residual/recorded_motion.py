@@ -31,7 +31,6 @@ from fbse_drake.discrepancy.residual.recorded_signals import (
 from fbse_drake.discrepancy.residual.recorded_velocity import Lateness, rounding_error
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.discrepancy.residual.rows import foot_pairs, residual_rows
-from fbse_drake.discrepancy.residual.time_stamps import sampled_evenly
 from fbse_drake.discrepancy.residual.white_noise import noise_corners, step_of
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
@@ -67,6 +66,7 @@ class RecordedMotion:
         recording: RecordingConfig,
         log: Log,
         left_out: Sequence[tuple[float, float]] = (),
+        stamps: np.ndarray | None = None,
     ):
         """Reads the log.
 
@@ -75,13 +75,12 @@ class RecordedMotion:
             sensors: whose noise is believed.
             recording: how the log is read.
             left_out: start and end [s] of stretches of which nothing is known.
+            stamps: of the samples, where those of the log are not as recorded (N,) [s].
 
         Raises:
             InputError: a log that does not fit the model, or one that is too short.
         """
-        # Before its samples are taken to be even.
-        self.stamps = log.time
-        log = sampled_evenly(log)
+        self.stamps = log.time if stamps is None else stamps
         self.robot, self.sensors, self.recording, self.log = robot, sensors, recording, log
         self.timing = Timing.of(log, recording)
         self.period = self.timing.period
