@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks import recordings
 from benchmarks.recorded.cases import Recording, outcome, record
-from benchmarks.recorded.course import inverse_dynamics
+from benchmarks.recorded.course import Course, inverse_dynamics
 from benchmarks.recorded.machine import random_machine
-from benchmarks.recorded.physics import Hidden
+from benchmarks.recorded.physics import Hidden, random_physics
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.robot.plant import make_robot
@@ -91,33 +91,65 @@ def test_outcomes(tmp_path: Path, said: dict, expected: str) -> None:
     assert outcome(one, said) == expected
 
 
-def test_what_a_link_has_is_said_of_its_joint(tmp_path: Path) -> None:
-    """About a vertical axis a centre of mass elsewhere is nothing but an inertia, as a rotor's."""
+def test_what_a_link_has_is_said_of_its_joint_and_the_other_way_round(tmp_path: Path) -> None:
+    """About a vertical axis a centre of mass elsewhere is nothing but an inertia, as a rotor's; and
+    where a joint's zero is off, the weight of its link is elsewhere."""
     drawn = record(5, tmp_path)
-    hidden = (Hidden(("BodyCentreOfMass",), ("link_1",)),)
-    one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
-    for joint, confusable, expected in (
-        ("joint_1", ["BodyCentreOfMass"], "right"),
-        ("joint_2", ["BodyCentreOfMass"], "wrong"),
-        ("joint_1", ["BodyMass"], "wrong"),
+    for has, at, named, target, confusable, expected in (
+        ("BodyCentreOfMass", "link_1", "ReflectedInertia", "joint_1", "BodyCentreOfMass", "right"),
+        ("BodyCentreOfMass", "link_1", "ReflectedInertia", "joint_2", "BodyCentreOfMass", "wrong"),
+        ("BodyCentreOfMass", "link_1", "ReflectedInertia", "joint_1", "BodyMass", "wrong"),
+        ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_2", "EncoderOffset", "right"),
+        ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_1", "EncoderOffset", "wrong"),
+        ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_2", "JointSpring", "wrong"),
     ):
-        said = diagnosis("effect_found", ("ReflectedInertia", [joint], confusable))
+        hidden = (Hidden((has,), (at,)),)
+        one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
+        said = diagnosis("effect_found", (named, [target], [confusable]))
         assert outcome(one, said) == expected
 
 
 def test_what_does_not_show_is_not_missed(tmp_path: Path) -> None:
+    """What would show in sizes of 0.1 in two joints does not in others, nor if it is smaller."""
     drawn = record(5, tmp_path)
-    hidden = (Hidden(("TorqueBias",), ("joint_3",)),)
-    one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
-    assert outcome(one, diagnosis("nothing_missing")) == "right"
+    for joint, size, expected in (
+        ("joint_3", 1.0, "right"),
+        ("joint_1", 0.09, "right"),
+        ("joint_1", 0.11, "missed"),
+    ):
+        hidden = (Hidden(("TorqueBias",), (joint,), (size,)),)
+        one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
+        assert outcome(one, diagnosis("nothing_missing")) == expected
 
 
-@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029])
+def test_a_loss_is_as_large_as_it_is_said_to_be() -> None:
+    """At unit velocities, accelerations and torques a law is its first amount."""
+    random = np.random.default_rng(4)
+    machine = random_machine(random)
+    known = Course(np.arange(50.0), *random.normal(size=(4, 50, len(machine.joints))))
+    still = np.zeros((3, len(machine.joints)))
+    unit = Course(np.arange(3.0), still, still + 1.0, still + 1.0, still + 1.0)
+    laws = {"CoulombFriction", "ViscousFriction", "QuadraticDrag"}
+    laws |= {"ReflectedInertia", "TorqueBias", "LoadDependentFriction"}
+    met = set()
+    for hidden in (h for _ in range(100) for h in random_physics(random, machine, known)):
+        name = hidden.names[0]
+        if name in laws and len(hidden.targets) == 1:
+            met.add(name)
+            assert np.abs(hidden.loss(unit)).max() == pytest.approx(hidden.sizes[0]), name
+        if name == "TorqueGain":
+            wrong = np.abs(1.0 / hidden.told(np.ones(len(machine.joints))) - 1.0)
+            assert wrong.max() == pytest.approx(hidden.sizes[0])
+    assert met == laws
+
+
+@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029, 17013, 17034])
 def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     """Nothing hidden, and angles alone that nobody tells the noise of; filtered velocities whose
     torques have the noise that is told; the same where nobody tells it; a centre of mass of which
     only the moment about one axis shows; a drag in one joint of two; friction that follows the load
-    of a link that is too light in the model, by torques in coarse steps."""
+    of a link that is too light in the model, by torques in coarse steps; two joints that stick more
+    than they slide, by other humps than the library's."""
     drawn = record(number, tmp_path)
     found = diagnose(Predictor(drawn.scenario, drawn.log))
     assert outcome(drawn, diagnosis_json(found)) == "right"

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
@@ -13,6 +14,7 @@ from fbse_drake.discrepancy.identification.regression import (
     FOLDS,
     Regression,
     Signature,
+    Spread,
     WhitenedResidual,
 )
 from fbse_drake.discrepancy.residual.memory import Memory
@@ -33,15 +35,24 @@ def white_of(values: np.ndarray) -> WhitenedResidual:
 
 
 def some_signatures(rng: np.random.Generator, blocks: int) -> list[Signature]:
-    """In single rows and in all, with and without an offset, a belief and a bound; of very
+    """In single rows and in all, with and without an offset, a belief and bounds; of very
     different units."""
     return [
         Signature(np.array([0]), 1e-4 * rng.normal(size=(blocks, 1, 2))),
         Signature(np.array([1]), rng.normal(size=(blocks, 1, 1)), rng.normal(size=(blocks, 1))),
         Signature(
-            np.arange(ROWS), 1e3 * rng.normal(size=(blocks, ROWS, 2)), prior=np.array([1e6, 0.0])
+            np.arange(ROWS),
+            1e3 * rng.normal(size=(blocks, ROWS, 2)),
+            prior=np.array([1e9, 0.0]),
+            expected=np.array([2.0, 0.0]),
         ),
         Signature(np.array([2]), rng.normal(size=(blocks, 1, 1)), lowest=np.array([0.5])),
+        Signature(
+            np.array([2]),
+            rng.normal(size=(blocks, 1, 2)),
+            lowest=np.array([-np.inf, -9.0]),
+            highest=np.array([-7.0, 9.0]),
+        ),
     ]
 
 
@@ -74,10 +85,12 @@ def plain_least_squares(
     as `Regression` says."""
     size = sum(s.values.shape[2] for s in signatures)
     X, y = np.zeros((*white.y.shape, size)), white.y.copy()
-    prior, lowest, start = np.zeros(size), np.full(size, -np.inf), 0
+    prior, expected, start = np.zeros(size), np.zeros(size), 0
+    lowest, highest = np.full(size, -np.inf), np.full(size, np.inf)
     for s in signatures:
         part = slice(start, start + s.values.shape[2])
-        X[:, s.rows, part], prior[part], lowest[part] = s.values, s.prior, s.lowest
+        X[:, s.rows, part], prior[part], expected[part] = s.values, s.prior, s.expected
+        lowest[part], highest[part] = s.lowest, s.highest
         y[:, s.rows] -= s.offset
         start = part.stop
 
@@ -85,15 +98,11 @@ def plain_least_squares(
         weight = 1.0 / np.sqrt(scale)
         A = (X[blocks] * weight[:, None]).reshape(-1, size)
         b = (y[blocks] * weight).ravel()
-        A, b = np.concatenate([A, np.diag(np.sqrt(prior))]), np.concatenate([b, np.zeros(size)])
+        believed = np.sqrt(prior)
+        A, b = np.concatenate([A, np.diag(believed)]), np.concatenate([b, believed * expected])
         norm = np.linalg.norm(A, axis=0)
-        theta = np.linalg.lstsq(A / norm, b)[0] / norm
-        below = theta < lowest
-        if below.any():
-            theta[below] = lowest[below]
-            rest = b - A[:, below] @ theta[below]
-            theta[~below] = np.linalg.lstsq(A[:, ~below] / norm[~below], rest)[0] / norm[~below]
-        return theta
+        bounds = lowest * norm, highest * norm
+        return lsq_linear(A / norm, b, bounds, method="bvls", tol=1e-15).x / norm
 
     every = np.ones(len(y), dtype=bool)
     scale = np.ones(ROWS)
@@ -124,6 +133,37 @@ def test_fits_by_inner_products_are_those_of_plain_least_squares(noise: float) -
         _, left = plain_least_squares(white, signatures, fold)
         held_out += (left[white.fold == fold] ** 2).sum(axis=0)
     np.testing.assert_allclose(fit.held_out_sse, held_out, rtol=1e-6)
+
+
+def test_what_is_expected_decides_what_the_data_do_not() -> None:
+    """Of two columns that are one the data tell the sum, 3; that of an amount which is believed to
+    be 5 within 0.1 is left to the other, however sure it is of nothing."""
+    rng = np.random.default_rng(8)
+    one = rng.normal(size=(400, 1, 1))
+    white = white_of(3.0 * one[:, :, 0] + 0.1 * rng.normal(size=(400, 1)))
+    columns, prior = np.concatenate([one, one], axis=2), np.array([0.01, 1.0]) / 0.1**2
+    signature = Signature(np.array([0]), columns, prior=prior, expected=np.array([0.0, 5.0]))
+    fit = Regression(white).fit([signature])
+    assert fit.parameters.sum() == pytest.approx(3.0, abs=0.1)
+    # The sum is 2 too small, of which the surer one takes a hundredth.
+    assert fit.parameters[1] == pytest.approx(5.0 - 2.0 / 101, abs=0.01)
+
+
+def test_what_is_known_of_others_makes_surer() -> None:
+    """Deviations of a normal distribution given some of its variables: those of the rest in the
+    inverse of the covariance (the information)."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(5, 5)) * np.array([[1e3], [1.0], [1e-3], [1.0], [1e5]])
+    covariance = root @ root.T
+    deviation = np.sqrt(np.diag(covariance))
+    spread = Spread(deviation, np.full(5, 9.0), covariance)
+    # Of the last four variables, whatever the first is.
+    correlation = (covariance / np.outer(deviation, deviation))[1:, 1:]
+    given = np.linalg.inv(np.linalg.inv(correlation)[:2, :2])
+    share = spread.if_known(slice(3, 5), slice(1, 3))
+    np.testing.assert_allclose(share, np.sqrt(np.diag(given)), rtol=1e-6)
+    assert np.all(share < 1.0)
+    assert np.all(spread.if_known(slice(3, 3), slice(1, 3)) == 1.0)
 
 
 def test_what_keeps_a_fit_near_makes_nobody_surer() -> None:

@@ -63,16 +63,15 @@ class Recording:
     @property
     def truth(self) -> Mapping[str, set[str]]:
         """Effects that rightly say something about a target. What a link has may look like what its
-        joint could have, and is then said of the joint; and the first joint's zero is the mount's,
-        about its axis."""
-        first = self.machine.joints[0]
-        alike = {link.name: link.joint for link in self.machine.links}
-        alike |= {first: "robot", "robot": first}
+        joint could have, and is then said of the joint, and the other way round; and the first
+        joint's zero is the mount's, about its axis."""
+        alike = [{link.name, link.joint} for link in self.machine.links]
+        alike.append({self.machine.joints[0], "robot"})
         found: dict[str, set[str]] = {}
         for hidden in self.hidden:
             for target in hidden.targets:
                 for name in hidden.names:
-                    for place in {target, alike.get(target, target)}:
+                    for place in {target}.union(*(pair for pair in alike if target in pair)):
                         found.setdefault(place, set()).update((name, *_FRICTION.get(name, ())))
         if self.recorder.late:
             for joint in self.machine.joints:
@@ -171,12 +170,19 @@ def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
 
 
 def shows(hidden: Hidden, diagnosis: Mapping[str, Any]) -> bool:
-    """Does the diagnosis state of each of its names that it would have shown?"""
-    for name in hidden.names:
+    """Does the diagnosis state of each of its names that it would have shown, and of the first that
+    it would in the size that it has?"""
+
+    def smallest(name: str, target: str) -> float:
         sizes = diagnosis["effects"].get(name, {}).get("smallest_detectable_by_target", {})
-        if not any(math.isfinite(sizes.get(target) or math.inf) for target in hidden.targets):
-            return False
-    return True
+        return sizes.get(target) or math.inf
+
+    def is_large(target: str, size: float) -> bool:
+        visible = all(math.isfinite(smallest(name, target)) for name in hidden.names)
+        return visible and smallest(hidden.names[0], target) < size
+
+    sizes = hidden.sizes or [math.inf] * len(hidden.targets)
+    return any(is_large(*there) for there in zip(hidden.targets, sizes, strict=True))
 
 
 def sources() -> str:

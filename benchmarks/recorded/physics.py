@@ -25,6 +25,9 @@ class Hidden:
     names: tuple[str, ...]
     # Joints or bodies.
     targets: tuple[str, ...]
+    # How much it is in each of them: what the first effect calls its first parameter. Nothing where
+    # it has several of a kind, as a place in space has.
+    sizes: tuple[float, ...] = ()
     # Torque that it takes beside what the links need, (N, n), of a course.
     loss: Callable[[Course], np.ndarray] = field(default=lambda c: np.zeros_like(c.torque))
     # The machine that has it.
@@ -60,7 +63,7 @@ class _Draw:
             "coulomb": lambda: self._law("CoulombFriction", _sign, "StribeckFriction"),
             "viscous": lambda: self._law("ViscousFriction", lambda v: v),
             "drag": lambda: self._law("QuadraticDrag", lambda v: v * np.abs(v)),
-            "stribeck": lambda: self._law("StribeckFriction", _stribeck(self.random.uniform())),
+            "stribeck": self._stribeck,
             "ripple": self._ripple,
             "spring": self._spring,
             "bias": self._bias,
@@ -78,6 +81,7 @@ class _Draw:
         return Hidden(
             ("CoulombFriction", "ViscousFriction", "CoulombViscousFriction"),
             tuple(self.machine.joints),
+            tuple(sizes[0].tolist()),
             lambda course: sizes[0] * _sign(course.velocity) + slope * course.velocity,
         )
 
@@ -94,7 +98,7 @@ class _Draw:
         return float(self._sizes[joint] * np.exp(self.random.uniform(*np.log(_SHARE))))
 
     def _in_joint(
-        self, names: tuple[str, ...], joint: int, law: Callable[[Course], np.ndarray]
+        self, names: tuple[str, ...], joint: int, size: float, law: Callable[[Course], np.ndarray]
     ) -> Hidden:
         """A loss in one joint, with a law that gives (N,)."""
 
@@ -103,13 +107,30 @@ class _Draw:
             result[:, joint] = law(course)
             return result
 
-        return Hidden(names, (self.machine.joints[joint],), loss)
+        return Hidden(names, (self.machine.joints[joint],), (abs(size),), loss)
 
-    def _law(self, name: str, law: Callable[[np.ndarray], np.ndarray], *also: str) -> Hidden:
-        """A law of the velocity, with a size that makes it as large as losses are."""
+    def _law(
+        self, name: str, law: Callable[[np.ndarray], np.ndarray], *also: str, of_size: float = 1.0
+    ) -> Hidden:
+        """A law of the velocity, with a factor that makes it as large as losses are.
+
+        Args:
+            of_size: how much it is without that factor, see `Hidden.sizes`.
+        """
         joint = self._joint()
-        size = self._size(joint) / _rms(law(self.course.velocity[:, joint]))
-        return self._in_joint((name, *also), joint, lambda c: size * law(c.velocity[:, joint]))
+        factor = self._size(joint) / _rms(law(self.course.velocity[:, joint]))
+        return self._in_joint(
+            (name, *also), joint, factor * of_size, lambda c: factor * law(c.velocity[:, joint])
+        )
+
+    def _stribeck(self) -> Hidden:
+        """Friction of a joint at rest is larger, and falls with the square of the speed."""
+        hump = 0.3 + self.random.uniform()
+        return self._law(
+            "StribeckFriction",
+            lambda v: _sign(v) * (1.0 + hump * np.exp(-((v / 0.08) ** 2))),
+            of_size=hump,
+        )
 
     def _ripple(self) -> Hidden:
         joint, cycles = self._joint(), float(self.random.integers(*_CYCLES))
@@ -117,7 +138,10 @@ class _Draw:
             cycles *= 10.0
         size, phase = 1.4 * self._size(joint), float(self.random.uniform(0, 6.3))
         return self._in_joint(
-            ("TorqueRipple",), joint, lambda c: size * np.sin(cycles * c.position[:, joint] + phase)
+            ("TorqueRipple",),
+            joint,
+            size,
+            lambda c: size * np.sin(cycles * c.position[:, joint] + phase),
         )
 
     def _spring(self) -> Hidden:
@@ -125,35 +149,40 @@ class _Draw:
         rest = self.machine.posture[joint]
         stiffness = self._size(joint) / self.course.position[:, joint].std()
         return self._in_joint(
-            ("JointSpring",), joint, lambda c: stiffness * (c.position[:, joint] - rest)
+            ("JointSpring",), joint, stiffness, lambda c: stiffness * (c.position[:, joint] - rest)
         )
 
     def _bias(self) -> Hidden:
         joint = self._joint()
         size = float(self.random.choice([-1, 1])) * self._size(joint)
-        return self._in_joint(("TorqueBias",), joint, lambda c: np.full(len(c.time), size))
+        return self._in_joint(("TorqueBias",), joint, size, lambda c: np.full(len(c.time), size))
 
     def _load(self) -> Hidden:
         joint, coefficient = self._joint(), float(self.random.uniform(0.03, 0.2))
         return self._in_joint(
             ("LoadDependentFriction",),
             joint,
+            coefficient,
             lambda c: coefficient * np.abs(c.torque[:, joint]) * _sign(c.velocity[:, joint]),
         )
 
     def _gain(self) -> Hidden:
         joint = self._joint()
         gain = np.ones(len(self.machine.joints))
-        gain[joint] += float(self.random.choice([-1, 1]) * self.random.uniform(0.04, 0.2))
+        wrong = float(self.random.choice([-1, 1]) * self.random.uniform(0.04, 0.2))
+        gain[joint] += wrong
         return Hidden(
-            ("TorqueGain",), (self.machine.joints[joint],), told=lambda torque: torque / gain
+            ("TorqueGain",),
+            (self.machine.joints[joint],),
+            (abs(wrong),),
+            told=lambda torque: torque / gain,
         )
 
     def _rotor(self) -> Hidden:
         joint = self._joint()
         more = self._size(joint) / self.course.acceleration[:, joint].std()
         return self._in_joint(
-            ("ReflectedInertia",), joint, lambda c: more * c.acceleration[:, joint]
+            ("ReflectedInertia",), joint, more, lambda c: more * c.acceleration[:, joint]
         )
 
     def _link(self) -> tuple[int, Link]:
@@ -166,6 +195,7 @@ class _Draw:
         return Hidden(
             ("BodyMass", "Payload"),
             (link.name,),
+            (mass - link.mass,),
             change=lambda machine: machine.with_link(number, mass=mass, size=_as_heavy(link, mass)),
         )
 
@@ -189,11 +219,6 @@ def _as_heavy(link: Link, mass: float) -> tuple[float, float, float]:
 
 def _sign(velocity: np.ndarray) -> np.ndarray:
     return np.tanh(velocity / _TRANSITION)
-
-
-def _stribeck(share: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Friction of a joint at rest is this much larger, and falls with the square of the speed."""
-    return lambda v: _sign(v) * (1.0 + (0.3 + share) * np.exp(-((v / 0.08) ** 2)))
 
 
 def _rms(values: np.ndarray) -> float:

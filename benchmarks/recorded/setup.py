@@ -32,7 +32,8 @@ def random_setup(random: np.random.Generator, machine: Machine) -> tuple[Hidden,
         def read(course: Course) -> Course:
             return replace(course, position=course.position + offset)
 
-        result.append(Hidden(("EncoderOffset",), (machine.joints[joint],), read=read))
+        sizes = (float(abs(offset[joint])),)
+        result.append(Hidden(("EncoderOffset",), (machine.joints[joint],), sizes, read=read))
     return tuple(result)
 
 

@@ -24,7 +24,7 @@ from fbse_drake.discrepancy.identification.regression import (
 )
 from fbse_drake.discrepancy.identification.rounding import chance_bound, noise_of_rounding
 from fbse_drake.discrepancy.residual.memory import Memory
-from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -38,10 +38,10 @@ COMPLEXITY = 4.0
 _SYSTEMATIC = 0.5
 # Safety on what the noise in an effect's own columns may feign.
 _SPURIOUS = 3.0
-
-
-# Slopes with respect to nonlinear values are taken over this share of them.
+# Slopes with respect to nonlinear values are taken over this share of them, and hold within such
+# factors of them.
 _SLOPE_STEP = 0.02
+_NEARBY = (0.4, 1.6)
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
 _MOST_NUMBERS = 5_000_000
@@ -398,27 +398,28 @@ class Fits:
             together = [columns[:, :, 0], *(slope[..., None] for slope in slopes)]
             return np.moveaxis(np.concatenate(together, axis=2), 0, 1)
 
-        # A weak belief in the plausible range keeps values that the data say nothing about from
-        # running away.
-        ranges = [np.log(parameters[name].plausible) for name in names]
-        belief = [
-            1.0 / (0.25 * (high - low) * value) ** 2
-            for (low, high), value in zip(ranges, nonlinear, strict=True)
-        ]
+        # A weak belief in the middle of the plausible range keeps values that the data say nothing
+        # about from running away.
+        ranges = np.log([parameters[name].plausible for name in names]).reshape(-1, 2)
+        spread = 0.25 * (ranges[:, 1] - ranges[:, 0]) * nonlinear
+        middle = nonlinear * (ranges.mean(axis=1) - np.log(nonlinear))
         near = np.array([parameters[name].linear_within for name in names])
-        steadying = np.append(np.zeros(len(smallest)), (near * nonlinear) ** -2.0)
-        # Nonlinear parameters do not fall far below their plausible range.
-        lows = 0.5 * np.array([parameters[name].plausible[0] for name in names])
-        lowest = smallest.tolist()
-        lowest += np.maximum(-0.6 * nonlinear, np.minimum(lows - nonlinear, 0.0)).tolist()
-        prior = np.array([0.0] * len(smallest) + belief)
+        # Beyond where its slopes hold a law would mimic what no law of its kind does.
+        down, up = _nearby(parameters, nonlinear)
+        unbounded, unknown = np.full(len(smallest), np.inf), np.zeros(len(smallest))
+        beliefs = {
+            "prior": np.append(unknown, spread**-2.0),
+            "expected": np.append(unknown, middle),
+            "steadying": np.append(unknown, (near * nonlinear) ** -2.0),
+            "lowest": np.append(smallest, down),
+            "highest": np.append(unbounded, up),
+        }
 
         def signature(columns: np.ndarray) -> Signature:
             values = linearised(columns)
             if len(smallest):
-                return Signature(places, values, 0.0, prior, steadying, np.array(lowest))
-            offset = values[:, :, 0]
-            return Signature(places, values[:, :, 1:], offset, prior, steadying, np.array(lowest))
+                return Signature(places, values, **beliefs)
+            return Signature(places, values[:, :, 1:], values[:, :, 0], **beliefs)
 
         # A candidate must not hold the fits that hold it.
         dictionary = self.dictionary
@@ -500,3 +501,15 @@ class Fits:
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""
         return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)
+
+
+def _nearby(
+    parameters: Mapping[str, Parameter], nonlinear: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far nonlinear values can be moved where slopes about them hold, down and up, (m,) each:
+    not far beyond their plausible ranges either."""
+    ranges = np.array([p.plausible for p in parameters.values() if not p.linear]).reshape(-1, 2)
+    least, most = (factor * nonlinear for factor in _NEARBY)
+    down = np.maximum(least, 0.5 * ranges[:, 0]) - nonlinear
+    up = np.minimum(most, 2.0 * ranges[:, 1]) - nonlinear
+    return np.minimum(down, 0.0), np.maximum(up, 0.0)

@@ -416,8 +416,10 @@ def _with_amount(member: Candidate) -> Candidate | None:
             law,
             values=np.concatenate([law.values, np.asarray(law.offset)[..., None]], axis=2),
             prior=np.append(law.prior, 0.0),
+            expected=np.append(law.expected, 0.0),
             steadying=np.append(law.steadying, 0.0),
             lowest=np.append(law.lowest, -np.inf),
+            highest=np.append(law.highest, np.inf),
         )
 
     return replace(member, signature=scaled(member.signature), source=lambda: scaled(member.raw))
@@ -557,11 +559,8 @@ def _simpler(
 
     if not reductions:
         return
-    last = len(reductions) - 1
-    is_doubtful = _may_be_without(explanation, member, reductions[last])
     # What is better and smaller comes before what is worse by no more than chance.
-    if is_doubtful:
-        yield from _with_another(proposals, judge, explanation, reduced(last), member)
+    yield from _with_another(proposals, judge, explanation, reduced(len(reductions) - 1), member)
     for k, reduction in enumerate(reductions):
         smaller = reduced(k)
         is_needless = smaller.deviance <= explanation.deviance or (
@@ -572,8 +571,6 @@ def _simpler(
         # What takes its place has to stay.
         if is_smaller and judge.all_pay(smaller, reduction.effects, member.targets):
             yield smaller
-    if not is_doubtful:
-        yield from _with_another(proposals, judge, explanation, reduced(last), member)
 
 
 def _at_least(
@@ -716,7 +713,7 @@ def _pooled(proposals: Proposals, judge: Judge, explanation: Explanation) -> Ite
             if len(group) == 1 or len(members) < len(group):
                 continue
             rest = fits.explain([c for c in pooled.candidates if c not in members])
-            shared = polished(fits, proposals.beside(rest, effect, group))
+            shared = converged(fits, proposals.beside(rest, effect, group))
             if judge.after(pooled).is_as_good(shared, pooled):
                 pooled = shared
     if pooled is not explanation:

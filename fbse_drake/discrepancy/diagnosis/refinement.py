@@ -67,8 +67,23 @@ def converged(fits: Fits, explanation: Explanation) -> Explanation:
     return explanation
 
 
+def attained(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation that laws of its kind attain: itself, or what it is at the values that were
+    found where slopes promised more than is there."""
+    there = fits.explain(_about_found(fits, explanation.candidates))
+    return max(explanation, there, key=lambda e: e.deviance)
+
+
 def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
     """Members made linear about the values that they have together; themselves if that is worse."""
+    moved = fits.explain(_about_found(fits, members))
+    is_worse = moved.deviance > fits.explain(members).deviance + COMPLEXITY
+    return members if is_worse else moved.candidates
+
+
+def _about_found(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    """Members made linear about the values that they have together; themselves where no body has
+    them."""
     explanation = fits.explain(members)
     moved, start = [], 0
     for candidate in members:
@@ -80,7 +95,6 @@ def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
             try:
                 about = fits.about(candidate, values)
             except InputError:
-                # No body has these values.
                 return members
             others = [c for c in members if c is not candidate]
             moved.append(_narrowed(fits, others, about, values))
@@ -89,19 +103,11 @@ def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
             moved.append(candidate)
             continue
         rest = fits.explain([c for c in members if c is not candidate])
-        ranges = np.array(
-            [candidate.parameters[name].plausible for name in candidate.nonlinear_names]
-        )
-        # The slopes hold nearby.
-        near = np.clip(
-            candidate.nonlinear + shift, 0.6 * candidate.nonlinear, 1.6 * candidate.nonlinear
-        )
-        nonlinear = np.clip(near, 0.5 * ranges[:, 0], 2.0 * ranges[:, 1])
+        nonlinear = candidate.nonlinear + shift
         moved.append(
             fits.candidate(candidate.effect, candidate.targets, nonlinear, fits.remainder(rest))
         )
-    better = fits.explain(moved)
-    return better.candidates if better.deviance <= explanation.deviance + COMPLEXITY else members
+    return tuple(moved)
 
 
 def _narrowed(

@@ -15,7 +15,7 @@ from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.parsimony import Judge
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import converged
+from fbse_drake.discrepancy.diagnosis.refinement import attained, converged
 from fbse_drake.discrepancy.diagnosis.selection import best_additions, is_shown
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.inertia import InertiaEffect
@@ -169,7 +169,7 @@ def _contains(law: type[Effect], other: type[Effect]) -> bool:
 def fitted(fits: Fits, explanation: Explanation) -> Explanation:
     """An explanation at the values that fit it best, found by Gauss-Newton steps, and for its last
     member by a search over what is nonlinear in it."""
-    return converged(fits, _searched(fits, explanation))
+    return attained(fits, converged(fits, _searched(fits, explanation)))
 
 
 def _searched(fits: Fits, explanation: Explanation) -> Explanation:

@@ -265,7 +265,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         return False
     if _may_be_misfit(fits, base, wider, added):
         return False
-    start = wider.start(added)
+    start, is_law = wider.start(added), issubclass(added.effect, JointTorqueEffect)
     names = added.linear_names if added.has_linear else added.nonlinear_names
     offsets = np.zeros(len(names)) if added.has_linear else added.nonlinear
     part = slice(start, start + len(names))
@@ -276,8 +276,8 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     largest = np.array([max(map(abs, parameter.plausible)) for parameter in parameters])
     if is_disbelieved(values, beliefs, largest, deviations, intervals):
         return False
-    for parameter, value, widest, deviation, (least, most) in zip(
-        parameters, values, largest, deviations, intervals, strict=True
+    for k, (parameter, value, widest, deviation, (least, most)) in enumerate(
+        zip(parameters, values, largest, deviations, intervals, strict=True)
     ):
         if least <= 0 <= most and np.isfinite(parameter.belief):
             # One of several components, which the log hardly shows.
@@ -286,7 +286,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         if low <= value <= high and abs(value) <= widest:
             continue
         allowed = 3 * deviation
-        if not issubclass(added.effect, JointTorqueEffect):
+        if not is_law:
             # Masses, places and offsets have sizes that a bad fit does not widen.
             allowed = min(allowed, _IMPLAUSIBLE * widest)
         if value < low or value > high + 3 * deviation:
@@ -296,9 +296,13 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
             is_known = parameter.unit in ("Nm", "N") or deviation < _KNOWN * abs(value)
             if not (is_known and _is_carried(fits, wider, added)):
                 return False
-        # What is not told from nothing may not be implausible as well.
+        # What is not told from nothing may not be implausible as well. Of a law that is not there
+        # no shape would be told: whether it is, is asked with a known one.
         if abs(value) > (1 + _ROUNDING) * widest and least <= 0 <= most:
-            return False
+            shapes = len(added.nonlinear) if is_law and added.has_linear else 0
+            surer = wider.solved.spread.if_known(slice(part.stop, part.stop + shapes), part)
+            if abs(value) <= surer[k] * (most - least) / 2:
+                return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
 
 

@@ -46,14 +46,16 @@ class Signature:
     values: np.ndarray
     # What it adds whatever the parameters are, shape (B, r) or 0.
     offset: np.ndarray | float = 0.0
-    # What is believed of the parameters beforehand: that they are 0, with this inverse variance,
-    # shape (p,) or 0.
+    # What is believed of the parameters beforehand: that they are as expected, with this inverse
+    # variance, shape (p,) or 0.
     prior: np.ndarray | float = 0.0
+    expected: np.ndarray | float = 0.0
     # The same of what is not believed, but keeps them where the columns hold: it moves a fit, and
     # makes nobody surer.
     steadying: np.ndarray | float = 0.0
-    # Smallest value that each parameter can have, shape (p,) or -inf.
+    # Smallest and largest value that each parameter can have, shape (p,) or infinite.
     lowest: np.ndarray | float = -np.inf
+    highest: np.ndarray | float = np.inf
     # Values about which it is linear, shape (p,), or 0.
     about: np.ndarray | float = 0.0
 
@@ -75,6 +77,14 @@ class Spread:
     freedom: np.ndarray
     # Covariance with these deviations, (P, P); correlations as of white noise.
     covariance: np.ndarray
+
+    def if_known(self, known: slice, of: slice) -> np.ndarray:
+        """By what share parameters are surer if others were known, (p,)."""
+        deviation = np.maximum(self.deviation, 1e-300)
+        correlation = self.covariance / np.outer(deviation, deviation)
+        by_known = correlation[of, known]
+        told = by_known @ np.linalg.pinv(correlation[known, known], hermitian=True) @ by_known.T
+        return np.sqrt(np.clip(1.0 - np.diag(told), 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -495,17 +505,17 @@ class Regression:
             [np.arange(self.target(s).shape[2]) < s.values.shape[2] for s in signatures]
         )
         amounts = np.where(fitted, 0.0, 1.0)
-        prior, steadying, lowest = (
+        prior, expected, steadying, lowest, highest = (
             np.concatenate(
                 [np.broadcast_to(getattr(s, name), s.values.shape[2]) for s in signatures]
             )
-            for name in ("prior", "steadying", "lowest")
+            for name in ("prior", "expected", "steadying", "lowest", "highest")
         )
         # Units must not decide what counts as singular, nor a column that is next to nothing beside
         # what is believed of it.
         norm = np.sqrt(np.einsum("rqq->q", together.whole[0])[fitted] + prior + steadying)
         norm[norm == 0] = 1.0
-        held = np.diag((prior + steadying) / norm**2)
+        held, believed = np.diag((prior + steadying) / norm**2), prior * expected / norm
 
         def weighted(fold: int | None) -> tuple[np.ndarray, np.ndarray]:
             gram, target = together.of(fold)
@@ -516,18 +526,19 @@ class Regression:
             return gram / np.outer(norm, norm), right / norm
 
         def solved(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
-            # What is rounded below a bound would be impossible.
-            return np.maximum(bounded_least_squares(gram, right, lowest * norm) / norm, lowest)
+            found = bounded_least_squares(gram, right, lowest * norm, highest * norm) / norm
+            # What is rounded beyond a bound would be impossible.
+            return np.minimum(np.maximum(found, lowest), highest)
 
         # From the sensors' noise on: weighted by what is there before anything is fitted,
         # beliefs would hold back what the data say clearly.
         scale = np.ones(len(rows))
         for _ in range(_REWEIGHTINGS):
             gram, right = weighted(None)
-            amounts[fitted] = solved(gram + held, right)
+            amounts[fitted] = solved(gram + held, right + believed)
             scale = np.maximum(self._squares(signatures, together, amounts) / count, 1.0)
         gram, right = weighted(None)
-        gram += held
+        gram, right = gram + held, right + believed
         amounts[fitted] = solved(gram, right)
         parameters = amounts[fitted]
         sse = self._squares(signatures, together, amounts)
@@ -620,8 +631,13 @@ def connected(signatures: Sequence[Signature]) -> list[list[int]]:
     return [sorted(members) for _, members in groups]
 
 
-def bounded_least_squares(gram: np.ndarray, right: np.ndarray, lowest: np.ndarray) -> np.ndarray:
-    """Least squares with parameters not below their bounds: what would be below is held there."""
+def bounded_least_squares(
+    gram: np.ndarray,
+    right: np.ndarray,
+    lowest: np.ndarray,
+    highest: np.ndarray | float = np.inf,
+) -> np.ndarray:
+    """Least squares with parameters between their bounds: what would be beyond is held there."""
     free, theta = np.ones(len(right), dtype=bool), np.zeros(len(right))
     while free.any():
         if free.all():
@@ -629,10 +645,11 @@ def bounded_least_squares(gram: np.ndarray, right: np.ndarray, lowest: np.ndarra
         else:
             rest = right[free] - gram[np.ix_(free, ~free)] @ theta[~free]
             theta[free] = _least_squares(gram[np.ix_(free, free)], rest)
-        below = free & (theta < lowest)
-        if not below.any():
+        beyond = free & ((theta < lowest) | (theta > highest))
+        if not beyond.any():
             break
-        theta[below], free = lowest[below], free & ~below
+        bound = np.minimum(np.maximum(theta, lowest), highest)
+        theta[beyond], free = bound[beyond], free & ~beyond
     return theta
 
 
