@@ -143,13 +143,13 @@ def test_a_loss_is_as_large_as_it_is_said_to_be() -> None:
     assert met == laws
 
 
-@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029, 17013, 17034])
+@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029, 17013, 17034, 20036])
 def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     """Nothing hidden, and angles alone that nobody tells the noise of; filtered velocities whose
     torques have the noise that is told; the same where nobody tells it; a centre of mass of which
     only the moment about one axis shows; a drag in one joint of two; friction that follows the load
     of a link that is too light in the model, by torques in coarse steps; two joints that stick more
-    than they slide, by other humps than the library's."""
+    than they slide, by other humps than the library's; a mount that is askew about an axis that shows."""
     drawn = record(number, tmp_path)
     found = diagnose(Predictor(drawn.scenario, drawn.log))
     assert outcome(drawn, diagnosis_json(found)) == "right"

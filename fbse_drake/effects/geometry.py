@@ -148,8 +148,11 @@ class BaseTilt(GeometryEffect):
     experiment: ClassVar[str] = "Move all joints slowly through many postures."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "robot"
     needs_fixed_base: ClassVar[bool] = True
+    linear_nearby: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        axis: Parameter("rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi))
+        axis: Parameter(
+            "rad", linear=True, plausible=(-0.1, 0.1), bounds=(-np.pi, np.pi), belief=0.15
+        )
         for axis in "xy"
     }
     # Links stay as they are.
