@@ -620,7 +620,9 @@ def _with_another(
         key = found.candidates[-1].key
         (added,) = (c for c in better.candidates if c.key == key)
         rest = fits.explain([c for c in better.candidates if c is not added])
-        if judge.after(better).pays(rest, better, added):
+        # What is nothing of its kind beside it would be lost next.
+        stays = all(is_shown(fits, better.as_fitted(c)) for c in better.candidates)
+        if stays and judge.after(better).pays(rest, better, added):
             yield better
 
 
