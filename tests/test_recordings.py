@@ -149,7 +149,8 @@ def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     torques have the noise that is told; the same where nobody tells it; a centre of mass of which
     only the moment about one axis shows; a drag in one joint of two; friction that follows the load
     of a link that is too light in the model, by torques in coarse steps; two joints that stick more
-    than they slide, by other humps than the library's; a mount that is askew about an axis that shows."""
+    than they slide, by other humps than the library's; a mount that is askew about an axis that
+    shows."""
     drawn = record(number, tmp_path)
     found = diagnose(Predictor(drawn.scenario, drawn.log))
     assert outcome(drawn, diagnosis_json(found)) == "right"
