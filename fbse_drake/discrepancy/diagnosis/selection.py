@@ -300,8 +300,8 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
         # no shape would be told: whether it is, is asked with a known one.
         if abs(value) > (1 + _ROUNDING) * widest and least <= 0 <= most:
             shapes = len(added.nonlinear) if is_law and added.has_linear else 0
-            surer = wider.solved.spread.if_known(slice(part.stop, part.stop + shapes), part)
-            if abs(value) <= surer[k] * (most - least) / 2:
+            kept = wider.solved.spread.if_known(slice(part.stop, part.stop + shapes), part)
+            if abs(value) <= kept[k] * (most - least) / 2:
                 return False
     return fits.dictionary.predictor.is_possible(added.effect, added.targets[0], values)
 

@@ -79,7 +79,7 @@ class Spread:
     covariance: np.ndarray
 
     def if_known(self, known: slice, of: slice) -> np.ndarray:
-        """By what share parameters are surer if others were known, (p,)."""
+        """Share of their deviations that parameters keep if others are known, (p,)."""
         deviation = np.maximum(self.deviation, 1e-300)
         correlation = self.covariance / np.outer(deviation, deviation)
         by_known = correlation[of, known]
