@@ -156,6 +156,14 @@ def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     assert outcome(drawn, diagnosis_json(found)) == "right"
 
 
+def test_what_would_fit_but_cannot_be_is_not_tried(tmp_path: Path) -> None:
+    """A wrong gain and a centre of mass elsewhere look, linearised, like a mount that is turned by
+    more than half a turn."""
+    drawn = record(17051, tmp_path)
+    found = diagnose(Predictor(drawn.scenario, drawn.log))
+    assert outcome(drawn, diagnosis_json(found)) in ("right", "unsure")
+
+
 def test_a_line_says_what_went_wrong() -> None:
     tree = {
         "case": {"number": 7},

@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.joint_torque import JointTorqueEffect
+from fbse_drake.errors import InputError
 
 # How often a grid of nonlinear values is narrowed down around its best point, and to how many
 # points.
@@ -163,7 +164,11 @@ class Proposals:
                 wider = self.fits.explain([*base.candidates, settled])
                 start = wider.start(settled)
                 values = wider.solved.parameters[start : start + len(settled.linear_names)]
-                settled = self.fits.about(settled, values)
+                try:
+                    settled = self.fits.about(settled, values)
+                except InputError:
+                    # No robot has these values.
+                    break
             return settled
 
         return self._found.or_made((candidate, base), made)
