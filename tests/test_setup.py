@@ -123,6 +123,23 @@ def test_an_encoder_that_was_homed_badly_is_found(zero: float) -> None:
     assert high - low < 5e-3
 
 
+def test_what_repeats_with_the_angle_does_so_with_the_joint_s_and_not_with_what_is_read() -> None:
+    """A ripple of 40 waves per radian in a joint whose encoder is off by 0.06 rad, 2.4 rad of the
+    wave: amounts are those of the joint's angle, so that a model with both leaves nothing."""
+    scenario, log = arm_that_moves()
+    angle, torque = log["joint/position"][:, 2], log["joint/torque_command"].copy()
+    torque[:, 2] += 6.0 * np.sin(40.0 * angle + 0.7)
+    log = Log(log.channels | {"joint/torque_command": torque}, log.meta)
+    diagnosis = diagnose(Predictor(scenario, counted(log, 2, zero=0.06)))
+    assert diagnosis.verdict == "effect_found"
+    found = {f.effect: f for f in diagnosis.chosen}
+    assert found.keys() == {"EncoderOffset", "TorqueRipple"}
+    assert all(f.targets == ("axis_3",) for f in found.values())
+    ripple = found["TorqueRipple"].parameters
+    assert ripple["sine"].value == pytest.approx(6.0 * np.cos(0.7), abs=0.3)
+    assert ripple["cosine"].value == pytest.approx(6.0 * np.sin(0.7), abs=0.3)
+
+
 def test_torques_that_come_very_late_are_said_to_be_so_late() -> None:
     """And one alone, which wants to be as late because something else is wrong with it, is not."""
     scenario, log = arm_that_moves()

@@ -388,7 +388,7 @@ class Dictionary:
 
 
 @cache
-def depends_on(effect: type[Effect], *signals: Literal["command", "load"]) -> bool:
+def depends_on(effect: type[Effect], *signals: Literal["command", "load", "position"]) -> bool:
     """Does what a joint effect takes depend on these signals of a joint's motion?"""
     if not issubclass(effect, JointTorqueEffect):
         return False
@@ -402,8 +402,7 @@ def depends_on(effect: type[Effect], *signals: Literal["command", "load"]) -> bo
         time=time,
         time_step=1e-3,
     )
-    command, load = (100.0 * torque if of in signals else torque for of in ("command", "load"))
-    larger = motion._replace(command=command, load=load)
+    larger = motion._replace(**{name: 100.0 * getattr(motion, name) for name in signals})
     nonlinear = usual_values(effect)[:, None]
     usual, changed = (basis_over_time(effect, one, nonlinear) for one in (motion, larger))
     return not np.array_equal(usual, changed)

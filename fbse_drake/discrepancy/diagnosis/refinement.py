@@ -71,7 +71,7 @@ def attained(fits: Fits, explanation: Explanation) -> Explanation:
     """An explanation that laws of its kind attain: itself, or what it is at the values that were
     found where slopes promised more than is there."""
     there = fits.explain(_about_found(fits, explanation.candidates))
-    return max(explanation, there, key=lambda e: e.deviance)
+    return there if there.deviance > explanation.deviance + COMPLEXITY else explanation
 
 
 def _moved(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
@@ -274,10 +274,10 @@ def beside_model(
     predictor = _predictor_with(fits, effects)
     inside = Fits(fits.dictionary, WhitenedResidual(predictor.residual))
     moved = {c: replace(c, signature=inside.white.whiten_signature(c.raw)) for c in others}
-    # Heavier links are another load.
+    # Heavier links are another load, and an encoder whose zero is off reads another angle.
     of_model = Fits(Dictionary(predictor, fits.dictionary.effects), inside.white)
     for c in others:
-        if not (issubclass(c.effect, JointTorqueEffect) and depends_on(c.effect, "load")):
+        if not depends_on(c.effect, "load", "position"):
             continue
         rest = of_model.remainder(of_model.explain([moved[o] for o in others if o is not c]))
         moved[c] = of_model.candidate(c.effect, c.targets, c.nonlinear, rest)
@@ -320,12 +320,25 @@ def _beside_interplay(fits: Fits, explanation: Explanation, left: Residual) -> E
     Args:
         left: when they are in the model.
     """
+    # Where some of them are in the model, the others may be other columns.
+    found = beside_model(fits, explanation)
+    moved: dict[Candidate, Candidate] = {}
+    if found is not None:
+        inside, moved = found
+        left = inside.white.residual
     value = left.value.copy()
     for candidate in explanation.candidates:
+        if candidate in moved:
+            continue
         raw, start = candidate.raw, explanation.start(candidate)
         parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
         value[:, raw.rows] += raw.values @ parameters + raw.offset
     residual = fits.white.residual
     both = residual.known & left.known
-    moved = replace(residual, value=np.where(both, value, residual.value), known=both)
-    return Fits(fits.dictionary, WhitenedResidual(moved)).explain(explanation.candidates)
+    white = WhitenedResidual(
+        replace(residual, value=np.where(both, value, residual.value), known=both)
+    )
+    members = [moved.get(c, c) for c in explanation.candidates]
+    return Fits(fits.dictionary, white).explain(
+        [replace(c, signature=white.whiten_signature(c.raw)) for c in members]
+    )
