@@ -2,15 +2,21 @@
 
 import numpy as np
 import pytest
+from conftest import swinging_legs
 from recorded_arm import ARM
 from test_regression import white_of
 
+from fbse_drake import Log
+from fbse_drake.discrepancy.diagnosis import selection
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals, fixed_gain, largest_drop
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Regression, Signature
-from fbse_drake.effects.friction import ViscousFriction
+from fbse_drake.effects.effect import Effect
+from fbse_drake.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
 
 BLOCKS, ROWS = 400, 3
 
@@ -77,3 +83,28 @@ def test_rivals_may_be_on_those_joints_of_a_group_that_are_free() -> None:
 
     assert targets(in_part=False) == {(joint,) for joint in free}
     assert targets(in_part=True) == {free, *((joint,) for joint in free)}
+
+
+def test_what_is_far_behind_a_law_that_cannot_be_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a torque that is there at low speed alone Coulomb friction takes a small part of what
+    Stribeck friction does; where that is refused, the small part counts."""
+    scenario, log = swinging_legs(12, 0.05)
+    place, torque = log.joints.index("left_knee_pitch"), log["joint/torque_command"].copy()
+    velocity = log["joint/velocity"][:, place]
+    torque[:, place] += 3.0 * np.tanh(velocity / 0.01) * np.exp(-((velocity / 0.1) ** 2))
+    torque += 0.05 * np.random.default_rng(3).standard_normal(torque.shape)
+    log = Log(log.channels | {"joint/torque_command": torque}, log.meta)
+    fits = Fits(Dictionary(Predictor(scenario, log), [CoulombFriction, StribeckFriction]))
+
+    def found() -> set[type[Effect]]:
+        additions = selection.best_additions(Proposals(fits), fits.explain([]))
+        return {e.candidates[-1].effect for e in additions}
+
+    assert found() == {StribeckFriction}
+    significant = selection.is_significant
+
+    def refusing(of: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
+        return added.effect is not StribeckFriction and significant(of, base, wider, added)
+
+    monkeypatch.setattr(selection, "is_significant", refusing)
+    assert found() == {CoulombFriction}

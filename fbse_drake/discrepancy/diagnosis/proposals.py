@@ -66,6 +66,7 @@ class Proposals:
         share: float = _ENOUGH,
         *,
         in_part: bool = False,
+        behind: bool = False,
     ) -> list[Candidate]:
         """Candidates that, alone, would take off enough of what an explanation leaves over.
 
@@ -75,6 +76,7 @@ class Proposals:
                 about no effect at all, is left out.
             share: so much of what is required is enough.
             in_part: of groups of joints some of which have an effect already also the others.
+            behind: also what is far behind the best in its joints.
         """
         fits, dictionary, beside = self.fits, self.fits.dictionary, self.fits.remainder(base)
         # First, for the other effects are being predicted beside.
@@ -117,7 +119,7 @@ class Proposals:
                 for gain, effect, _ in found
                 if dictionary.per_step or not dictionary.takes_torque(effect)
             )
-            least = max(enough, 0.4 * max(honest, default=0.0))
+            least = enough if behind else max(enough, 0.4 * max(honest, default=0.0))
             for size, effect, best in found:
                 if size > least:
                     dictionary.progress(LOOKING, 0.3)

@@ -109,8 +109,28 @@ def _additions(
     *,
     in_part: bool,
 ) -> list[Explanation]:
-    fits = proposals.fits
-    promising, found = proposals.promising(base, rows, base.deviance - most, in_part=in_part), []
+    def added(*, behind: bool) -> list[Explanation]:
+        promising = proposals.promising(
+            base, rows, base.deviance - most, in_part=in_part, behind=behind
+        )
+        return _with_each(proposals, base, promising, most, in_part=in_part)
+
+    # What is far behind in its joints may be there all the same, if nothing else is.
+    found = added(behind=False) or added(behind=True)
+    return sorted(found, key=lambda e: e.deviance)
+
+
+def _with_each(
+    proposals: Proposals,
+    base: Explanation,
+    promising: Sequence[Candidate],
+    most: float,
+    *,
+    in_part: bool,
+) -> list[Explanation]:
+    """What each of these candidates makes of an explanation, of those that improve it
+    significantly; see `best_additions`."""
+    fits, found = proposals.fits, []
     tried = [
         *([candidate] for candidate in promising),
         *proposals.together(base, promising),
@@ -133,7 +153,7 @@ def _additions(
             for rest, member in zip(without, added, strict=True)
         ):
             found.append(wider)
-    return sorted(found, key=lambda e: e.deviance)
+    return found
 
 
 def single_guesses(proposals: Proposals, rows: np.ndarray) -> list[Explanation]:
