@@ -277,6 +277,8 @@ def beside_model(
     # Heavier links are another load, and an encoder whose zero is off reads another angle.
     of_model = Fits(Dictionary(predictor, fits.dictionary.effects), inside.white)
     for c in others:
+        if not issubclass(c.effect, JointTorqueEffect):
+            continue
         if not depends_on(c.effect, "load", "position"):
             continue
         rest = of_model.remainder(of_model.explain([moved[o] for o in others if o is not c]))
