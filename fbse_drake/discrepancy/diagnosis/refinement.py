@@ -320,26 +320,22 @@ def _beside_interplay(fits: Fits, explanation: Explanation, left: Residual) -> E
     """The same effects fitted beside what they add together beyond the sum of what each adds.
 
     Args:
-        left: when they are in the model.
+        left: when all of them are in the model. Those that need not be there are fitted, if there
+            are any, as the columns that they are in a model that has the others.
     """
-    # Where some of them are in the model, the others may be other columns.
-    found = beside_model(fits, explanation)
     moved: dict[Candidate, Candidate] = {}
-    if found is not None:
+    if found := beside_model(fits, explanation):
         inside, moved = found
         left = inside.white.residual
     value = left.value.copy()
-    for candidate in explanation.candidates:
-        if candidate in moved:
-            continue
+    for candidate in (c for c in explanation.candidates if c not in moved):
         raw, start = candidate.raw, explanation.start(candidate)
         parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
         value[:, raw.rows] += raw.values @ parameters + raw.offset
     residual = fits.white.residual
     both = residual.known & left.known
-    white = WhitenedResidual(
-        replace(residual, value=np.where(both, value, residual.value), known=both)
-    )
+    value = np.where(both, value, residual.value)
+    white = WhitenedResidual(replace(residual, value=value, known=both))
     members = [moved.get(c, c) for c in explanation.candidates]
     return Fits(fits.dictionary, white).explain(
         [replace(c, signature=white.whiten_signature(c.raw)) for c in members]
