@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 
+from fbse_drake.control.position_loop import PositionLoopConfig
 from fbse_drake.errors import InputError
 from fbse_drake.files import write_atomically, write_text
 from fbse_drake.interop.bag_map import propose_map
@@ -37,8 +38,12 @@ _AMPLITUDE, _FREQUENCY, _DURATION = 0.02, 0.5, 4.0
 _STIFFNESS = 7.0
 # The motors' rotors make a joint as fast as this with that gain [rad/s]; damping over gain [s].
 _BANDWIDTH, _DAMPING = 160.0, 0.007
-# Amplitude and frequency of joints that swing [rad], [Hz].
-_SWING, _SWING_FREQUENCY = 0.1, 0.5
+# Torque limit over what holds the whole robot like that; where that is less, the usual one will do.
+_STRENGTH = 4.0
+# Amplitude and frequency of joints that swing [rad or m], [Hz]; and the most of a joint's range.
+_SWING, _SWING_FREQUENCY, _SWING_SHARE = 0.1, 0.5, 0.4
+# Joints that are further from their plan do not follow it [rad or m].
+_FOLLOWS = 0.01
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def init_robot(
     figure = robot_figure(robot, posture)
     picture = folder / f"{name}.png"
     write_atomically(picture, lambda partial: _save(figure, partial))
-    remarks, problems = _tried(scenario)
+    remarks, problems = _tried(scenario, robot)
     said = [*proposal.remarks, *about_map, *remarks]
     return Made(description, scenario, map_path, picture, said, problems)
 
@@ -168,15 +173,57 @@ def _standing(robot: Robot) -> tuple[Squat, Reference] | None:
     raise InputError(f"the robot cannot stand with level feet: {reason}")
 
 
-def _gain(robot: Robot, arm: float) -> float:
-    """Position gain of all joints [Nm/rad]: a round number.
+@dataclass(frozen=True)
+class _Drives:
+    """Position loops, motors and gears that are strong enough for a robot."""
 
-    Args:
-        arm: how far the robot's weight reaches [m].
-    """
-    mass = robot.total_mass
-    gravity = float(np.linalg.norm(robot.plant.gravity_field().gravity_vector()))
-    return float(f"{_STIFFNESS * mass * gravity * arm:.1e}")
+    # By joint, as in a scenario [Nm/rad], or [N/m] of a prismatic joint.
+    stiffness: dict[str, float]
+    # Largest torque [Nm] or force [N] of all; None where the usual one will do.
+    limit: float | None
+
+    @staticmethod
+    def of(robot: Robot, arm: float) -> "_Drives":
+        """
+        Args:
+            arm: how far the robot's weight reaches [m].
+        """
+        gravity = float(np.linalg.norm(robot.plant.gravity_field().gravity_vector()))
+        weight = robot.total_mass * gravity
+        sliding = [
+            joint
+            for joint, unit in zip(robot.joint_names, robot.torque_units, strict=True)
+            if unit == "N"
+        ]
+        # What turns a joint by an angle moves the weight by that times the arm.
+        needed = {"all": weight * arm} | dict.fromkeys(sliding, weight / arm)
+        limit = _round(_STRENGTH * (max(weight, weight * arm) if sliding else weight * arm))
+        return _Drives(
+            {joint: _round(_STIFFNESS * gain) for joint, gain in needed.items()},
+            limit if limit > PositionLoopConfig().torque_limit["all"] else None,
+        )
+
+    @property
+    def control(self) -> str:
+        """As in a scenario."""
+        damping = {joint: _DAMPING * gain for joint, gain in self.stiffness.items()}
+        limit = f", torque_limit: {_by_joint({'all': self.limit})}" if self.limit else ""
+        return f"{{kp: {_by_joint(self.stiffness)}, kd: {_by_joint(damping)}{limit}}}"
+
+    @property
+    def rotor_inertia(self) -> str:
+        """As in a scenario."""
+        return _by_joint({joint: gain / _BANDWIDTH**2 for joint, gain in self.stiffness.items()})
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.1e}")
+
+
+def _by_joint(values: dict[str, float]) -> str:
+    """Numbers by joint as YAML on one line."""
+    tree = {joint: float(f"{value:.3g}") for joint, value in values.items()}
+    return yaml.safe_dump(tree, default_flow_style=True, width=1000, sort_keys=False).strip()
 
 
 _SCENARIO = """\
@@ -189,7 +236,7 @@ _SCENARIO = """\
   robot: &robot
     description: {robot}.yaml{hanging}
     # Of motors and gears, as they act on the joints [kg m^2]. A guess: put in those of your drives.
-    rotor_inertia: {{all: {inertia:.2g}}}
+    rotor_inertia: {inertia}
     # What really acts in the robot; `fbse list effects` says what there is.
     effects: {{}}
   # What is believed of it: here all.
@@ -200,13 +247,12 @@ _SCENARIO = """\
     imu: {{acceleration_noise: 0.02, angular_velocity_noise: 1.0e-3}}
     foot_force: {{noise: 0.5, moment_noise: 0.02}}
   # Of the position loops [Nm/rad], [Nms/rad]. A guess from the robot's weight.
-  control: {{kp: {{all: {kp:g}}}, kd: {{all: {kd:.3g}}}}}
+  control: {control}
 """
 
 
 def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
     squat, _ = stands
-    kp = _gain(robot, squat.com_height)
     words = ", ".join(
         f"{key}: {getattr(squat, key):g}"
         for key in (
@@ -223,7 +269,7 @@ def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
     return _scenario(
         name,
         "squat",
-        kp,
+        _Drives.of(robot, squat.com_height),
         what="all feet stand, the body goes up and down",
         title=f"{name} squats.",
         reference=f"!Squat {{{words}}}",
@@ -234,25 +280,24 @@ def _squat(robot: Robot, name: str, stands: tuple[Squat, Reference]) -> str:
 def _swing(robot: Robot, name: str) -> str:
     """Every joint swings about the middle of its range, or about 0 if that is inside."""
     joints = [robot.plant.GetJointByName(joint) for joint in robot.joint_names]
-    limits = [(j.position_lower_limits()[0], j.position_upper_limits()[0]) for j in joints]
-    posture = {
-        joint.name(): round(float(0.5 * (low + high)), 3)
-        for joint, (low, high) in zip(joints, limits, strict=True)
-        if not low + _SWING < 0.0 < high - _SWING
+    limits = {
+        j.name(): (float(j.position_lower_limits()[0]), float(j.position_upper_limits()[0]))
+        for j in joints
     }
-    context = robot.plant.CreateDefaultContext()
-    origin = robot.plant.EvalBodyPoseInWorld(context, robot.base).translation()
-    bodies = robot.plant.GetBodyIndices(robot.base.model_instance())
-    places = [
-        robot.plant.EvalBodyPoseInWorld(context, robot.plant.get_body(k)).translation() - origin
-        for k in bodies
-    ]
-    reach = max(float(np.linalg.norm(place)) for place in places)
-    kp = _gain(robot, max(0.5 * reach, 0.1))
+    swing = {
+        joint: min(_SWING, _SWING_SHARE * (high - low)) for joint, (low, high) in limits.items()
+    }
+    posture = {
+        joint: round(0.5 * (low + high), 4)
+        for joint, (low, high) in limits.items()
+        if not low + swing[joint] < 0.0 < high - swing[joint]
+    }
+    narrow = {joint: _round(most) for joint, most in swing.items() if most < _SWING}
+    reach = _reach(robot)
     reference = yaml.safe_dump(
         {
             "posture": posture,
-            "amplitude": {"all": _SWING},
+            "amplitude": {"all": _SWING} | narrow,
             "frequency": {"all": _SWING_FREQUENCY},
         },
         default_flow_style=True,
@@ -261,29 +306,41 @@ def _swing(robot: Robot, name: str) -> str:
     return _scenario(
         name,
         "swing",
-        kp,
+        _Drives.of(robot, max(0.5 * reach, 0.1)),
         what="the base is held, every joint swings",
         title=f"{name} swings its joints; its base is held.",
         reference=f"!JointSines {reference}",
-        hanging=f"\n    gantry_height: {2 * reach:.2f}",
+        hanging="" if robot.description.fixed_base else f"\n    gantry_height: {2 * reach:.2f}",
     )
 
 
-def _scenario(robot: str, motion: str, kp: float, **words: str) -> str:
-    """A scenario file of a robot whose position loops have this gain [Nm/rad]."""
+def _reach(robot: Robot) -> float:
+    """How far links and their centres of mass are from the base in the zero posture [m]."""
+    plant, context = robot.plant, robot.plant.CreateDefaultContext()
+    bodies = [plant.get_body(k) for k in plant.GetBodyIndices(robot.base.model_instance())]
+    origin = plant.EvalBodyPoseInWorld(context, robot.base).translation()
+    places = [
+        plant.EvalBodyPoseInWorld(context, body) @ place
+        for body in bodies
+        for place in (np.zeros(3), body.CalcCenterOfMassInBodyFrame(context))
+    ]
+    return max(float(np.linalg.norm(place - origin)) for place in places)
+
+
+def _scenario(robot: str, motion: str, drives: _Drives, **words: str) -> str:
+    """A scenario file of a robot with these drives."""
     return _SCENARIO.format(
         file=f"{robot}_{motion}.yaml",
         name=f"{robot}_{motion}",
         robot=robot,
         duration=_DURATION,
-        inertia=kp / _BANDWIDTH**2,
-        kp=kp,
-        kd=_DAMPING * kp,
+        inertia=drives.rotor_inertia,
+        control=drives.control,
         **words,
     )
 
 
-def _tried(path: Path) -> tuple[list[str], list[str]]:
+def _tried(path: Path, robot: Robot) -> tuple[list[str], list[str]]:
     """What the scenario shows, and what goes wrong in it."""
     try:
         run = simulate(load_scenario(path))
@@ -293,7 +350,11 @@ def _tried(path: Path) -> tuple[list[str], list[str]]:
         return [], [run.failure]
     tracking = run.metrics["joint_tracking_rms"]
     worst = max(tracking, key=lambda joint: tracking[joint])
-    remarks = [f"It follows its plan within {1e3 * tracking[worst]:.2g} mrad rms ({worst})."]
+    units = dict(zip(robot.joint_names, robot.position_units, strict=True))
+    off = f"{1e3 * tracking[worst]:.2g} m{units[worst]} rms ({worst})"
+    if tracking[worst] > _FOLLOWS:
+        return [], [f"it does not follow its plan but misses it by {off}: see its `control`"]
+    remarks = [f"It follows its plan within {off}."]
     if run.log.sides:
         remarks.append(_weight_text(run.log))
     return remarks, []
@@ -333,14 +394,20 @@ _MAP_HEADER = """\
 def _map_text(robot: Robot) -> str:
     """A map of a table with a column for each number."""
     joints = robot.joint_names
+    turns, moves = (set(units) for units in (robot.torque_units, robot.position_units))
 
     def channel(kind: str, names: Sequence[str], unit: str) -> dict[str, Any]:
-        return {"columns": [f"{kind}_{name}" for name in names], "unit": unit}
+        columns = {"columns": [f"{kind}_{name}" for name in names]}
+        return columns | {"unit": unit} if unit else columns
+
+    def shared(units: set[str], per: str = "") -> str:
+        """Unit of all joints; nothing, which is SI, where they have not the same."""
+        return f"{min(units)}{per}" if len(units) == 1 else ""
 
     channels = {
-        "joint/position": channel("position", joints, "rad"),
-        "joint/velocity": channel("velocity", joints, "rad/s"),
-        "joint/torque_command": channel("torque", joints, "Nm"),
+        "joint/position": channel("position", joints, shared(moves)),
+        "joint/velocity": channel("velocity", joints, shared(moves, "/s")),
+        "joint/torque_command": channel("torque", joints, shared(turns)),
     }
     if robot.description.legs:
         channels["imu/linear_acceleration"] = channel("acc", "xyz", "m/s^2")

@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cached_property, lru_cache
+from functools import cached_property
 from os.path import expandvars
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -37,6 +36,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.errors import InputError, located, require_not_negative, require_positive
+from fbse_drake.robot.bare_urdf import bare_urdf
 from fbse_drake.robot.description import Leg, RobotDescription, load_description
 from fbse_drake.robot.implicit import ImplicitTorque, add_implicit_torque, clamp_name
 
@@ -120,6 +120,8 @@ class Robot:
     description: RobotDescription
     # What its solver takes of the joints' losses.
     implicit: ImplicitTorque
+    # What of its model's file could not be taken as it is, in words.
+    remarks: tuple[str, ...] = ()
 
     @property
     def joint_names(self) -> list[str]:
@@ -159,6 +161,11 @@ class Robot:
             "N" if self.plant.GetJointByName(name).type_name() == PrismaticJoint.kTypeName else "Nm"
             for name in self.joint_names
         ]
+
+    @cached_property
+    def position_units(self) -> list[str]:
+        """Unit of each joint's angle, or of the place of a prismatic joint."""
+        return ["m" if unit == "N" else "rad" for unit in self.torque_units]
 
     @cached_property
     def body_names(self) -> list[str]:
@@ -415,7 +422,7 @@ def make_robot(
     diagram = builder or DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config or MultibodyPlantConfig(), diagram)
     with located(f"{path}: "):
-        _add_model(plant, names, path)
+        remarks = _add_model(plant, names, path)
         _add_frames(plant, names)
         _check_names(plant, names)
         _hold_other_joints(plant, names)
@@ -446,10 +453,12 @@ def make_robot(
     elif ground is not None:
         _tilt_world(plant, ground.slope)
     plant.Finalize()
+    if plant.CalcTotalMass(plant.CreateDefaultContext()) <= 0.0:
+        raise InputError(f"{path}: expected a robot with a mass, found none in its model")
     if builder is None:
         # A builder that never builds is never freed.
         diagram.Build()
-    robot = Robot(plant, names, implicit)
+    robot = Robot(plant, names, implicit, remarks)
     for side in names.sides:
         for pad, X_FP in zip(names.legs[side].pads, robot._pad_poses(side), strict=True):
             if not X_FP.rotation().IsNearlyIdentity(1e-9):
@@ -464,7 +473,8 @@ def make_robot(
     return robot, scene_graph
 
 
-def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> None:
+def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> tuple[str, ...]:
+    """Adds what a description describes; what of its file could not be taken as it is, in words."""
     key, file = ("urdf", names.urdf) if names.urdf else ("directives", names.directives)
     source = path.parent / expandvars(file)
     if "$" in str(source):
@@ -474,46 +484,16 @@ def _add_model(plant: MultibodyPlant, names: RobotDescription, path: Path) -> No
     parser = Parser(plant)
     try:
         if names.urdf:
-            parser.AddModelsFromString(bare_urdf(source), "urdf")
-        else:
-            parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
-            ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
+            urdf = bare_urdf(source)
+            parser.AddModelsFromString(urdf.text, "urdf")
+            return urdf.remarks
+        parser.package_map().AddPackageXml(str(path.parent / "package.xml"))
+        ProcessModelDirectives(LoadModelDirectives(str(source)), parser)
+        return ()
     # Drake's parsers say it in several ways; where they do not, SystemExit stands for an assertion.
     except (Exception, SystemExit) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{key}: {reason}") from None
-
-
-# What is not taken from a URDF: shapes, whose meshes need not be there; friction, which is an
-# effect; actuators, which every joint has that is named; and that one joint mimics another, for
-# what is not named is held.
-_NOT_TAKEN = ("visual", "collision", "dynamics", "transmission", "mimic")
-
-
-def bare_urdf(urdf: Path) -> str:
-    """A URDF with bodies, joints and frames only.
-
-    Limits of which the lower one is the upper one are none: who writes 0 and 0 did not know them.
-    """
-    return _bare(urdf.read_bytes())
-
-
-# A diagnosis makes its robot many times, of large files too.
-@lru_cache(maxsize=4)
-def _bare(urdf: bytes) -> str:
-    root = ElementTree.fromstring(urdf)
-    for element in [root, *root.iter("link"), *root.iter("joint")]:
-        for part in [part for part in element if part.tag in _NOT_TAKEN]:
-            element.remove(part)
-    for joint in root.iter("joint"):
-        limit = joint.find("limit")
-        if joint.get("type") == "revolute" and limit is not None:
-            low, high = (float(limit.get(end, "0")) for end in ("lower", "upper"))
-            if low == high:
-                joint.set("type", "continuous")
-                for end in ("lower", "upper"):
-                    limit.attrib.pop(end, None)
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _add_frames(plant: MultibodyPlant, names: RobotDescription) -> None:

@@ -51,8 +51,12 @@ def propose(urdf: Path, file: str) -> Proposal:
     model = UrdfModel(urdf)
     if not model.joints:
         raise InputError(f"{urdf}: no joint turns or slides")
-    legs, imu = model.legs(), _imu(model)
-    remarks = [f"IMU: {imu}." if imu else "No frame is called IMU: it measures in the base's axes."]
+    legs, imu = [] if model.is_fixed else model.legs(), _imu(model)
+    remarks = [f"{remark}." for remark in model.file.remarks]
+    if imu:
+        remarks.append(f"IMU: {imu}.")
+    elif legs:
+        remarks.append("No frame is called IMU: it measures in the base's axes.")
     imu = imu or (model.base.name() if legs else "")
     kind = (len(legs), len(legs[0].joints)) if legs else None
     found: list[str]
@@ -62,22 +66,41 @@ def propose(urdf: Path, file: str) -> Proposal:
         elif kind in _ON_POINTS:
             description, found = _on_points(model, legs, file, imu)
         else:
-            text = f"{kind[0]} legs of {kind[1]} joints" if kind else "no legs"
-            needed = "a robot on two legs of six, or four of three, would stand"
-            description, found = _swinging(model, file), [f"{text} were found; {needed}."]
+            description, found = _swinging(model, file), _no_legs_to_stand_on(model, legs)
     except NoStanceError as error:
         description, found = _swinging(model, file), [f"It only swings: {error}."]
     remarks += found
-    held = len(model.joints) - len(description.joint_names)
-    if held:
+    others = {joint.name() for joint in model.joints} - set(description.joint_names)
+    following = others & set(model.file.mimicking)
+    if following:
+        remarks.append(f"Joints that follow others are held at 0: {', '.join(sorted(following))}.")
+    if held := len(others - following):
         remarks.append(f"{held} joints that are no leg's are held at 0 (see `held`).")
     return Proposal(description, remarks)
 
 
+def _no_legs_to_stand_on(model: UrdfModel, legs: list[Chain]) -> list[str]:
+    """Why a robot does not stand; nothing of one that is fixed to the world."""
+    if model.is_fixed:
+        return []
+    needed = "a robot on two legs of six, or four of three, would stand"
+    if not legs:
+        return [f"No legs were found; {needed}."]
+    joints = len(legs[0].joints)
+    alike = sum(len(chain.joints) == joints for chain in model.chains())
+    if (alike, joints) in ((2, 6), *_ON_POINTS):
+        return [
+            f"{alike} chains of {joints} joints leave {model.base.name()}, of which only "
+            f"{len(legs)} end low: do its axes point forwards (x) and up (z)? If not, fix a frame "
+            "with such axes to it and make it the root."
+        ]
+    return [f"{len(legs)} legs of {joints} joints were found; {needed}."]
+
+
 def _swinging(model: UrdfModel, file: str) -> RobotDescription:
-    """Of a robot of which all joints are alike."""
-    names = [joint.name() for joint in model.joints]
-    return RobotDescription(model.base.name(), urdf=file, joints=names)
+    """Of a robot of which all joints are alike, but those that follow another one."""
+    names = [j.name() for j in model.joints if j.name() not in model.file.mimicking]
+    return RobotDescription(model.base.name(), urdf=file, fixed_base=model.is_fixed, joints=names)
 
 
 def _on_soles(

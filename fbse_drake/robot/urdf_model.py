@@ -17,13 +17,15 @@ from pydrake.multibody.tree import (
 )
 
 from fbse_drake.errors import InputError
-from fbse_drake.robot.plant import bare_urdf
+from fbse_drake.robot.bare_urdf import bare_urdf
 from fbse_drake.robot.shapes import link_points
 
 # The instance that holds the robot: the first after Drake's own two.
 _MODEL = ModelInstanceIndex(2)
 # A leg ends no higher above the lowest end than this share of the robot's height.
 _LOW = 0.15
+# Of a body that is no link: the world's.
+_NO_SHAPES = ElementTree.Element("link")
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,11 @@ class UrdfModel:
     def __init__(self, urdf: Path):
         self.urdf, self.plant = urdf, MultibodyPlant(0.0)
         try:
+            self.file = bare_urdf(urdf)
             self.links = {
                 link.get("name", ""): link for link in ElementTree.parse(urdf).iter("link")
             }
-            Parser(self.plant).AddModelsFromString(bare_urdf(urdf), "urdf")
+            Parser(self.plant).AddModelsFromString(self.file.text, "urdf")
         except OSError as error:
             raise InputError(f"{urdf}: {error.strerror}") from None
         except (RuntimeError, ValueError, ElementTree.ParseError) as error:
@@ -61,10 +64,15 @@ class UrdfModel:
         joints = [self.plant.get_joint(index) for index in self.plant.GetJointIndices(_MODEL)]
         one = (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)
         self.joints = [joint for joint in joints if joint.type_name() in one]
-        free = [body for body in self._bodies() if body.is_floating_base_body()]
-        if not free:
-            raise InputError(f"{urdf}: no body is free, so there is no base")
-        self.base = free[0]
+        roots = [body for body in self._bodies() if body.is_floating_base_body()]
+        # Of a URDF with a link called world, to which it is fixed.
+        self.is_fixed = not roots
+        world = self.plant.world_body()
+        self.base = (
+            roots or [joint.child_body() for joint in joints if joint.parent_body() is world]
+        )[0]
+        if self.plant.CalcTotalMass(self.context) == 0.0:
+            raise InputError(f"{urdf}: no link has a mass (<inertial>), so nothing would move it")
 
     def _bodies(self) -> list[RigidBody]:
         return [self.plant.get_body(index) for index in self.plant.GetBodyIndices(_MODEL)]
@@ -84,7 +92,8 @@ class UrdfModel:
             parts = [np.empty((0, 3))]
             for part in self.fixed_to(body):
                 X_BP = self.pose(part)
-                local = link_points(self.links[part.name()], kind, self.urdf, X_BP[:3, :3].T)
+                link = self.links.get(part.name(), _NO_SHAPES)
+                local = link_points(link, kind, self.urdf, X_BP[:3, :3].T)
                 parts.append(local @ X_BP[:3, :3].T + X_BP[:3, 3])
             points = np.vstack(parts)
             if len(points):

@@ -412,10 +412,11 @@ def _check_limits(robot: Robot, time: np.ndarray, q: np.ndarray, plan: TaskPlan 
         step = (
             f"step {(plan.phase_at(float(time[sample]))[0] + 1) // 2}, " if plan is not None else ""
         )
+        unit = robot.position_units[joint]
         raise InputError(
             f"{step}t = {time[sample]:.2f} s: needs {robot.joint_names[joint]} at "
-            f"{q[sample, joint]:.3f} rad, "
-            f"its limits are {lower[joint]:.3f} to {upper[joint]:.3f} rad"
+            f"{q[sample, joint]:.3f} {unit}, "
+            f"its limits are {lower[joint]:.3f} to {upper[joint]:.3f} {unit}"
         )
 
 

@@ -459,7 +459,14 @@ def check_gravity(evidence: Evidence) -> Iterable[HygieneFinding]:
         )
 
 
+def check_model_file(evidence: Evidence) -> Iterable[HygieneFinding]:
+    """The model is as its file has it."""
+    for text in evidence.robot.remarks:
+        yield remark("model_file", "warning", "model", 1.0, "1", text)
+
+
 CHECKS = (
+    check_model_file,
     check_velocity_clock,
     check_gyro_clock,
     check_force_clock,
