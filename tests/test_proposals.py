@@ -10,9 +10,9 @@ from fbse_drake import Log
 from fbse_drake.discrepancy.diagnosis import selection
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
-from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.fits import Fits, fixed_gain
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.diagnosis.proposals import Proposals, fixed_gain, largest_drop
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals, largest_drop
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Regression, Signature
 from fbse_drake.effects.effect import Effect

@@ -24,7 +24,9 @@ class TorqueGain(JointTorqueEffect):
     shows_at_rest: ClassVar[bool] = True
     needs_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Parameter]] = {
-        "shortfall": Parameter("1", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf)),
+        "shortfall": Parameter(
+            "1", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf), everything=1.0
+        ),
     }
 
     shortfall: dict[str, float] = field(default_factory=dict)

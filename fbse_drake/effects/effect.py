@@ -95,6 +95,8 @@ class Parameter:
     # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that
     # a log which does not show it does not make it large; by default nothing is believed.
     belief: float = np.inf
+    # For one that is a share: its value where all is taken. What may be all of it is no share.
+    everything: float = np.inf
     # For a nonlinear one: is what would lie beyond its plausible range something else?
     closed: bool = False
     # What it is, where its name does not say it.

@@ -250,7 +250,9 @@ class FootForceGain(Gain):
     experiment: ClassVar[str] = "Shift the weight slowly from foot to foot."
     acts_on: ClassVar[Literal["joint", "body", "foot", "robot"]] = "foot"
     parameters: ClassVar[dict[str, Parameter]] = {
-        "gain": Parameter("1", linear=True, plausible=(-0.2, 0.2), bounds=(-1.0, np.inf))
+        "gain": Parameter(
+            "1", linear=True, plausible=(-0.2, 0.2), bounds=(-1.0, np.inf), everything=-1.0
+        )
     }
 
     gain: dict[str, float] = field(default_factory=dict)

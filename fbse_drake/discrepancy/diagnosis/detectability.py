@@ -45,9 +45,11 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
     if not issubclass(effect, JointTorqueEffect):
         for candidate in (c for c in fits.fixed_candidates if c.effect is effect):
             s = candidate.signature
+            # What is noise in its columns shows nothing.
+            noise = np.broadcast_to(candidate.noise_power, s.values.shape[1:])[:, 0]
             power = sum(
-                gram[0, 0] / beside.scale[row]
-                for row, (gram, _) in zip(s.rows, beside.moments(s), strict=True)
+                (gram[0, 0] - of_noise) / beside.scale[row]
+                for row, of_noise, (gram, _) in zip(s.rows, noise, beside.moments(s), strict=True)
             )
             result[candidate.targets[0]] = float(
                 np.sqrt(

@@ -22,6 +22,7 @@ from fbse_drake.discrepancy.residual.evidence import travel_of
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.white_noise import step_of
+from fbse_drake.effects.contact import ContactEffect
 from fbse_drake.effects.effect import Effect, Parameter
 from fbse_drake.effects.friction import CoulombViscousFriction
 from fbse_drake.effects.geometry import GeometryEffect
@@ -45,7 +46,7 @@ class FixedColumns:
     # Values of its nonlinear parameters, which are not searched for, (m,).
     nonlinear: np.ndarray
     signature: Signature
-    # What the sensors' noise puts into it, for an inertia effect.
+    # What the sensors' noise puts into it, where that counts.
     noise: Signature | None
 
 
@@ -227,11 +228,14 @@ class Dictionary:
             lowest=effect.lowest_values(self.predictor.robot, target),
             prior=effect.linear_beliefs() ** -2,
         )
-        noise = None
-        is_noisy = follows_torque(effect) and self._is_torque_noisy
-        if len(raw.rows) and (issubclass(effect, InertiaEffect | GeometryEffect) or is_noisy):
-            noise = self.predictor.noise_in(effect, target, nonlinear, raw)
+        is_noisy = len(raw.rows) and (self.is_measured(effect) or issubclass(effect, ContactEffect))
+        noise = self.predictor.noise_in(effect, target, nonlinear, raw) if is_noisy else None
         return FixedColumns(target, nonlinear, raw, noise)
+
+    def is_measured(self, effect: type[Effect]) -> bool:
+        """Is the noise that is in the columns of an effect in the residual as well?"""
+        is_noisy = follows_torque(effect) and self._is_torque_noisy
+        return issubclass(effect, InertiaEffect | GeometryEffect) or is_noisy
 
     @cached_property
     def _is_torque_noisy(self) -> bool:

@@ -31,8 +31,10 @@ class Candidate:
     # The same as it is, or what makes it: it is seldom asked for.
     source: Signature | Callable[[], Signature]
     # Drop of the deviance that it brings because the sensors' noise is in its columns and in the
-    # residual alike.
-    spurious: float = 0.0
+    # residual alike, or what finds it: it is seldom asked for as well.
+    noise_drop: float | Callable[[], float] = 0.0
+    # Sum of squares of the noise in its columns, whitened, by row and column, (r, p) or 0.
+    noise_power: np.ndarray | float = 0.0
 
     @property
     def name(self) -> str:
@@ -47,6 +49,11 @@ class Candidate:
     def raw(self) -> Signature:
         """Its signature, not whitened."""
         return self.source if isinstance(self.source, Signature) else self.source()
+
+    @cached_property
+    def spurious(self) -> float:
+        """Drop of the deviance that noise in its columns feigns."""
+        return self.noise_drop() if callable(self.noise_drop) else self.noise_drop
 
     @property
     def has_linear(self) -> bool:

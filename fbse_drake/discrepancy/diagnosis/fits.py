@@ -172,26 +172,23 @@ class Fits:
 
     def _fixed_candidate(self, effect: type[Effect], fixed: FixedColumns) -> Candidate:
         signature = self.white.whiten_signature(fixed.signature)
-        spurious = (
-            0.0
-            if fixed.noise is None
-            else self._spurious(signature, self.white.whiten_signature(fixed.noise))
-        )
-        return Candidate(
+        candidate = Candidate(
             effect,
             (fixed.target,),
             self.dictionary.parameters(effect, fixed.target),
             fixed.nonlinear,
             signature,
             fixed.signature,
-            spurious,
         )
-
-    def _spurious(self, signature: Signature, noise: Signature) -> float:
-        """Drop of the deviance that the noise in a signature may feign."""
-        both = np.einsum("brp,br->p", noise.values, self._noise[:, signature.rows])
-        power = (signature.values**2).sum(axis=(0, 1))
-        return _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+        if fixed.noise is None:
+            return candidate
+        noise = self.white.whiten_signature(fixed.noise)
+        is_measured = self.dictionary.is_measured(effect)
+        return replace(
+            candidate,
+            noise_drop=_noise_drop(signature, noise, self._noise) if is_measured else 0.0,
+            noise_power=(noise.values**2).sum(axis=0),
+        )
 
     @cached_property
     def _noise(self) -> np.ndarray:
@@ -436,8 +433,7 @@ class Fits:
             (noisy - clean[:, 0]).T @ self._noise[:, place]
             for noisy, clean, place in zip(noisier, whitened, places, strict=True)
         )
-        power = sum(np.diag(s.gram[0]) for s in sets)
-        spurious = _SPURIOUS * float((both**2 / np.maximum(power, 1e-30)).sum())
+        spurious = _SPURIOUS * fixed_gain(sum(s.gram[0] for s in sets), both)
         return Candidate(effect, group, parameters, nonlinear, signature(whitened), raw, spurious)
 
     def about(self, candidate: Candidate, values: np.ndarray) -> Candidate:
@@ -450,14 +446,21 @@ class Fits:
         if issubclass(candidate.effect, InertiaEffect):
             about = np.broadcast_to(candidate.raw.about, values.shape)
             values = candidate.effect.nearby(about, values)
+        effect, target, nonlinear = candidate.effect, candidate.targets[0], candidate.nonlinear
         raw = self.dictionary.predictor.signature_near(
-            candidate.effect,
-            candidate.targets[0],
-            values,
-            candidate.nonlinear,
-            candidate.raw,
+            effect, target, values, nonlinear, candidate.raw
         )
-        return replace(candidate, source=raw, signature=self.white.whiten_signature(raw))
+        signature = self.white.whiten_signature(raw)
+        if not self.dictionary.is_measured(effect):
+            return replace(candidate, source=raw, signature=signature)
+        # A candidate must not hold the fits that hold it.
+        predictor, white, realization = self.dictionary.predictor, self.white, self._noise
+
+        def noise_drop() -> float:
+            noise = white.whiten_signature(predictor.noise_in(effect, target, nonlinear, raw))
+            return _noise_drop(signature, noise, realization)
+
+        return replace(candidate, source=raw, signature=signature, noise_drop=noise_drop)
 
     def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
         """Whitened, in the order of the explanation's parameters."""
@@ -501,6 +504,23 @@ class Fits:
     def needed(self, parameters: int) -> float:
         """Sum of squares that an effect with so many parameters must have to be found."""
         return float(self.threshold[min(12, parameters)] + (COMPLEXITY + 1) * parameters)
+
+
+def fixed_gain(gram: np.ndarray, right: np.ndarray) -> float:
+    """Drop of the sum of squares by columns with these inner products, roughly."""
+    return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
+
+
+def _noise_drop(signature: Signature, noise: Signature, realization: np.ndarray) -> float:
+    """Drop of the deviance that noise in columns may feign.
+
+    Args:
+        noise: what it adds to the columns.
+        realization: what it adds to the residual, whitened, (B, R).
+    """
+    right = np.einsum("brp,br->p", noise.values, realization[:, signature.rows])
+    gram = np.tensordot(signature.values, signature.values, axes=((0, 1), (0, 1)))
+    return _SPURIOUS * fixed_gain(gram, right)
 
 
 def _nearby(

@@ -490,9 +490,11 @@ class Predictor:
         clean: Signature,
     ) -> Signature:
         """What that noise adds to the signature of an effect: regressors are measured too."""
-        point = self._expansion_point(effect, target)
-        if point is not None:
-            values, _ = self._slopes(effect, target, point, nonlinear, noisier=True)
+        if issubclass(effect, ContactEffect):
+            return replace(clean, values=self._soles.noise_in(effect)[:, clean.rows])
+        if np.any(clean.about):
+            about = np.asarray(clean.about)
+            values, _ = self._slopes(effect, target, about, nonlinear, noisier=True)
             return replace(clean, values=values[:, clean.rows] - clean.values, offset=0.0)
         values = self._per_unit(effect, target, nonlinear, noisier=True)
         return replace(clean, values=values[:, clean.rows] - clean.values)

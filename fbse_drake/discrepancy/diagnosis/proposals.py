@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
-from fbse_drake.discrepancy.diagnosis.fits import Alike, Fits
+from fbse_drake.discrepancy.diagnosis.fits import Alike, Fits, fixed_gain
 from fbse_drake.discrepancy.diagnosis.grid_sets import grid_gain
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Signature, WhitenedResidual
@@ -333,11 +333,6 @@ def largest_drop(
     left = sse.copy()
     left[rows] -= np.clip(alone, 0.0, sse[rows])
     return white.deviance(sse) - white.deviance(left)
-
-
-def fixed_gain(gram: np.ndarray, right: np.ndarray) -> float:
-    """Drop of the sum of squares by columns with these inner products, roughly."""
-    return float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])
 
 
 def _free(

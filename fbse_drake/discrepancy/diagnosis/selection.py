@@ -299,6 +299,9 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
     for k, (parameter, value, widest, deviation, (least, most)) in enumerate(
         zip(parameters, values, largest, deviations, intervals, strict=True)
     ):
+        if least <= parameter.everything <= most:
+            # Where a joint needs next to no torque, any friction takes all that it is given.
+            return False
         if least <= 0 <= most and np.isfinite(parameter.belief):
             # One of several components, which the log hardly shows.
             continue

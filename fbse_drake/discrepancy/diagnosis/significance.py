@@ -72,13 +72,20 @@ class Significance:
         """What is left in a row beyond the sensors' noise, as a share of the row's size; NaN if it
         has none.
 
+        The smaller of two measures. In units of noise, what is slow counts for many times its size
+        where noise is quick, as that of rates whose differences are accelerations. As it is, what
+        is left cannot be told from the chance in the noise's own mean square.
+
         Args:
             row: its place.
             left: what is left of the whitened residual, (B, R).
         """
-        beyond = float((left[:, row] ** 2).sum()) / max(1, white.count[row]) - 1.0
-        noise = white.residual.noise_floor[row]
-        return float(np.sqrt(max(beyond, 0.0)) * noise / self._sizes[row])
+        count, noise = max(1, white.count[row]), white.residual.noise_floor[row]
+        beyond = float((left[:, row] ** 2).sum()) / count - 1.0
+        chance = 2.0 * np.sqrt(2.0 / count)
+        as_it_is = float((white.coloured(left)[:, row] ** 2).sum()) / count / noise**2 - 1.0
+        larger = min(max(beyond, 0.0), max(as_it_is, 0.0) + chance)
+        return float(np.sqrt(larger) * noise / self._sizes[row])
 
 
 def _length(vectors: np.ndarray) -> float:

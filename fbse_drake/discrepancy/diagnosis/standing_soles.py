@@ -42,9 +42,18 @@ class StandingSoles:
         the standing soles that it predicts, (B, R, p)."""
         if not self._robot.has_floating_base:
             return np.zeros((*self._shape, len(effect.parameters)))
-        motions = [
-            effect.sole_motion(force, pads, self._sample_time) for force, pads in self._foot_forces
-        ]
+        return self._columns(effect, self._foot_forces)
+
+    def noise_in(self, effect: type[ContactEffect]) -> np.ndarray:
+        """What noise that is added to the measured forces once more adds to these columns."""
+        if not self._robot.has_floating_base:
+            return np.zeros((*self._shape, len(effect.parameters)))
+        return self._columns(effect, self._noisier_forces) - self.columns(effect)
+
+    def _columns(
+        self, effect: type[ContactEffect], forces: Sequence[tuple[np.ndarray, np.ndarray]]
+    ) -> np.ndarray:
+        motions = [effect.sole_motion(force, pads, self._sample_time) for force, pads in forces]
         columns = [
             self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))
         ]
@@ -63,6 +72,17 @@ class StandingSoles:
     @cached_property
     def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return self._split_feet(self._motion.signals.pad_force)
+
+    @cached_property
+    def _noisier_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        force = self._motion.signals.pad_force
+        noise = force_noise(
+            self._motion.sensors_by_row.foot_force,
+            self._robot,
+            len(force),
+            np.random.default_rng(0),
+        )
+        return self._split_feet(force + noise)
 
     def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Force (N, P, 3) on the pads of each foot, of which the normal component is their springs'
@@ -192,30 +212,10 @@ class StandingSoles:
         """What the noise of the force sensors puts into the predicted sinking of the soles, per
         unit of compliance squared, (R,).
 
-        Of a noise that is added to the measured forces once more. A robot that does not stand has
-        no soles that sink.
+        A robot that does not stand has no soles that sink.
         """
-        if not self._robot.has_floating_base:
-            return np.zeros(self._shape[1])
-        force = self._motion.signals.pad_force
-        noise = force_noise(
-            self._motion.sensors_by_row.foot_force,
-            self._robot,
-            len(force),
-            np.random.default_rng(0),
-        )
-        motions = [
-            [
-                GroundCompliance.sole_motion(f, pads, self._sample_time)
-                for f, pads in self._split_feet(forces)
-            ]
-            for forces in (force, force + noise)
-        ]
-        clean, noisy = (
-            self._sole_rows([(rotation[0], displacement[0]) for rotation, displacement in both])
-            for both in motions
-        )
-        return np.nan_to_num(rms(noisy - clean, self._motion.known) ** 2)
+        noise = self.noise_in(GroundCompliance)[:, :, 0]
+        return np.nan_to_num(rms(noise, self._motion.known) ** 2)
 
 
 def _later(values: np.ndarray, samples: float) -> np.ndarray:

@@ -579,7 +579,8 @@ class Score:
     """How good a diagnosis of an exercise is."""
 
     # Does the verdict fit? `effect_found` for effects of the library, `unknown_effect` for a
-    # stranger; a decoy has nothing missing, nor has a log that cannot show what is hidden.
+    # stranger; a decoy has nothing missing, nor has a log that cannot show what is hidden, or in
+    # which it is said to be too small to matter.
     verdict: bool
     # By hidden effect of the library: is it found, or larger than the smallest size that the
     # diagnosis says would have shown; was it found, or an effect that is declared to say the same;
@@ -692,9 +693,10 @@ def score(answer: Answer, diagnoses: Sequence[Mapping[str, Any]]) -> Score:
                 }
     wrong = [f["effect"] for f in chosen if not {f["effect"], *f["confusable_with"]} & set(hidden)]
     names_nothing = diagnoses[0]["verdict"] in ("nothing_missing", "not_visible")
+    said_to_be_small = {finding["effect"] for finding in small}
+    unnamed = [name for name, shows in visible.items() if shows and name not in said_to_be_small]
     verdict = {
-        "library": diagnoses[0]["verdict"] == "effect_found"
-        or (names_nothing and not any(visible.values())),
+        "library": diagnoses[0]["verdict"] == "effect_found" or (names_nothing and not unnamed),
         "decoy": names_nothing,
         "stranger": diagnoses[-1]["verdict"] == "unknown_effect",
     }[answer.kind]
