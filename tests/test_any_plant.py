@@ -16,6 +16,7 @@ from fbse_drake.discrepancy.diagnosis.compare import compare
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import model_error, train_and_rest
+from fbse_drake.discrepancy.exercises.strangers import UnevenFriction
 from fbse_drake.discrepancy.residual.servo import with_command
 from fbse_drake.effects.actuation import TorqueBias, TorqueDelay, TorqueGain, TorqueLag
 from fbse_drake.effects.friction import CoulombFriction, CoulombViscousFriction, ViscousFriction
@@ -399,3 +400,37 @@ def test_a_position_servo_tells_its_torque_by_its_gains(rubbing: tuple[Scenario,
 def test_a_description_that_does_not_fit_is_refused(folder: Path, changes: dict, message: str):
     with pytest.raises(InputError, match=message):
         make_robot(described(folder, **changes))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+def test_where_friction_takes_all_that_a_joint_is_given_no_gain_is_named(
+    tmp_path: Path, offset: float
+):
+    """A wheel that turns in balance needs next to no torque: friction of any kind is as good as a
+    motor of which nothing arrives. Out of balance it needs some, and the gain is named."""
+    (tmp_path / "wheel.urdf").write_text(
+        f"""<robot name="wheel"><link name="stand"/><link name="wheel"><inertial>
+        <origin xyz="{offset} 0 0"/><mass value="2"/>
+        <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        <joint name="axle" type="continuous"><parent link="stand"/><child link="wheel"/>
+        <axis xyz="0 1 0"/></joint></robot>"""
+    )
+    text = {"urdf": "wheel.urdf", "base": "stand", "fixed_base": True, "joints": ["axle"]}
+    (tmp_path / "wheel.yaml").write_text(yaml.safe_dump(text))
+    motion = JointSines(amplitude={"axle": 0.1}, frequency={"axle": 0.5}, ramp=2.0)
+    hidden = (
+        UnevenFriction(coulomb={"axle": 4.4}, unevenness={"axle": 0.97})
+        if offset == 0.0
+        else TorqueGain({"axle": 0.3})
+    )
+    scenario = Scenario(
+        duration=6.0,
+        robot=RobotConfig(str(tmp_path / "wheel.yaml"), effects={"hidden": hidden}),
+        reference=motion,
+        control=PositionLoopConfig(kp={"all": 400.0}, kd={"all": 8.0}),
+        sensors=SensorsConfig(encoders=EncoderConfig(velocity_noise=1e-4)),
+    )
+    believed = dataclasses.replace(scenario, model=RobotConfig(str(tmp_path / "wheel.yaml")))
+    found = diagnose(Predictor(believed, simulate(scenario).log))
+    named = {finding.effect for finding in found.chosen}
+    assert ("TorqueGain" in named) == isinstance(hidden, TorqueGain)

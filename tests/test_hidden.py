@@ -384,6 +384,17 @@ def test_what_a_later_round_finds_counts():
     assert score(two, rounds[:1]).found == {"TorqueBias": False, "BodyMass": True}
 
 
+@pytest.mark.parametrize("is_small", [True, False])
+def test_who_says_that_what_is_hidden_is_too_small_to_matter_is_right(is_small: bool):
+    """Who has it among what may be there instead does not say so."""
+    found = diagnosis(("TorqueBias", (JOINT,), {}), verdict="nothing_missing")
+    found["ranking"][0] |= {"chosen": False, "too_small": is_small}
+    result = score(answer("TorqueBias", JOINT, bias=2.0), [found])
+    assert result.verdict is is_small
+    assert result.found == {"TorqueBias": is_small}
+    assert result.wrong == ()
+
+
 @pytest.mark.parametrize(
     ("shown", "is_visible"),
     [({JOINT: 1.9}, True), ({JOINT: 2.1, "left_hip_yaw": 0.1}, False), ({JOINT: None}, False)],
