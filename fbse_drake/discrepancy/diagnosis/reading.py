@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import savgol_filter
 
+from fbse_drake.discrepancy.residual.equation_of_motion import joint_velocity_noise
 from fbse_drake.discrepancy.residual.noise import measured_noise, measured_sensors
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.recorded_signals import Instants, within_steps
@@ -27,6 +28,8 @@ from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take
 # them.
 _SMOOTHING = 9
+# A joint that is slower than so many deviations of its velocity's noise may turn either way.
+_MOVES = 4.0
 # For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
 # those that we did.
 _EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
@@ -137,7 +140,7 @@ class Reading:
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
-            load=at.torque_command - self._loss_at(middle),
+            load=at.torque_command - self._loss_at(middle, velocity),
             rotor_inertia=self.robot.rotor_inertias,
         )
 
@@ -168,13 +171,53 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
-    def _loss_at(self, time: np.ndarray) -> np.ndarray:
+    def _loss_at(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
         three blocks, (M, n); without frequencies in which velocities are noise, which is that of
-        the residual."""
-        loss = smoothed(self.motion.residual.value[:, : len(self.robot.joint_names)])
-        at = np.stack([np.interp(time, self.motion.time, c) for c in loss.T], axis=1)
-        return self.motion.without_noise(at)
+        the residual.
+
+        Friction jumps where a joint turns: what it takes one way is not smoothed into what it takes
+        the other.
+
+        Args:
+            velocity: of the joints then, (M, n) [rad/s].
+        """
+        motion = self.motion
+        n = len(self.robot.joint_names)
+        loss, least = motion.residual.value[:, :n], _MOVES * joint_velocity_noise(motion.sensors)
+        between = 0.5 * (motion.blocks.joint_velocity[1:] + motion.blocks.joint_velocity[:-1])
+        begins, ends = (
+            np.concatenate(p) for p in ((between[:1], between), (between, between[-1:]))
+        )
+        either_way = [
+            motion.without_noise(
+                _of_those(
+                    loss,
+                    np.minimum(sign * begins, sign * ends) > -least,
+                    motion.time,
+                    time,
+                )
+            )
+            for sign in (1, -1)
+        ]
+        return np.where(velocity > 0, *either_way)
+
+
+def _of_those(
+    values: np.ndarray, chosen: np.ndarray, known_at: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """Values of some blocks alone, smoothed over three of them, at times (M,), (M, n).
+
+    Args:
+        values: of all blocks, (B, n).
+        chosen: which, (B, n) bool; of none all are taken.
+        known_at: times of the blocks, (B,) [s].
+    """
+    columns = []
+    for column, of_column in zip(values.T, chosen.T, strict=True):
+        which = of_column if of_column.any() else np.ones_like(of_column)
+        columns.append(np.interp(time, known_at[which], smoothed(column[which])))
+    return np.stack(columns, axis=1)
 
 
 def is_read(effect: Effect | type[Effect], recording: RecordingConfig) -> bool:
