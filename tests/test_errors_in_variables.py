@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 from recorded_arm import ARM, Course, Machine
+from scipy.ndimage import uniform_filter1d
 
 from benchmarks.recorded.course import inverse_dynamics
 from fbse_drake.control.position_loop import PositionLoopConfig
@@ -254,3 +255,24 @@ def test_the_load_of_a_joint_has_little_of_the_noise_of_the_residual(
     load = Predictor(scenario, replace(log, channels=channels)).joint_motion.load
     known = np.ones(load.shape, dtype=bool)
     assert np.all(rms(load - course.torque, known) < worst * rms(friction, known))
+
+
+def test_where_a_joint_turns_its_load_is_not_off_by_its_friction() -> None:
+    """Coulomb friction jumps there. Smoothed over the jump it would be in the load, by half of it
+    on either side of the turn."""
+    machine = replace(ARM, period=2e-3, duration=6.0, torque_noise=(0.01,) * 6)
+    course, step = machine.course(), 2 * np.pi / 2**20
+    size = np.array([20.0, 20.0, 10.0, 2.0, 2.0, 1.0])
+    log = machine.log(course, course.torque + size * np.tanh(course.velocity / 0.01))
+    channels = {name: log[name] for name in ("time", "joint/torque_command")}
+    channels["joint/position"] = step * np.round(log["joint/position"] / step)
+    scenario = replace(machine.scenario, sensors=SensorsConfig())
+    predictor = Predictor(scenario, replace(log, channels=channels))
+    # Law for law what matters is the load times how much of the friction acts.
+    acts = np.abs(np.tanh(course.velocity / 0.01))
+    error = acts * (predictor.joint_motion.load - course.torque) / size
+    sign = np.sign(course.velocity)
+    turned = np.diff(sign, axis=0, prepend=sign[:1]) != 0
+    near = uniform_filter1d(turned.astype(float), 50, axis=0) > 0
+    assert near.any(axis=0).all()
+    assert np.all(rms(error, near) < 0.2)
