@@ -7,7 +7,7 @@ from functools import cache, cached_property, partial
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnosis.reading import Reading, is_read
+from fbse_drake.discrepancy.diagnosis.reading import Reading, in_steps, is_read
 from fbse_drake.discrepancy.diagnosis.regressors import Regressors, noisier_signals
 from fbse_drake.discrepancy.diagnosis.standing_soles import StandingSoles
 from fbse_drake.discrepancy.identification.inertial import inertia_addition
@@ -18,7 +18,6 @@ from fbse_drake.discrepancy.residual.equation_of_motion import (
     joint_velocity_noise,
 )
 from fbse_drake.discrepancy.residual.noise import Noise, measured_noise
-from fbse_drake.discrepancy.residual.recorded_signals import within_steps
 from fbse_drake.discrepancy.residual.recorded_velocity import velocity_error
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.actuation import TorqueReadingLag
@@ -252,7 +251,7 @@ class Predictor:
         def change(velocity: np.ndarray) -> np.ndarray:
             """Of that torque, (B, n)."""
             return block_means(
-                _in_steps(motion.recording, torque(velocity) - torque_here), motion.length
+                in_steps(motion.recording, torque(velocity) - torque_here), motion.length
             )
 
         torque_here = torque(here.velocity)
@@ -412,7 +411,7 @@ class Predictor:
         first = np.moveaxis(columns, -2, 0)
         if step > 1:
             return np.moveaxis(block_means(first, self.motion.length // step), 0, -2)
-        return np.moveaxis(self.motion.averages(_in_steps(self.motion.recording, first)), 0, -2)
+        return np.moveaxis(self.motion.averages(in_steps(self.motion.recording, first)), 0, -2)
 
     @property
     def _joined_steps(self) -> int:
@@ -636,16 +635,10 @@ def _joined(recording: RecordingConfig, motion: JointMotion, steps: int) -> Join
     if steps == 1:
         return motion
     joined = {
-        name: block_means(_in_steps(recording, getattr(motion, name)), steps)
+        name: block_means(in_steps(recording, getattr(motion, name)), steps)
         for name in ("velocity", "position", "command", "time", "load")
     }
     return motion._replace(**joined, time_step=steps * motion.time_step)
-
-
-def _in_steps(recording: RecordingConfig, values: np.ndarray) -> np.ndarray:
-    """Values (N - 1, ...) of every step: those of samples (N, ...) are averaged between neighbours,
-    as torques that are sampled."""
-    return within_steps(values, 0.5) if recording.is_sampled else values
 
 
 def _without_rounding(values: np.ndarray) -> np.ndarray:

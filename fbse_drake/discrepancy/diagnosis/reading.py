@@ -28,8 +28,9 @@ from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 # Joint velocities are smoothed over this many samples, without delay, where friction laws take
 # them.
 _SMOOTHING = 9
-# A joint that is slower than so many deviations of its velocity's noise may turn either way.
-_MOVES = 4.0
+# Friction changes its sign within so many deviations of the velocity's noise, and any mixture of
+# these widths [rad/s].
+_MOVES, _TURNS = 4.0, (1e-3, 5e-2)
 # For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
 # those that we did.
 _EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
@@ -140,7 +141,7 @@ class Reading:
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
-            load=at.torque_command - self._loss_at(middle, velocity),
+            load=at.torque_command - self._loss_at(middle, velocity, at.torque_command),
             rotor_inertia=self.robot.rotor_inertias,
         )
 
@@ -171,53 +172,39 @@ class Reading:
         variance = motion.torque_variance(torque).mean(axis=0) + noise
         return noise_corners(torque, variance, motion.period)
 
-    def _loss_at(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def _loss_at(self, time: np.ndarray, velocity: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
         three blocks, (M, n); without frequencies in which velocities are noise, which is that of
         the residual.
 
-        Friction jumps where a joint turns: what it takes one way is not smoothed into what it takes
-        the other.
+        Friction jumps where a joint turns, by an amount that may grow with the torque: what jumps
+        so, by least squares, is not smoothed.
 
         Args:
-            velocity: of the joints then, (M, n) [rad/s].
+            velocity, torque: of the joints then, (M, n) [rad/s], [Nm].
         """
-        motion = self.motion
-        n = len(self.robot.joint_names)
-        loss, least = motion.residual.value[:, :n], _MOVES * joint_velocity_noise(motion.sensors)
-        between = 0.5 * (motion.blocks.joint_velocity[1:] + motion.blocks.joint_velocity[:-1])
-        begins, ends = (
-            np.concatenate(p) for p in ((between[:1], between), (between, between[-1:]))
-        )
-        either_way = [
-            motion.without_noise(
-                _of_those(
-                    loss,
-                    np.minimum(sign * begins, sign * ends) > -least,
-                    motion.time,
-                    time,
-                )
-            )
-            for sign in (1, -1)
-        ]
-        return np.where(velocity > 0, *either_way)
+        motion, n = self.motion, len(self.robot.joint_names)
+        blocks, loss = motion.blocks, motion.residual.value[:, :n]
+        noise = _MOVES * joint_velocity_noise(motion.sensors)
+        signs = [np.tanh(velocity / (noise + width)) for width in _TURNS]
+        jumps = np.stack([s * size for s in signs for size in (1.0, np.abs(torque))])
+        of_blocks = np.stack([motion.averages(in_steps(motion.recording, jump)) for jump in jumps])
+        jump, of_block = np.empty(velocity.shape), np.empty(loss.shape)
+        for k in range(n):
+            smooth = [blocks.joint_velocity[:, k], blocks.joint_acceleration[:, k]]
+            basis = np.column_stack([*of_blocks[..., k], *smooth, np.ones(len(loss))])
+            known = motion.known[:, k] > 0
+            size = np.linalg.lstsq(basis[known], loss[known, k])[0][: len(jumps)]
+            jump[:, k], of_block[:, k] = size @ jumps[..., k], size @ of_blocks[..., k]
+        rest = smoothed(loss - of_block)
+        at = np.stack([np.interp(time, motion.time, column) for column in rest.T], axis=1)
+        return motion.without_noise(at) + jump
 
 
-def _of_those(
-    values: np.ndarray, chosen: np.ndarray, known_at: np.ndarray, time: np.ndarray
-) -> np.ndarray:
-    """Values of some blocks alone, smoothed over three of them, at times (M,), (M, n).
-
-    Args:
-        values: of all blocks, (B, n).
-        chosen: which, (B, n) bool; of none all are taken.
-        known_at: times of the blocks, (B,) [s].
-    """
-    columns = []
-    for column, of_column in zip(values.T, chosen.T, strict=True):
-        which = of_column if of_column.any() else np.ones_like(of_column)
-        columns.append(np.interp(time, known_at[which], smoothed(column[which])))
-    return np.stack(columns, axis=1)
+def in_steps(recording: RecordingConfig, values: np.ndarray) -> np.ndarray:
+    """Values (N - 1, ...) of every step: those of samples (N, ...) are averaged between neighbours,
+    as torques that are sampled."""
+    return within_steps(values, 0.5) if recording.is_sampled else values
 
 
 def is_read(effect: Effect | type[Effect], recording: RecordingConfig) -> bool:
