@@ -169,6 +169,7 @@ def test_joints_that_hang_on_the_world_and_slide_a_little(tmp_path: Path):
     scenario = load_scenario(made.scenario)
     robot = build_robot(scenario.robot)
     assert robot.joint_names == ["slide", "pivot"]
+    assert not robot.has_floating_base
     assert scenario.reference.posture["slide"] == pytest.approx(0.004)
     assert 0.0 < scenario.reference.amplitude["slide"] < 0.002
     # One unit cannot be that of both.

@@ -17,8 +17,6 @@ _TAKEN = {
     "link": ("inertial",),
     "joint": ("origin", "parent", "child", "axis", "limit"),
 }
-# What Drake takes to be the world, and what a link of this name is called otherwise.
-_WORLD, _ITS_WORLD = "world", "world_link"
 # A share of the largest moment of inertia that is rounding.
 _ROUNDING = 1e-9
 _MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
@@ -72,24 +70,8 @@ def _bare(urdf: bytes) -> BareUrdf:
     for link in links:
         if what := _made_possible(link):
             changed.setdefault(what, []).append(link.get("name", ""))
-    remarks = [f"{', '.join(names)}: {what}" for what, names in changed.items()]
-    remarks += _own_world(links, joints)
-    return BareUrdf(ElementTree.tostring(root, encoding="unicode"), tuple(remarks), mimicking)
-
-
-def _own_world(links: list[Element], joints: list[Element]) -> list[str]:
-    """Gives a link that Drake takes to be the world another name, where joints that move hang on
-    it: a robot's base is a body of its own."""
-    ends = [end for joint in joints for end in (joint.find("parent"), joint.find("child"))]
-    names = [end for end in ends if end is not None and end.get("link") == _WORLD]
-    if all(joint.get("type") == "fixed" for joint in joints if joint.find("parent") in names):
-        return []
-    for link in links:
-        if link.get("name") == _WORLD:
-            link.set("name", _ITS_WORLD)
-    for end in names:
-        end.set("link", _ITS_WORLD)
-    return [f"Joints hang on the link {_WORLD}: it is called {_ITS_WORLD} here"]
+    remarks = tuple(f"{', '.join(names)}: {what}" for what, names in changed.items())
+    return BareUrdf(ElementTree.tostring(root, encoding="unicode"), remarks, mimicking)
 
 
 def _without_empty_range(joint: Element) -> None:

@@ -65,7 +65,7 @@ class UrdfModel:
         one = (RevoluteJoint.kTypeName, PrismaticJoint.kTypeName)
         self.joints = [joint for joint in joints if joint.type_name() in one]
         roots = [body for body in self._bodies() if body.is_floating_base_body()]
-        # Of a URDF with a link called world, to which it is fixed.
+        # A link called world is the world for Drake: what it carries is the base.
         self.is_fixed = not roots
         world = self.plant.world_body()
         self.base = (
