@@ -13,10 +13,6 @@ from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import model_error
 from fbse_drake.discrepancy.residual.rollout import RolloutError, rollout
-from fbse_drake.effects.actuation import TorqueRollOff
-from fbse_drake.effects.friction import CoulombFriction, LoadDependentFriction, ViscousFriction
-from fbse_drake.effects.inertia import ReflectedInertia
-from fbse_drake.effects.sensor import EncoderOffset
 from fbse_drake.interop.convert import convert
 from fbse_drake.interop.mapping import load_map
 
@@ -25,16 +21,6 @@ pytestmark = pytest.mark.skipif(
     "FBSE_DATA_DIR" not in os.environ or not DATA.is_dir(),
     reason="needs the recordings bam_xl330 in the folder that FBSE_DATA_DIR names",
 )
-# Of the effects that are tried, those that concern a joint of a motor with a gear; the whole
-# library takes minutes.
-FEW = [
-    LoadDependentFriction,
-    TorqueRollOff,
-    CoulombFriction,
-    ViscousFriction,
-    ReflectedInertia,
-    EncoderOffset,
-]
 
 
 def records(*gains: int) -> Log:
@@ -59,7 +45,7 @@ def believed() -> Scenario:
 
 @pytest.fixture(scope="module")
 def diagnosis(train: Log, believed: Scenario) -> Diagnosis:
-    return diagnose(Predictor(believed, train), FEW)
+    return diagnose(Predictor(believed, train))
 
 
 @pytest.fixture(scope="module")

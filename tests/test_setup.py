@@ -98,6 +98,33 @@ def test_a_large_tilt_is_found_where_it_is_and_not_along_its_slope() -> None:
     assert [found.parameters[a].value for a in "xy"] == pytest.approx([0.2, 0.15], abs=1e-3)
 
 
+def test_a_pendulum_shows_no_tilt_of_its_axis() -> None:
+    """A tilt out of the plane in which it swings makes its weight less by a cosine to either side.
+
+    A weight that is larger than believed is none of it, although along the slope beside the middle,
+    where the cosine rises again, a tilt seems to make it more. A tilt in the plane is an angle.
+    """
+    scenario = load_scenario("real/xl330")
+    model = dataclasses.replace(scenario.believed, effects={})
+    recording = RecordingConfig(rows="instantaneous", torque_noise={"servo": 2e-3})
+    scenario = dataclasses.replace(scenario, model=model, recording=recording)
+    time = np.arange(0.0, 20.0, 0.01)
+    angle = 1.2 * np.sin(2.0 * time) + 0.4 * np.sin(5.1 * time)
+    velocity = 2.4 * np.cos(2.0 * time) + 2.04 * np.cos(5.1 * time)
+    acceleration = -4.8 * np.sin(2.0 * time) - 10.404 * np.sin(5.1 * time)
+    inertia, weight, tilt = 1.5e-4 + 0.49 * 0.1**2, 0.49 * 9.81 * 0.1, 0.03
+    noise = 2e-3 * np.random.default_rng(8).standard_normal(len(time))
+    torque = inertia * acceleration + 1.04 * weight * np.sin(angle + tilt) + noise
+    of_joint = {"position": angle, "velocity": velocity, "torque_command": torque}
+    channels = {f"joint/{name}": values[:, None] for name, values in of_joint.items()}
+    log = Log({"time": time} | channels, {"joints": ["servo"], "period": 0.01})
+    found = diagnose(Predictor(scenario, log))
+    (mount,) = (f for f in found.ranking if f.effect == "BaseTilt")
+    assert mount.parameters["x"].value == 0.0
+    # The servo turns about -y.
+    assert mount.parameters["y"].value == pytest.approx(-tilt, rel=0.1)
+
+
 def about_torques(scenario: Scenario, log: Log) -> list[HygieneFinding]:
     """What the hygiene says of the torques."""
     findings = inspect(Predictor(scenario, log).motion).findings

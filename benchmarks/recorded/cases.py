@@ -144,13 +144,18 @@ def judge(material: Material) -> dict[str, str]:
 
 
 def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
-    """How a recording's diagnosis is: right if everything that shows is named and nothing else."""
+    """How a recording's diagnosis is: right if everything that shows is named and nothing else.
+
+    What a finding is declared confusable with may be in another place: a mount's tilt is an encoder
+    offset of a joint that is level.
+    """
     truth = recording.truth
+    everywhere = set().union(*truth.values())
     chosen = [finding for finding in diagnosis["ranking"] if finding["chosen"]]
 
     def is_right(finding: Mapping[str, Any], target: str) -> bool:
-        said = {finding["effect"], *finding["confusable_with"]}
-        return bool(said & truth.get(target, set()))
+        known = finding["effect"] in truth.get(target, set())
+        return known or not everywhere.isdisjoint(finding["confusable_with"])
 
     wrong = [f for f in chosen if not all(is_right(f, target) for target in f["joints"])]
     if wrong:

@@ -441,25 +441,12 @@ class Predictor:
             values = self._soles.columns(effect)
         else:
             point = self._expansion_point(effect, target)
+            values, offset = self._slopes(effect, target, point, nonlinear)
             if point is not None:
-                values, offset = self._slopes(effect, target, point, nonlinear)
                 rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
                 return Signature(rows, values[:, rows], offset[:, rows], about=point)
-            values = _without_rounding(self._per_unit(effect, target, nonlinear))
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
         return Signature(rows, values[:, rows])
-
-    def _per_unit(
-        self, effect: type[Effect], target: str, nonlinear: np.ndarray, *, noisier: bool = False
-    ) -> np.ndarray:
-        """What an effect adds per unit of each linear parameter, (B, R, p)."""
-        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
-        units = np.diag([_probe(effect, name) for name in names])
-        columns = [
-            self._addition(effect, target, unit, nonlinear, noisier=noisier) / unit.sum()
-            for unit in units
-        ]
-        return np.stack(columns, axis=2)
 
     @cached_property
     def _regressors(self) -> Regressors:
@@ -495,7 +482,7 @@ class Predictor:
             about = np.asarray(clean.about)
             values, _ = self._slopes(effect, target, about, nonlinear, noisier=True)
             return replace(clean, values=values[:, clean.rows] - clean.values, offset=0.0)
-        values = self._per_unit(effect, target, nonlinear, noisier=True)
+        values, _ = self._slopes(effect, target, None, nonlinear, noisier=True)
         return replace(clean, values=values[:, clean.rows] - clean.values)
 
     def is_possible(self, effect: type[Effect], target: str, linear: np.ndarray) -> bool:
@@ -564,22 +551,30 @@ class Predictor:
         self,
         effect: type[Effect],
         target: str,
-        linear: np.ndarray,
+        about: np.ndarray | None,
         nonlinear: np.ndarray,
         *,
         noisier: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What one of these effects adds per unit of each parameter about some values, (B, R, p),
-        and what it adds with these values beyond that, (B, R)."""
-        names = [name for name, parameter in effect.parameters.items() if parameter.linear]
-        here = self._addition(effect, target, linear, nonlinear, noisier=noisier)
-        slopes = []
-        for k, name in enumerate(names):
-            moved = linear.copy()
-            moved[k] += _probe(effect, name)
-            there = self._addition(effect, target, moved, nonlinear, noisier=noisier)
-            slopes.append((there - here) / _probe(effect, name))
-        values = _without_rounding(np.stack(slopes, axis=2))
+        """What one of these effects adds per unit of each linear parameter about some values (None
+        for zeros), (B, R, p), and what it adds with these values beyond that, (B, R).
+
+        Of a robot's shape by central differences: a tilt to the left and one to the right do the
+        same to a pendulum, and a slope that is not there would promise anything.
+        """
+
+        def addition(values: np.ndarray) -> np.ndarray:
+            return self._addition(effect, target, values, nonlinear, noisier=noisier)
+
+        probes = np.array([_probe(effect, n) for n, p in effect.parameters.items() if p.linear])
+        linear = np.zeros(len(probes)) if about is None else about
+        here = np.zeros_like(self.residual.value) if about is None else addition(linear)
+        if issubclass(effect, GeometryEffect):
+            differences = [addition(linear + d) - addition(linear - d) for d in np.diag(probes)]
+            probes = 2.0 * probes
+        else:
+            differences = [addition(linear + d) - here for d in np.diag(probes)]
+        values = _without_rounding(np.stack(differences, axis=2) / probes)
         return values, here - values @ linear
 
     def _addition(
