@@ -565,6 +565,20 @@ def test_effects_in_one_place_are_named_together():
     )
 
 
+def test_laws_of_two_effects_are_named_by_these_where_one_of_them_is_found_too():
+    left, right = ((knee,) for knee in KNEES)
+    both = dataclasses.replace(FRICTION, effect="CoulombViscousFriction", targets=right)
+    viscous = dataclasses.replace(FRICTION, effect="ViscousFriction", targets=left)
+    coulomb = dataclasses.replace(FRICTION, targets=left)
+    for found, text in (
+        ((both, viscous, coulomb), "Coulomb friction and viscous friction in right and left knee"),
+        ((both, MASS), "Coulomb viscous friction in right knee pitch and body mass in trunk"),
+        ((both, coulomb), "Coulomb friction in right and left knee pitch and viscous friction in "),
+    ):
+        said = reports.diagnosis_outcome(made_diagnosis(ranking=found))
+        assert said.startswith(f"The model lacks {text}")
+
+
 def test_one_effect_in_several_places_is_one_row_of_the_table():
     """The most important rows are not crowded out by the joints of an arm."""
 

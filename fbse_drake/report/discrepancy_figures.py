@@ -31,6 +31,7 @@ from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.discrepancy.residual.rows import Row
 from fbse_drake.effects.effect import library, spaced
+from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.report.html import number
 from fbse_drake.report.style import (
     ERROR,
@@ -796,12 +797,27 @@ def _added(findings: Sequence[Finding]) -> list[str]:
 
 
 def by_effect(findings: Sequence[Finding]) -> dict[str, list[str]]:
-    """All targets of each effect, once."""
+    """All targets of each effect, once.
+
+    What others say together is said by these where one of them is found too: friction that is
+    Coulomb and viscous friction in one joint, and one law for each in the next, is of two kinds.
+    """
+    found = {finding.effect for finding in findings}
     result: dict[str, list[str]] = {}
     for finding in findings:
-        targets = result.setdefault(finding.effect, [])
-        targets.extend(target for target in finding.targets if target not in targets)
+        parts = _parts(finding.effect)
+        for effect in parts if found & parts.keys() else [finding.effect]:
+            targets = result.setdefault(effect, [])
+            targets.extend(target for target in finding.targets if target not in targets)
     return result
+
+
+def _parts(effect: str) -> dict[str, None]:
+    """Effects that say together what a composite effect says, in their order."""
+    law = library().get(effect)
+    if law is None or not law.composite or not issubclass(law, JointTorqueEffect):
+        return {}
+    return {part.__name__: None for reduction in law.reductions for part in reduction.effects}
 
 
 def small_motions(robot: Robot) -> str:

@@ -484,10 +484,11 @@ def as_sentence(text: str) -> str:
 def listed_effects(findings: Sequence[Finding]) -> str:
     """Effects and where, as `Coulomb friction and torque bias in left knee pitch and body mass in
     trunk`; for the inside of a sentence."""
-    by_place: dict[tuple[str, ...], list[str]] = {}
-    for effect, targets in by_effect(findings).items():
-        by_place.setdefault(tuple(targets), []).append(effect)
-    return _enumerated([_effects_in(effects, targets) for targets, effects in by_place.items()])
+    targets = by_effect(findings)
+    by_place: dict[frozenset[str], list[str]] = {}
+    for effect in targets:
+        by_place.setdefault(frozenset(targets[effect]), []).append(effect)
+    return _enumerated([_effects_in(there, targets[there[0]]) for there in by_place.values()])
 
 
 def _enumerated(names: Sequence[str]) -> str:
