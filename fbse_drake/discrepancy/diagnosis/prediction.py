@@ -559,8 +559,8 @@ class Predictor:
         """What one of these effects adds per unit of each linear parameter about some values (None
         for zeros), (B, R, p), and what it adds with these values beyond that, (B, R).
 
-        Of a robot's shape by central differences: a tilt to the left and one to the right do the
-        same to a pendulum, and a slope that is not there would promise anything.
+        Of a shape that is linear only nearby by central differences: a tilt to the left and one to
+        the right do the same to a pendulum, and a slope that is not there would promise anything.
         """
 
         def addition(values: np.ndarray) -> np.ndarray:
@@ -569,7 +569,7 @@ class Predictor:
         probes = np.array([_probe(effect, n) for n, p in effect.parameters.items() if p.linear])
         linear = np.zeros(len(probes)) if about is None else about
         here = np.zeros_like(self.residual.value) if about is None else addition(linear)
-        if issubclass(effect, GeometryEffect):
+        if issubclass(effect, GeometryEffect) and effect.linear_nearby:
             differences = [addition(linear + d) - addition(linear - d) for d in np.diag(probes)]
             probes = 2.0 * probes
         else:
