@@ -26,7 +26,7 @@ class Hidden:
     # Joints or bodies.
     targets: tuple[str, ...]
     # How much it is in each of them: what the first effect calls its first parameter. Nothing where
-    # it has several of a kind, as a place in space has.
+    # it has several of a kind, as a place in space has; of a tilt its angle.
     sizes: tuple[float, ...] = ()
     # Torque that it takes beside what the links need, (N, n), of a course.
     loss: Callable[[Course], np.ndarray] = field(default=lambda c: np.zeros_like(c.torque))

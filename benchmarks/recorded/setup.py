@@ -22,7 +22,10 @@ def random_setup(random: np.random.Generator, machine: Machine) -> tuple[Hidden,
     if askew:
         heading, angle = random.uniform(0, 2 * np.pi), random.uniform(*_TILT)
         tilt = (float(angle * np.cos(heading)), float(angle * np.sin(heading)))
-        result.append(Hidden(("BaseTilt",), ("robot",), change=lambda m: replace(m, tilt=tilt)))
+        sizes = (float(angle),)
+        result.append(
+            Hidden(("BaseTilt",), ("robot",), sizes, change=lambda m: replace(m, tilt=tilt))
+        )
     turning = [k for k, link in enumerate(machine.links) if not link.slides]
     if homed_badly and turning:
         joint = int(random.choice(turning))
