@@ -314,7 +314,7 @@ class Walk:
         """Standard deviation of the friction, stated or (if it is not) measured, (N, n) [Nm]."""
         if _DEVIATION in self.estimates:
             return self.estimates[_DEVIATION]
-        error = self.estimates[_FRICTION] - ended_step(self.log["truth/joint/friction_torque"])
+        error = self.estimates[_FRICTION] - ended_step(self.log, "truth/joint/friction_torque")
         rms = np.sqrt(np.mean(error[self.ticks(_SETTLED) :] ** 2, axis=0))
         return np.broadcast_to(rms, error.shape)
 

@@ -441,7 +441,7 @@ def rows_of(scenario: Scenario, log: Log) -> list[Row]:
     known = priors(scenario)
     model = walk_model(scenario, log, known["law"])
     squares = {
-        "friction": ended_step(log["truth/joint/friction_torque"]) ** 2,
+        "friction": ended_step(log, "truth/joint/friction_torque") ** 2,
         "limit": model.filtered_variance(),
         "smoother": model.smoothed_variance(),
         "limit_with_walk": replace(model, prior=known["with walk"]).filtered_variance(),

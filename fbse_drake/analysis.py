@@ -43,12 +43,12 @@ from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.residual.evidence import Evidence
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import Effect
-from fbse_drake.errors import InputError
+from fbse_drake.errors import InputError, require_type
 from fbse_drake.files import origin, write_json, write_text
 from fbse_drake.interop.convert import read_logs
 from fbse_drake.interop.export import writer_for
 from fbse_drake.interop.models import write_mjcf, write_urdf
-from fbse_drake.log import Log, joined
+from fbse_drake.log import Log, joined, require_log
 from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress, silent
 from fbse_drake.report import discrepancy_figures as figures
@@ -78,7 +78,7 @@ from fbse_drake.report.replay import study_motions, write_replay
 from fbse_drake.report.sentences import Inputs, compare_outcome, diagnosis_outcome, study_outcome
 from fbse_drake.results import Result, made_folder
 from fbse_drake.robot.plant import Robot
-from fbse_drake.scenario import Scenario, dump_scenario
+from fbse_drake.scenario import Scenario, dump_scenario, require_scenario
 
 # A log, or several by name, which are fitted together.
 Recordings: TypeAlias = Log | Mapping[str, Log]
@@ -137,7 +137,8 @@ class Case:
         cls, scenario: Scenario, log: Recordings, tests: Mapping[str, Log] | None, name: str
     ) -> "Case":
         """With the rest of each log set aside."""
-        given = {"the log": log} if isinstance(log, Log) else dict(log)
+        require_scenario(scenario)
+        given: dict[str, Log] = {"the log": log} if isinstance(log, Log) else _recordings(log)
         if not given:
             raise InputError("no log is given")
         parts = {one: train_and_rest(scenario, of) for one, of in given.items()}
@@ -388,6 +389,8 @@ def compare(scenario: Scenario, log: Log, *, name: str = "scenario") -> Comparis
     >>> compare(scenario, simulate(scenario).log).failures[0].row.name
     'axis_6'
     """
+    require_scenario(scenario)
+    require_log(log)
     case = Case(name, scenario, log, log)
     return _with_case(ComparisonResult, case.comparison, case=case)
 
@@ -429,10 +432,11 @@ def diagnose(
     'Nm'
     """
     case = Case.divided(scenario, log, tests, name)
+    tried = None if effects is None else _classes(effects)
     with Processes(jobs) as processes:
         beside = processes.beside(progress)
         averaged, _ = averaged_to_bandwidth(case.predictor)
-        tried = plausible_effects(averaged) if effects is None else list(effects)
+        tried = plausible_effects(averaged) if tried is None else tried
         dictionary = Dictionary(averaged, tried, beside)
         dictionary.begin(processes)
         # While it is begun the log is inspected; mostly all of it is trusted.
@@ -497,7 +501,7 @@ def study(
     found = studying.study(
         case.trusted,
         case.train,
-        effects,
+        None if effects is None else _classes(effects),
         rollouts=rollouts,
         tests=case.tests,
         progress=progress,
@@ -542,7 +546,10 @@ def add(scenario: Scenario, found: Diagnosis | Iterable[Finding]) -> Scenario:
     Raises:
         InputError: an effect that the library does not have.
     """
+    require_scenario(scenario)
     findings = found.completing if isinstance(found, Diagnosis) else list(found)
+    for finding in findings:
+        require_type("found", finding, Finding, "the ranking of a diagnosis")
     return addition.add(scenario, findings)
 
 
@@ -568,6 +575,7 @@ def hide(
     Raises:
         InputError: an unknown effect or size, or nothing is small enough for the robot.
     """
+    require_scenario(scenario)
     return hidden.make_exercise(scenario, name, seed, what=what, size=size, count=count)
 
 
@@ -609,6 +617,32 @@ def convert(
 
 
 T = TypeVar("T")
+
+
+def _recordings(logs: Mapping[str, Log]) -> dict[str, Log]:
+    """
+    Raises:
+        InputError: it is something else than logs by name.
+    """
+    for log in logs.values() if isinstance(logs, Mapping) else [logs]:
+        require_log(log)
+    return dict(logs)
+
+
+def _classes(effects: Iterable[type[Effect]]) -> list[type[Effect]]:
+    """
+    Raises:
+        InputError: it holds something else than classes of effects.
+    """
+    found = list(effects) if isinstance(effects, Iterable) else [effects]
+    for effect in found:
+        if not (isinstance(effect, type) and issubclass(effect, Effect)):
+            raise InputError(
+                f"effects: expected classes of effects, as [CoulombFriction], found {effect!r}"
+            )
+    if not isinstance(effects, Iterable):
+        raise InputError("effects: expected a list of classes, found a single one")
+    return found
 
 
 def _with_case(kind: type[T], found: Any, **more: Any) -> T:

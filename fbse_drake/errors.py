@@ -26,6 +26,19 @@ def located(where: str) -> Iterator[None]:
         raise InputError(f"{where}{error}") from None
 
 
+def require_type(name: str, value: object, expected: type, made_by: str) -> None:
+    """Refuses an argument of another type.
+
+    Args:
+        made_by: where one comes from, as `load_scenario`.
+    """
+    if not isinstance(value, expected):
+        raise InputError(
+            f"{name}: expected a {expected.__name__} (as {made_by} gives), found "
+            f"{type(value).__name__}"
+        )
+
+
 def require_positive(config: object, *names: str) -> None:
     """Refuses a configuration in which one of these numbers is given (not None) and not > 0."""
     for name in names:

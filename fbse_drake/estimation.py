@@ -16,11 +16,11 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.estimator import Estimator, make_estimator
 from fbse_drake.estimators.recursive import RecursiveEstimator, start_share
 from fbse_drake.held_readings import rows_of_readings
-from fbse_drake.log import Log
+from fbse_drake.log import Log, require_log
 from fbse_drake.results import RunResult
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import output_views, state_views
-from fbse_drake.scenario import Scenario, build_robot, dump_scenario, task_plan
+from fbse_drake.scenario import Scenario, build_robot, dump_scenario, require_scenario, task_plan
 from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
 from fbse_drake.wiring import release
@@ -72,6 +72,8 @@ def estimate(
         InputError: no estimator in the scenario, a log that lacks a channel, other joints or feet
             than the model's.
     """
+    require_scenario(scenario)
+    require_log(log)
     replay = Replay(scenario, log)
     values, tick_time = replay.run(progress)
     remarks = replay.remarks + replay.findings()

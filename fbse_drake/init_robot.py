@@ -235,12 +235,15 @@ _SCENARIO = """\
   reference: {reference}
   robot: &robot
     description: {robot}.yaml{hanging}
-    # Of motors and gears, as they act on the joints [kg m^2]. A guess: put in those of your drives.
+    # Of motors and gears, as they act on the joints [kg m^2], [kg] where a joint slides. A guess:
+    # put in those of your drives.
     rotor_inertia: {inertia}
     # What really acts in the robot; `fbse list effects` says what there is.
     effects: {{}}
   # What is believed of it: here all.
   model: *robot
+  # For recordings of the machine itself: reference: !Recorded {{}}, and where torques are sampled
+  # with the angles and not held over a row, recording: {{rows: instantaneous}}.
   # Noise of usual sensors, standard deviations of a sample.
   sensors:
     encoders: {{resolution: 4.8e-5, velocity_noise: 5.0e-4}}

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fbse_drake import schema
-from fbse_drake.errors import InputError, located, require_not_negative, require_positive
+from fbse_drake.errors import (
+    InputError,
+    located,
+    require_not_negative,
+    require_positive,
+    require_type,
+)
 from fbse_drake.files import from_json, to_json, write_atomically
 from fbse_drake.npz import read_npz
 from fbse_drake.signals import channel_kind
@@ -379,3 +385,8 @@ def joined(logs: Mapping[str, "Log"], gap: float = 1.0) -> Log:
 
 def _shape_text(shape: tuple[Any, ...]) -> str:
     return " x ".join(map(str, shape))
+
+
+def require_log(log: object) -> None:
+    """Refuses what is no log, as its file."""
+    require_type("log", log, Log, "Log.load or convert")

@@ -25,7 +25,13 @@ from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.geometry import shifts
 from fbse_drake.effects.inertia import inertia_changes
 from fbse_drake.effects.user import import_effect_modules, require_trusted
-from fbse_drake.errors import InputError, located, require_not_negative, require_positive
+from fbse_drake.errors import (
+    InputError,
+    located,
+    require_not_negative,
+    require_positive,
+    require_type,
+)
 from fbse_drake.estimators.beliefs import SensorBeliefs, beliefs_of
 from fbse_drake.estimators.estimator import Estimator, NoEstimator
 from fbse_drake.robot.description import RobotDescription, load_description
@@ -475,6 +481,11 @@ def _ticks(scenario: Scenario) -> np.ndarray:
     """Times of the control [s]."""
     ticks = round(scenario.duration / scenario.control.period)
     return np.arange(ticks + 1) * scenario.control.period
+
+
+def require_scenario(scenario: object) -> None:
+    """Refuses what is no scenario, as its name."""
+    require_type("scenario", scenario, Scenario, "load_scenario")
 
 
 def load_scenario(

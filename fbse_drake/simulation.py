@@ -27,7 +27,7 @@ from fbse_drake.results import RunResult
 from fbse_drake.robot.description import RobotDescription
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sampling import state_views
-from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario
+from fbse_drake.scenario import FallConfig, Scenario, SensorsConfig, dump_scenario, require_scenario
 from fbse_drake.station import Station, build_station
 from fbse_drake.walking.reference import RecordedReference, Reference
 from fbse_drake.wiring import release
@@ -80,6 +80,7 @@ def simulate(
     >>> run.failure is None, run.log["joint/position"].shape
     (True, (201, 6))
     """
+    require_scenario(scenario)
     with recorded_run(scenario, meshcat=meshcat, progress=progress) as run:
         log = _make_log(scenario, name, run)
         return SimulationResult(log, run.end.failure, run.end.wall_time, scenario, name)

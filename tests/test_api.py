@@ -4,6 +4,7 @@ import ast
 import importlib
 import json
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -267,3 +268,25 @@ def test_a_run_shows_and_saves_itself(tmp_path: Path):
         "report.html",
         "scenario.yaml",
     ]
+
+
+def test_what_is_of_another_type_is_refused_in_a_line() -> None:
+    """A name or a file in the place of what it stands for."""
+    scenario = fd.load_scenario("bsc_arm", overrides=["duration=0.3"])
+    log = fd.simulate(scenario).log
+    for call, text in (
+        (lambda: fd.simulate("squat"), "scenario: expected a Scenario (as load_scenario gives), "),
+        (
+            lambda: fd.compare(scenario, "log.npz"),
+            "log: expected a Log (as Log.load or convert gives)",
+        ),
+        (lambda: fd.diagnose(log, scenario), "scenario: expected a Scenario"),
+        (lambda: fd.diagnose(scenario, [log, log]), "log: expected a Log"),
+        (lambda: fd.estimate(scenario, "log.npz"), "log: expected a Log"),
+        (lambda: fd.diagnose(scenario, log, ["TorqueBias"]), "found 'TorqueBias'"),
+        (lambda: fd.diagnose(scenario, log, fd.TorqueBias), "found a single one"),
+        (lambda: fd.add(scenario, log.channels), "found: expected a Finding"),
+        (lambda: fd.hide("squat", 1), "scenario: expected a Scenario"),
+    ):
+        with pytest.raises(fd.InputError, match=re.escape(text)):
+            call()

@@ -511,7 +511,10 @@ def test_rounds_are_told_apart_and_what_is_left_is_said_once(
     assert "<th>Round</th>" in text
     assert "<tr><td>left and right knee pitch</td><td>1</td>" in text
     assert "<tr><td>left knee pitch</td><td>2</td>" in text
-    assert "no effect of the library explains, in left knee pitch (follows position)." in text
+    assert (
+        "no effect of the library explains, in left knee pitch (follows position); what is named "
+        "there may stand for part of it." in text
+    )
     # It was added, so it is not lacking.
     assert "The model also lacks" not in text
     assert "fbse compare out/a_walk/completed.yaml" in text
@@ -563,6 +566,13 @@ def test_effects_in_one_place_are_named_together():
         "The model lacks Coulomb friction and torque bias in left and right knee pitch and body "
         "mass in trunk;"
     )
+
+
+def test_what_is_left_where_most_was_explained_is_said():
+    found = made_diagnosis(ranking=(FRICTION,))
+    left = dataclasses.replace(found, unexplained=UNKNOWN.unexplained)
+    assert "and more than noise" not in reports.diagnosis_outcome(found)
+    assert "is small beside that, and more than noise (up to " in reports.diagnosis_outcome(left)
 
 
 def test_laws_of_two_effects_are_named_by_these_where_one_of_them_is_found_too():

@@ -74,6 +74,19 @@ def test_an_exact_estimate_is_that_of_the_step_that_ends():
     assert min(every(friction_nrmse(with_estimate(log, truth)))) > 1e-3
 
 
+def test_rows_that_are_rarer_than_steps_are_compared_with_the_nearest_step():
+    """Of every tenth row: a step is a tenth of what the row before is off by."""
+    log = made_log()
+    exact = with_estimate(log, late(log["truth/joint/friction_torque"]))
+    rarer = Log(
+        {name: values[::10] for name, values in exact.channels.items()},
+        exact.meta | {"period": 0.01, "reading_time": 0.001},
+    )
+    assert max(every(friction_nrmse(rarer))) < 0.02
+    with_rows_of_steps = dataclasses.replace(rarer, meta=rarer.meta | {"reading_time": 0.01})
+    assert min(every(friction_nrmse(with_rows_of_steps))) > 0.03
+
+
 def test_nrmse_is_the_error_over_the_friction_and_rmse_in_nm():
     log = made_log()
     truth = late(log["truth/joint/friction_torque"])

@@ -171,10 +171,13 @@ def stance(log: Log) -> dict[str, np.ndarray]:
     return {}
 
 
-def ended_step(values: np.ndarray) -> np.ndarray:
+def ended_step(log: Log, channel: str) -> np.ndarray:
     """What a channel says of steps that begin at its rows' times, (N, ...), moved to the rows where
-    they end; the first row is NaN."""
-    return np.concatenate([np.full_like(values[:1], math.nan), values[:-1]])
+    they end; NaN before the first. Where rows are rarer than steps the step of the same row is the
+    nearest."""
+    values, period = log[channel], log.meta["period"]
+    rows = round(log.meta.get("reading_time", period) / period)
+    return np.concatenate([np.full_like(values[:rows], math.nan), values[: len(values) - rows]])
 
 
 def friction_law_error(log: Log) -> dict[str, float]:
@@ -206,7 +209,7 @@ def worst_joint(figures: Mapping[str, float]) -> str:
 def friction_error(log: Log) -> np.ndarray:
     """Estimated minus true friction of the step that ends at each row, shape (N, n) [Nm]; NaN in
     the first row, in which no step ends."""
-    return log["estimate/joint/friction_torque"] - ended_step(log["truth/joint/friction_torque"])
+    return log["estimate/joint/friction_torque"] - ended_step(log, "truth/joint/friction_torque")
 
 
 def friction_rmse(log: Log) -> dict[str, dict[str, float]]:
@@ -378,7 +381,7 @@ def _friction_figures(log: Log, *, normalised: bool) -> dict[str, dict[str, floa
     figures = {phase: dict.fromkeys(log.joints, math.nan) for phase in PHASES}
     if "estimate/joint/friction_torque" not in log or "truth/joint/friction_torque" not in log:
         return figures
-    error, truth = friction_error(log), ended_step(log["truth/joint/friction_torque"])
+    error, truth = friction_error(log), ended_step(log, "truth/joint/friction_torque")
     stands, rows = stance(log), settled(log)
     never = np.zeros(len(log.time), dtype=bool)
     for joint, (name, side) in enumerate(zip(log.joints, joint_sides(log), strict=True)):

@@ -231,7 +231,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
         if is_refuted(diagnosis.set_aside):
             return f"{_suggested(found)}{doubt}.{_tentative(diagnosis.tentative)}"
         text = f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}"
-        return f"{text}{_tentative(diagnosis.tentative)}{_open(diagnosis)}"
+        return f"{text}{_tentative(diagnosis.tentative)}{_left(diagnosis)}{_open(diagnosis)}"
     statuses = applicable(diagnosis.effects)
     hidden = sum(status.verdict == "not_visible" for status in statuses.values())
     if diagnosis.verdict == "nothing_missing":
@@ -269,7 +269,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if found:
         refuted = is_refuted(diagnosis.set_aside)
         known = f" {_suggested(found)}." if refuted else f" The model also lacks {found}."
-    return f"{_unexplained(diagnosis)}{known}{_tentative(diagnosis.tentative)}"
+    return f"{_unexplained(diagnosis, diagnosis.chosen)}{known}{_tentative(diagnosis.tentative)}"
 
 
 def _tentative(findings: Sequence[Finding]) -> str:
@@ -302,12 +302,33 @@ def _suggested(found: str) -> str:
     return f"What was fitted suggests that the model lacks {found}"
 
 
-def _unexplained(diagnosis: Diagnosis) -> str:
+def _unexplained(diagnosis: Diagnosis, found: Sequence[Finding]) -> str:
+    """What is missing besides what was found; in the same place that may stand for it."""
     places = ", ".join(
         f"{words(left.row)} (follows {left.variable})" if left.share > _FOLLOWS else words(left.row)
         for left in diagnosis.unexplained
     ) or _enumerated([targets_text(f.targets, f.effect) for f in diagnosis.tentative])
-    return f"Something is missing that no effect of the library explains, in {places}."
+    text = f"Something is missing that no effect of the library explains, in {places}"
+    rows = {left.row for left in diagnosis.unexplained}
+    # What is on a body shows in the joints that carry it.
+    if any(rows & {*f.targets} or not _is_in_joints(f) for f in found):
+        return f"{text}; what is named there may stand for part of it."
+    return f"{text}."
+
+
+def _is_in_joints(finding: Finding) -> bool:
+    effect = library().get(finding.effect)
+    return effect is None or effect.acts_on == "joint"
+
+
+def _left(diagnosis: Diagnosis) -> str:
+    """What is left where most was explained; empty if that is nothing but noise."""
+    if not diagnosis.unexplained:
+        return ""
+    rows = _rows([left.row for left in diagnosis.unexplained])
+    most = number(max(left.ratio for left in diagnosis.unexplained))
+    size = f"more than noise (up to {most} times it)"
+    return f" What is left in {rows} is small beside that, and {size}."
 
 
 def study_outcome(study: Study) -> str:
@@ -345,7 +366,7 @@ def _study_result(study: Study) -> str:
     if refused := [finding for one in study.diagnoses for finding in one.refuted]:
         result += f" {_refuted(refused)}"
     if ended.verdict == "unknown_effect":
-        result += f" {_unexplained(ended)}"
+        result += f" {_unexplained(ended, study.found)}"
     return result
 
 
@@ -357,7 +378,7 @@ def _not_added(diagnosis: Diagnosis) -> str:
         f"{number(diagnosis.held_out_after)})."
     )
     if diagnosis.verdict == "unknown_effect":
-        result += f" {_unexplained(diagnosis)}"
+        result += f" {_unexplained(diagnosis, ())}"
     return result
 
 

@@ -65,7 +65,7 @@ def _friction_lines(log: Log, joint: int) -> Iterator[Line]:
         band = None if deviation is None else 2 * deviation[:, joint]
         yield Line("estimated friction", estimate, ESTIMATE, band=band)
     if "truth/joint/friction_torque" in log:
-        truth = ended_step(log["truth/joint/friction_torque"])[:, joint]
+        truth = ended_step(log, "truth/joint/friction_torque")[:, joint]
         yield Line("true friction", truth, TRUTH, dashed=True)
 
 

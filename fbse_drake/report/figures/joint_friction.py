@@ -106,7 +106,7 @@ def estimated_friction(log: Log) -> Figure:
         log.get("estimate/joint/friction_torque_std"),
     )
     truth = (
-        ended_step(log["truth/joint/friction_torque"])
+        ended_step(log, "truth/joint/friction_torque")
         if "truth/joint/friction_torque" in log
         else None
     )
