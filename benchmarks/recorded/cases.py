@@ -146,16 +146,17 @@ def judge(material: Material) -> dict[str, str]:
 def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
     """How a recording's diagnosis is: right if everything that shows is named and nothing else.
 
-    What a finding is declared confusable with may be in another place: a mount's tilt is an encoder
-    offset of a joint that is level.
+    What the whole robot has may be declared confusable with what a joint has: a mount's tilt is an
+    encoder offset of a joint that is level.
     """
     truth = recording.truth
     everywhere = set().union(*truth.values())
     chosen = [finding for finding in diagnosis["ranking"] if finding["chosen"]]
 
     def is_right(finding: Mapping[str, Any], target: str) -> bool:
-        known = finding["effect"] in truth.get(target, set())
-        return known or not everywhere.isdisjoint(finding["confusable_with"])
+        said = {finding["effect"], *finding["confusable_with"]}
+        there = everywhere if target == "robot" else truth.get(target, set())
+        return bool(said & there)
 
     wrong = [f for f in chosen if not all(is_right(f, target) for target in f["joints"])]
     if wrong:
