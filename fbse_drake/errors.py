@@ -1,7 +1,8 @@
 """The errors this package raises on purpose."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from numbers import Real
 
 
 def on_one_line(text: str) -> str:
@@ -39,11 +40,21 @@ def require_type(name: str, value: object, expected: type, made_by: str) -> None
         )
 
 
-def require_positive(config: object, *names: str) -> None:
-    """Refuses a configuration in which one of these numbers is given (not None) and not > 0."""
+def _numbers(config: object, names: Iterable[str]) -> Iterator[tuple[str, float]]:
+    """Those of these fields that are given (not None)."""
     for name in names:
         value = getattr(config, name)
-        if value is not None and not value > 0:
+        if value is None:
+            continue
+        if not isinstance(value, Real):
+            raise InputError(f"{name}: expected a number, found {value!r:.80}")
+        yield name, float(value)
+
+
+def require_positive(config: object, *names: str) -> None:
+    """Refuses a configuration in which one of these is given (not None) and no number > 0."""
+    for name, value in _numbers(config, names):
+        if not value > 0:
             raise InputError(f"{name}: expected a number > 0, found {value:g}")
 
 
@@ -60,16 +71,14 @@ def required(value: float | None, name: str) -> float:
 
 
 def require_not_negative(config: object, *names: str) -> None:
-    """Refuses a configuration in which one of these numbers is given (not None) and < 0."""
-    for name in names:
-        value = getattr(config, name)
-        if value is not None and not value >= 0:
+    """Refuses a configuration in which one of these is given (not None) and no number >= 0."""
+    for name, value in _numbers(config, names):
+        if not value >= 0:
             raise InputError(f"{name}: expected a number >= 0, found {value:g}")
 
 
 def require_at_most(config: object, **largest: float) -> None:
-    """Refuses a configuration in which one of these numbers is given (not None) and too large."""
-    for name, bound in largest.items():
-        value = getattr(config, name)
-        if value is not None and value > bound:
-            raise InputError(f"{name}: expected at most {bound:g}, found {value:g}")
+    """Refuses a configuration in which one of these is given (not None) and too large."""
+    for name, value in _numbers(config, largest):
+        if value > largest[name]:
+            raise InputError(f"{name}: expected at most {largest[name]:g}, found {value:g}")

@@ -332,6 +332,7 @@ class Scenario:
     identify: IdentifyConfig = field(default_factory=IdentifyConfig)
 
     def __post_init__(self) -> None:
+        schema.check(type(self), self)
         require_positive(self, "duration")
         if self.seed < 0:
             raise InputError(f"seed: expected a whole number >= 0, found {self.seed}")
@@ -388,6 +389,17 @@ class Scenario:
                     f"{key}: expected a whole multiple of plant.time_step = "
                     f"{self.plant.time_step:g} s, found {period:g}"
                 )
+
+    def __eq__(self, other: object) -> bool:
+        """Drake's settings are compared one by one: two objects of them are never equal."""
+        if not isinstance(other, Scenario):
+            return NotImplemented
+        return self._comparable == other._comparable
+
+    @property
+    def _comparable(self) -> dict[str, Any]:
+        settings = {name: getattr(self.plant, name) for name in schema.fields_of(type(self.plant))}
+        return vars(self) | {"plant": settings}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """As its YAML text, for Drake's settings cannot be pickled."""

@@ -19,6 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load
 
@@ -190,6 +191,54 @@ def build(
     return _build(schema, tree, default, f"{file}: ", key)
 
 
+def check(schema: Any, value: Any, key: str = "") -> None:
+    """Refuses an object made in code in which a field has not the type that its class states.
+
+    Args:
+        schema: as of `build`; also the type of a field.
+        key: where the value stands, for messages.
+
+    Raises:
+        InputError: a wrong type, or a number that is not finite or too large.
+    """
+    origin, args = typing.get_origin(schema), typing.get_args(schema)
+    options = args if origin in (typing.Union, types.UnionType) else alternatives_of(schema)
+    where = key or "top level"
+    if schema is Any or (value is None and type(None) in options):
+        return
+    if options:
+        options = tuple(option for option in options if option is not type(None))
+        if len(options) == 1:
+            check(options[0], value, key)
+        elif type(value) in options:
+            check(type(value), value, key)
+        else:
+            names = ", ".join(option.__name__ for option in options)
+            raise InputError(f"{where}: expected one of {names}; found {describe(value)}")
+    elif schema in _SCALARS:
+        if isinstance(value, str) and schema is not str:
+            raise InputError(f"{where}: expected {_SCALARS[schema]}, found {describe(value)}")
+        _scalar(schema, value.item() if isinstance(value, np.generic) else value, "", where)
+    elif origin is typing.Literal:
+        _build(schema, value, None, "", where)
+    elif origin in (list, tuple):
+        if not isinstance(value, (list, tuple)):
+            raise InputError(f"{where}: expected a list, found {describe(value)}")
+        for i, item in enumerate(value):
+            check(args[0], item, f"{key}[{i}]")
+    elif origin is dict:
+        if not isinstance(value, dict):
+            raise InputError(f"{where}: expected a dict, found {describe(value)}")
+        for name, item in value.items():
+            check(str, name, f"{where}: key")
+            check(args[1], item, f"{key}.{name}")
+    elif not isinstance(value, schema):
+        raise InputError(f"{where}: expected a {schema.__name__}, found {describe(value)}")
+    else:
+        for name, kind in fields_of(schema).items():
+            check(kind, getattr(value, name), f"{key}.{name}".lstrip("."))
+
+
 def dump(value: Any, *, child_name: str | None = None) -> str:
     """YAML text of a dataclass, as the child of a document or as a document of its own; `build` of
     it gives an equal object.
@@ -239,7 +288,7 @@ def _tree(schema: Any, value: Any) -> Any:
     if schema is Any:
         return _tagged(value)
     if schema in _SCALARS or origin is typing.Literal:
-        return value
+        return value.item() if isinstance(value, np.generic) else value
     fields = {name: (kind, getattr(value, name)) for name, kind in fields_of(schema).items()}
     return {name: _tree(kind, item) for name, (kind, item) in fields.items() if item is not None}
 

@@ -1,12 +1,15 @@
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import scenario
 
 from fbse_drake import InputError, Scenario, build_station, load_scenario, resources, simulate
-from fbse_drake.effects.friction import StribeckFriction
+from fbse_drake.effects.friction import CoulombFriction, StribeckFriction
+from fbse_drake.errors import require_not_negative, require_positive
 from fbse_drake.scenario import RobotConfig, dump_scenario
 from fbse_drake.walking.stand import Squat
 from fbse_drake.wiring import release
@@ -30,8 +33,9 @@ def test_scenario_survives_being_written_and_read(name: str, tmp_path: Path):
     original = load_scenario(name, overrides=["seed=7"])
     again = load_scenario(written(tmp_path, dump_scenario(original, name)), name)
     assert dump_scenario(again, name) == dump_scenario(original, name)
-    # Drake's configs are equal only to themselves.
-    assert dataclasses.replace(again, plant=original.plant) == original
+    assert again == original
+    other = load_scenario(name, overrides=["seed=7", "plant.stiction_tolerance=0.0123"])
+    assert other != original
 
 
 def test_a_named_child_is_chosen(tmp_path: Path):
@@ -202,6 +206,48 @@ def test_bad_input_gets_one_line_with_file_and_key(tmp_path: Path, text: str, me
 def test_bad_override_gets_one_line(override: str, message: str):
     with pytest.raises(InputError, match=message):
         load_scenario("squat", overrides=[override])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"duration": "2"}, "duration: expected a number, found '2'"),
+        ({"seed": 1.5}, "seed: expected a whole number, found 1.5"),
+        ({"estimator": "Fbse"}, "estimator: expected one of NoEstimator, .*; found 'Fbse'"),
+        ({"reference": Squat}, "reference: expected one of Walk, .*; found <class .*Squat'>"),
+        ({"plant": {}}, "plant: expected a MultibodyPlantConfig, found a mapping"),
+        ({"robot": CoulombFriction()}, "robot: expected a RobotConfig, found CoulombFriction"),
+        ({"robot": RobotConfig(effects=[CoulombFriction()])}, "robot.effects: expected a dict"),
+        (
+            {"robot": RobotConfig(effects={"rub": CoulombFriction(1.0)})},
+            "robot.effects.rub.coulomb: expected a dict, found 1.0",
+        ),
+        (
+            {"model": RobotConfig(effects={"rub": CoulombFriction({"all": "1"})})},
+            "model.effects.rub.coulomb.all: expected a number, found '1'",
+        ),
+        (
+            {"robot": RobotConfig(effects={"rub": CoulombFriction({"all": np.nan})})},
+            "robot.effects.rub.coulomb.all: expected a finite number, found nan",
+        ),
+    ],
+)
+def test_what_is_made_in_code_is_refused_as_what_is_read(changes: dict, message: str):
+    with pytest.raises(InputError, match=f"^{message}"):
+        Scenario(**changes)
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path: Path):
+    friction = CoulombFriction({"all": np.float32(0.5)}, {"all": np.float64(0.25)})
+    robot = RobotConfig(effects={"rub": friction})
+    made = Scenario(seed=np.int64(3), duration=np.float64(2.0), robot=robot)
+    assert load_scenario(written(tmp_path, dump_scenario(made, "mine"))) == made
+
+
+@pytest.mark.parametrize("call", [require_positive, require_not_negative])
+def test_what_is_no_number_is_refused_as_such(call: Callable):
+    with pytest.raises(InputError, match=r"^duration: expected a number, found 'long'$"):
+        call(SimpleNamespace(duration="long"), "duration")
 
 
 def test_the_model_has_the_robots_joints():

@@ -25,8 +25,10 @@ from fbse_drake.discrepancy.diagnosis.validation import (
     root_of_ratio,
     validated,
 )
+from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.friction import CoulombFriction
+from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.files import write_text
 from fbse_drake.report.sentences import (
@@ -38,6 +40,7 @@ from fbse_drake.report.sentences import (
 )
 from fbse_drake.scenario import IdentifyConfig, RecordingConfig, dump_scenario
 
+VELOCITY_NOISE = 0.1  # [rad/s]
 NOISE, KNEE = 0.05, "left_knee_pitch"
 
 
@@ -75,6 +78,18 @@ def believing(scenario: Scenario, *effects: object) -> Scenario:
     return dataclasses.replace(scenario, model=model)
 
 
+def generalised_norm(values: np.ndarray, residual: Residual) -> float:
+    """sqrt(r' C^-1 r) of all rows, with dense covariances C."""
+    total = 0.0
+    for known, row, variance, covariance in zip(
+        residual.known.T, values.T, residual.variance.T, residual.covariance.T, strict=True
+    ):
+        at = np.flatnonzero(known)
+        beside = np.diag(np.where(np.diff(at) == 1, covariance[at[:-1]], 0.0), 1)
+        total += row[at] @ np.linalg.solve(np.diag(variance[at]) + beside + beside.T, row[at])
+    return float(np.sqrt(total))
+
+
 @pytest.mark.parametrize(("memory", "blocks"), [(0.0, 1500), (0.9, 1500), (0.0, 50), (0.9, 75)])
 def test_intervals_hold_the_truth_as_often_as_they_say(memory: float, blocks: int):
     """Squares of first-order autoregressions of known variances: the root of the ratio of these,
@@ -109,10 +124,8 @@ def test_errors_are_those_of_norms_and_the_change_is_surer_than_either(
     for error, residual in (("relative_before", first), ("relative_after", last)):
         expected = np.linalg.norm(residual.value[known]) / np.linalg.norm(torque)
         assert getattr(result, error).value == pytest.approx(expected)
-    of_first, of_last = (
-        (residual.value**2 / first.variance)[known].sum() for residual in (first, last)
-    )
-    ratio = np.sqrt(of_last / of_first)
+    of_first, of_last = (generalised_norm(residual.value, first) for residual in (first, last))
+    ratio = of_last / of_first
     assert result.change.value == pytest.approx(ratio)
     assert result.change.value == pytest.approx(result.after.value / result.before.value)
     # A bias that is tiny beside all else does not show beyond doubt, nor does a model beside
@@ -122,6 +135,24 @@ def test_errors_are_those_of_norms_and_the_change_is_surer_than_either(
     assert same.change.interval == pytest.approx((1.0, 1.0))
     wrong = validated(right, Predictor(believing(scenario, TorqueBias({KNEE: 0.4})), rubbed))
     assert wrong.course == "rises"
+
+
+def test_more_inertia_passes_on_more_noise_and_is_no_worse_for_it(swing: tuple[Scenario, Log]):
+    """Velocities so noisy that a mass which the model lacks hardly shows block by block, but does
+    beyond doubt in what is slow."""
+    scenario, log = swing
+    heavy = believing(scenario, BodyMass({"left_shank": 1.0}))
+    planned = planned_log(dataclasses.replace(heavy, robot=heavy.believed))
+    noise = np.random.default_rng(6).standard_normal(log["joint/velocity"].shape)
+    noisy = {"joint/velocity": planned["joint/velocity"] + VELOCITY_NOISE * noise}
+    noisy = Log(planned.channels | noisy, planned.meta)
+    given, right = (Predictor(one, noisy) for one in (scenario, heavy))
+    unwhitened = [np.sum(one.residual.value[one.residual.known] ** 2) for one in (given, right)]
+    assert unwhitened[1] > 0.98 * unwhitened[0]
+    assert validated(given, right).course == "falls"
+    # Three times what lacks is worse than nothing.
+    wrong = believing(scenario, BodyMass({"left_shank": 3.0}))
+    assert validated(given, Predictor(wrong, noisy)).course == "rises"
 
 
 def test_a_log_too_short_to_be_parted_is_fitted_whole(swing: tuple[Scenario, Log]):

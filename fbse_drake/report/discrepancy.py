@@ -195,7 +195,7 @@ def write_diagnosis_report(
             what_else(diagnosis.completing, partial=diagnosis.partial is not None),
         ),
         *too_small_rows(diagnosis.too_small),
-        ("What was looked for", verdicts_text(statuses)),
+        ("What was looked for", verdicts_text(statuses, diagnosis.unexplained)),
     )
     sections = [
         _summary(rows),
@@ -254,7 +254,7 @@ def write_study_report(
         ),
         ("What else it could be", what_else(study.found, partial=study.partial)),
         *too_small_rows(study.diagnoses[-1].too_small),
-        ("What was looked for", verdicts_text(statuses)),
+        ("What was looked for", verdicts_text(statuses, study.diagnoses[-1].unexplained)),
     )
     completed = dump_scenario(study.scenario, inputs.name) if study.found else None
     sections = [
@@ -265,7 +265,7 @@ def write_study_report(
             study.diagnoses[0].ranking,
             study.diagnoses[-1].unexplained,
         ),
-        _what_was_looked_for(statuses),
+        _what_was_looked_for(statuses, study.diagnoses[-1].unexplained),
         *([_fall(study, before, after, tests or {})] if study.found else []),
         _hygiene(before[0], inputs),
         _reproduce("study", before[0], inputs, completed),
@@ -418,10 +418,12 @@ def _why(
 
 def what_was_looked_for(diagnosis: Diagnosis) -> Section:
     """What the data says of every effect of the library that can be in such a robot."""
-    return _what_was_looked_for(applicable(diagnosis.effects))
+    return _what_was_looked_for(applicable(diagnosis.effects), diagnosis.unexplained)
 
 
-def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
+def _what_was_looked_for(
+    statuses: Mapping[str, EffectStatus], unexplained: Sequence[Structure]
+) -> Section:
     """What the data says of every effect of the library."""
     known = library()
     rows = []
@@ -451,7 +453,8 @@ def _what_was_looked_for(statuses: Mapping[str, EffectStatus]) -> Section:
         "All effects of the library, one by one",
         folded=True,
     )
-    return Section("What else was looked for", verdicts_text(statuses), (table,), (block,))
+    text = verdicts_text(statuses, unexplained)
+    return Section("What else was looked for", text, (table,), (block,))
 
 
 def _fall(

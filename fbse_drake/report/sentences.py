@@ -13,6 +13,7 @@ from fbse_drake.discrepancy.diagnosis.rivals import ELSEWHERE
 from fbse_drake.discrepancy.diagnosis.study import Study
 from fbse_drake.discrepancy.diagnosis.validation import Measured, Validation
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene
+from fbse_drake.discrepancy.identification.structure import Structure
 from fbse_drake.effects.effect import library
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy_figures import (
@@ -134,6 +135,8 @@ def _course(log: str, validation: Validation) -> str:
             f", from {number(100 * shares[0].value)} to {number(100 * shares[1].value)} % "
             f"({_between(shares[1], 100.0)}) of the torque"
         )
+        if validation.course == "falls" and shares[1].value > shares[0].value:
+            text += ", most of which is noise of the sensors"
     return text
 
 
@@ -420,7 +423,12 @@ def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, .
     if diagnosis.completing and not is_refuted(diagnosis.set_aside):
         completed = f"{inputs.name}_completed.yaml"
         command = f"fbse add {inputs.scenario} {inputs.out} --out {completed}"
-        steps.append(Step("Add it to the model:", command))
+        says = (
+            "Add it to the model; it may stand for part of what is left:"
+            if diagnosis.verdict == "unknown_effect"
+            else "Add it to the model:"
+        )
+        steps.append(Step(says, command))
     elif diagnosis.completing:
         command = f"fbse diagnose {inputs.scenario} {' '.join(inputs.logs)} --test ANOTHER_LOG"
         steps.append(Step("See whether another log confirms it, before it is added:", command))
@@ -629,8 +637,14 @@ def statuses_of(study: Study) -> dict[str, EffectStatus]:
     }
 
 
-def verdicts_text(statuses: Mapping[str, EffectStatus]) -> str:
-    """How many effects of the library have each verdict."""
+def verdicts_text(
+    statuses: Mapping[str, EffectStatus], unexplained: Sequence[Structure] = ()
+) -> str:
+    """How many effects of the library have each verdict.
+
+    Args:
+        unexplained: what no effect explains.
+    """
     if not statuses:
         return "The search ended before it could say what else there is."
     verdicts = [status.verdict for status in statuses.values()]
@@ -639,4 +653,9 @@ def verdicts_text(statuses: Mapping[str, EffectStatus]) -> str:
         for name in figures.VERDICT_COLORS
         if name in verdicts
     )
-    return f"{len(verdicts)} effects: {counts}. Absent means that it would have been seen."
+    means = "that it would have been seen"
+    if unexplained:
+        k = len(unexplained)
+        where = "the row" if k == 1 else f"the {k} rows"
+        means += f"; in {where} with something unknown, that what is left does not look like it"
+    return f"{len(verdicts)} effects: {counts}. Absent means {means}."

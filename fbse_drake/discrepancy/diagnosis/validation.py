@@ -1,20 +1,21 @@
 """Errors of models: is a completed one better on data that was set aside before anything was looked
 at?
 
-Both models are put against the same blocks, weighted by the same noise, so that what both do not
-know cancels in the change of the error. Its intervals are those of a ratio of sums by batch means:
-consecutive blocks are taken together until their sums are hardly correlated (with B blocks, a
-multiple of sqrt(B) at a time; Flegal and Jones 2010).
+Both models are put against the same blocks, whitened by the same noise, so that what both do not
+know cancels in the change of the error. (Unwhitened, noise that is differentiated would drown what
+is slow; and a model with more inertia, which makes more of it, would seem worse.) Its intervals are
+those of a ratio of sums by batch means: consecutive blocks are taken together until their sums are
+hardly correlated (with B blocks, a multiple of sqrt(B) at a time; Flegal and Jones 2010).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import t as student
 
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
-from fbse_drake.discrepancy.identification.regression import STRETCH
+from fbse_drake.discrepancy.identification.regression import STRETCH, WhitenedResidual
 from fbse_drake.discrepancy.residual.residual import rms
 
 # Of the intervals, unless they are simultaneous.
@@ -35,12 +36,13 @@ class Measured:
 class Validation:
     """Errors of a model as given and completed on one log that nothing was fitted to."""
 
-    # Root mean square of all rows in multiples of the sensors' noise, and the second over the
-    # first.
+    # Root mean square of all whitened rows, in multiples of the sensors' noise, and the second over
+    # the first.
     before: Measured
     after: Measured
     change: Measured
-    # |residual| / |torque|, 2-norms over all joints, and the second over the first; NaN without
+    # |residual| / |torque|, 2-norms over all joints, and the second over the first, or over what
+    # more noise of the sensors, as the completed model passes it on, makes of that. NaN without
     # torques.
     relative_before: Measured
     relative_after: Measured
@@ -98,15 +100,20 @@ def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> V
     """
     first, last, n = given.residual, completed.residual, len(given.robot.joint_names)
     known = first.known & last.known
-    # A row without any noise, as from ideal sensors, is still told apart from rounding.
-    noise = np.maximum(first.variance, 1e-18)
+    white = WhitenedResidual(replace(first, known=known))
     before, after = (
-        np.where(known, residual.value**2 / noise, 0.0).sum(axis=1) for residual in (first, last)
+        np.sum([white.whiten(row, of_row) ** 2 for row, of_row in enumerate(one.value.T)], axis=0)
+        for one in (first, last)
     )
-    of_joints = known[:, :n]
-    left, left_after, torque = (
-        np.where(of_joints, values[:, :n] ** 2, 0.0).sum(axis=1)
-        for values in (first.value, last.value, first.signals.torque_command)
+    left, left_after, torque, noise, noise_after = (
+        np.where(known[:, :n], values[:, :n], 0.0).sum(axis=1)
+        for values in (
+            first.value**2,
+            last.value**2,
+            first.signals.torque_command**2,
+            first.variance,
+            last.variance,
+        )
     )
     batch = batch_length(len(first.time), first.time[1] - first.time[0])
     return Validation(
@@ -115,7 +122,7 @@ def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> V
         root_of_ratio(after, before, batch, level),
         root_of_ratio(left, torque, batch, level),
         root_of_ratio(left_after, torque, batch, level),
-        root_of_ratio(left_after, left, batch, level),
+        root_of_ratio(left_after, left + np.maximum(noise_after - noise, 0.0), batch, level),
     )
 
 
