@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import scenario
 from pydrake.multibody.tree import MultibodyForces
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
 from fbse_drake import InputError, Log, Scenario, load_scenario, simulate
@@ -129,7 +130,14 @@ def test_delay_shifts_the_command(steps: float):
     ("effect", "sets"),
     [
         (TorqueDelay, [[[0.0, 2e-3], [7.3e-3, 2.9e-2]]]),
-        (Backlash, [[[1e-3, 2e-3], [0.0, 2e-2]], [[0.1, 0.3], [0.02, 1.0]]]),
+        (
+            Backlash,
+            [
+                [[1e-3, 2e-3], [0.0, 2e-2]],
+                [[0.1, 0.3], [0.02, 1.0]],
+                [[0.0, 4e-3], [1e-3, 1e-2]],
+            ],
+        ),
     ],
 )
 def test_memory_at_once_is_that_of_the_steps(
@@ -210,21 +218,69 @@ def test_gap_is_crossed_with_the_rotor_s_acceleration():
 
 
 @pytest.mark.parametrize("attached", [0.0, 0.25])
-def test_what_the_link_does_not_get_the_rotor_has_or_gives_it_back(attached: float):
+@pytest.mark.parametrize("contact_time", [0.0, 0.003])
+def test_what_the_link_does_not_get_the_rotor_has_or_gives_it_back(
+    attached: float, contact_time: float
+):
     """Its momentum against the link and what is still to come is the impulse that was taken, also
     of a link that is shaken."""
     time, random = np.arange(3000)[:, None] * H, np.random.default_rng(2)
     command = 6.0 * np.sin(20.0 * time) + 3.0 * np.sin(47.0 * time)
     velocity = np.cumsum(0.02 * random.standard_normal(time.shape), axis=0)
     motion = JointMotion(velocity, command=command, time_step=H, rotor_inertia=np.array([attached]))
-    nonlinear, inertia = np.array([[0.01], [0.25]]), 0.25
+    nonlinear, inertia = np.array([[0.01], [0.25], [contact_time]]), 0.25
     (taken,) = basis_over_time(Backlash, motion, nonlinear)
     offset, rate, coming, *_ = Backlash.memory_over_time(motion, nonlinear[:, None])
     impulse = np.cumsum(taken[:-1], axis=0) * H
     np.testing.assert_allclose(impulse, (inertia * rate + coming)[1:], atol=1e-9)
-    assert np.abs(offset).max() == pytest.approx(0.005)
+    if contact_time == 0.0:
+        assert np.abs(offset).max() == pytest.approx(0.005)
+        assert np.mean(rate == 0.0) > 0.1
+    else:
+        assert 0.005 < np.abs(offset).max() < 0.007
     assert np.abs(impulse).max() > 0.05
-    assert np.mean(rate == 0.0) > 0.1
+
+
+def test_sides_that_give_stop_a_rotor_as_springs_and_dampers_do():
+    """Against a link that is held it lands with the speed that it has from crossing the gap, swings
+    as a damped oscillator whose damping ratio is 0.7 would, as long as the side pushes, and comes
+    to rest where the command bends the side."""
+    gap, inertia, contact_time, drive, h = 0.01, 0.25, 0.01, 4.0, 1e-4
+    command = np.where(np.arange(4000) < 1500, drive, -drive)[:, None]
+    motion = JointMotion(np.zeros_like(command), command=command, time_step=h)
+    nonlinear = np.array([[gap], [inertia], [contact_time]])
+    offset = Backlash.memory_over_time(motion, nonlinear[:, None])[0, :, 0]
+    at_rest = gap / 2 + drive / inertia * contact_time**2
+    assert offset[1499] == pytest.approx(at_rest, rel=1e-3)
+    assert offset[-1] == pytest.approx(-at_rest, rel=1e-3)
+    start = int(np.argmax(offset < -gap / 2))
+    speed = np.sqrt(2.0 * (gap / 2 + at_rest) * drive / inertia)
+
+    def pushed_back(_: float, y: np.ndarray) -> list[float]:
+        push = max(0.0, y[0] / contact_time**2 + 1.4 * y[1] / contact_time)
+        return [y[1], drive / inertia - push]
+
+    times = h * np.arange(600)
+    expected = solve_ivp(pushed_back, (0.0, times[-1]), [0.0, speed], t_eval=times, rtol=1e-8)
+    deepest = expected.y[0].max()
+    found = -offset[start : start + len(times)] - gap / 2
+    # Leaving the other side, it was pushed a little: it lands by less than a step's travel off.
+    assert found.max() == pytest.approx(deepest, rel=0.15)
+    assert np.argmax(found) * h == pytest.approx(times[np.argmax(expected.y[0])], abs=0.002)
+
+
+@pytest.mark.parametrize("attached", [0.0, 0.25])
+def test_a_contact_of_less_than_a_step_is_an_impact(attached: float):
+    time = np.arange(3000)[:, None] * H
+    command = 6.0 * np.sin(20.0 * time) + 3.0 * np.sin(47.0 * time)
+    velocity = 0.1 * np.sin(13.0 * time)
+    motion = JointMotion(velocity, command=command, time_step=H, rotor_inertia=np.array([attached]))
+    quick, none, soft = (
+        basis_over_time(Backlash, motion, np.array([[0.01], [0.25], [contact]]))
+        for contact in (H, 0.0, 2 * H)
+    )
+    np.testing.assert_array_equal(quick, none)
+    assert np.abs(soft - none).max() > 1.0
 
 
 def test_an_impact_moves_smoothly_with_the_gap():

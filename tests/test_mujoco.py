@@ -426,6 +426,25 @@ def test_play_is_found_by_its_impacts() -> None:
 
 
 @needs_mujoco
+@pytest.mark.parametrize("number", [954, 972])
+def test_play_is_found_where_its_sides_give(number: int) -> None:
+    """The joint goes to and fro in its gap some 25 times a second, so that an impact which is too
+    short by 5 ms is soon in the wrong phase: as an impact of a step it explained nothing, and a
+    delay was named."""
+    case = random_case(number)
+    assert isinstance(case.physics, Play)
+    scenario, reference = setting(case)
+    log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
+    names = ("Backlash", "TorqueDelay", "TorqueLag", "ReflectedInertia", "TransmissionElasticity")
+    diagnosis = diagnose(Predictor(scenario, log), [library()[name] for name in names])
+    (finding,) = diagnosis.chosen
+    assert (finding.effect, finding.targets) == ("Backlash", (case.physics.joint,))
+    # Of the square of what was left.
+    assert (finding.held_out_after / finding.held_out_before) ** 2 < 0.1
+    assert finding.parameters["contact_time"].interval[0] > 2 * STEP
+
+
+@needs_mujoco
 def test_noise_of_an_arm_log_is_what_the_scenario_says() -> None:
     scenario = arm_scenario()
     reference = arm_motion(build_robot(scenario.robot), 7, STEP)

@@ -399,7 +399,7 @@ def test_play_finer_than_the_steps_of_an_encoder_does_not_show(bits: int) -> Non
     rest = fits.remainder(fits.explain([]))
 
     def shows(gap: float) -> bool:
-        nonlinear = np.array([gap, 0.2])
+        nonlinear = np.array([gap, 0.2, 1e-3])
         return is_shown(fits, fits.candidate(Backlash, ("axis_4",), nonlinear, rest))
 
     assert shows(5e-3)

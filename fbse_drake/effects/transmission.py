@@ -1,5 +1,6 @@
 """Torques of gears and cables: springs, ripple, hysteresis, backlash."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -21,6 +22,9 @@ from fbse_drake.robot.plant import Robot
 
 # Factor that the inertia of a rotor may be off by in a model that has one.
 _KNOWN_WITHIN = 2.0
+# Of the sides of a gap in a gear; and how long a step of their contact is resolved by, as a share
+# of its time.
+_DAMPING_RATIO, _RESOLVED = 0.7, 0.2
 
 
 @in_library
@@ -173,6 +177,16 @@ class Backlash(JointTorqueEffect):
     link's motion is left out. At the other side the rotor stays (a plastic impact), and all of its
     momentum reaches the link within a step from when the gap closes. An encoder on the motor's side
     shows where the rotor is in the gap.
+
+    A contact that gives for longer than a step is a spring and a damper, which only push (Nordin
+    and Gutman 2002):
+
+    dv/dt = (command - push) / rotor_inertia - dw/dt
+    push = rotor_inertia (x / contact_time^2 + 2 damping_ratio v / contact_time)
+
+    with x by how much the rotor is beyond the gap's side, w the link's velocity and a damping ratio
+    of 0.7. Then the link's acceleration is that of the step itself; a simulation takes what is
+    expected of it, and needs `solve_twice` to come close.
     """
 
     description: ClassVar[str] = (
@@ -197,12 +211,21 @@ class Backlash(JointTorqueEffect):
             grid=3,
             linear_within=0.1,
         ),
+        "contact_time": Parameter(
+            "s",
+            linear=False,
+            plausible=(1e-3, 1e-2),
+            grid=4,
+            linear_within=0.1,
+            meaning="in which the sides of the gap stop a rotor; 0 for at once",
+        ),
     }
     has_memory: ClassVar[bool] = True
     deflects: ClassVar[bool] = True
 
     gap: dict[str, float] = field(default_factory=dict)
     rotor_inertia: dict[str, float] = field(default_factory=lambda: {"all": 0.25})
+    contact_time: dict[str, float] = field(default_factory=lambda: {"all": 0.0})
 
     @classmethod
     def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
@@ -234,7 +257,7 @@ class Backlash(JointTorqueEffect):
 
     @staticmethod
     def start(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        gap, _ = nonlinear
+        gap, *_ = nonlinear
         side = 0.5 * gap * np.sign(motion.command)
         unmoved = np.zeros_like(side)
         return np.stack([side, unmoved, unmoved, motion.velocity + unmoved, unmoved])
@@ -284,47 +307,83 @@ def _crossings(
     attached: np.ndarray,
     gap: np.ndarray,
     inertia: np.ndarray,
+    contact_time: np.ndarray,
     time_step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What is remembered at the end of each step, (5, N, C), and the torque that rotors take in it
     [Nm], (N, C).
 
     Remembered are offset [rad] and velocity [rad/s] of a rotor against its link, the offset within
-    half the gap to either side; the momentum of an impact that is still to reach the link [Nm s];
-    and velocity [rad/s] and acceleration [rad/s^2] of the link.
+    half the gap to either side, or hardly beyond; the momentum of an impact that is still to reach
+    the link [Nm s]; and velocity [rad/s] and acceleration [rad/s^2] of the link.
 
     An impact lasts for a step from when the gap closes, so that all is smooth in the parameters.
 
     Args:
         start: what is remembered at the start, (5, C).
-        command, link_velocity, attached, gap, inertia: of each step, (N, C): the command, the
-            link's velocity at the end, the inertia of the rotor that the model has, gap and inertia
-            of the one that crosses it.
+        command, link_velocity, attached, gap, inertia, contact_time: of each step, (N, C): the
+            command, the link's velocity at the end, the inertia of the rotor that the model has,
+            gap, inertia and contact time of the one that crosses it.
     """
     memory, torque = np.empty((len(start), *command.shape)), np.empty(command.shape)
     for j in range(command.shape[1]):
         x, v, coming, w, a = start[:, j]
         for k in range(command.shape[0]):
-            R, is_hit = inertia[k, j], coming != 0.0 and attached[k, j] > 0.0
-            before, taken, coming = v, -coming / time_step, 0.0
-            drive = command[k, j] - attached[k, j] * a
-            v += time_step * drive / R
-            travel, side = time_step * v, 0.5 * gap[k, j]
-            room = side - np.sign(travel) * x
-            if is_hit:
-                # What the impact adds to the link's velocity it does not add against the rotor.
-                v = 0.0
-            elif abs(travel) < room:
-                x += travel
-                taken += drive
-            elif travel != 0.0:
-                share = room / abs(travel)
-                momentum = R * before + share * time_step * drive
-                coming = share * momentum
-                taken += share * drive - (momentum - coming) / time_step
-                x, v = side * np.sign(travel), 0.0
-            a, w = (link_velocity[k, j] - w) / time_step, link_velocity[k, j]
+            R, side, contact = inertia[k, j], 0.5 * gap[k, j], contact_time[k, j]
+            last, w = w, link_velocity[k, j]
+            if contact > time_step:
+                a = (w - last) / time_step
+                before, drive, coming = v, command[k, j] - attached[k, j] * a, 0.0
+                x, v = _pushed_back(x, v, drive / R, side, contact, time_step)
+                taken = R * (v - before) / time_step
+            else:
+                is_hit = coming != 0.0 and attached[k, j] > 0.0
+                before, taken, coming = v, -coming / time_step, 0.0
+                drive = command[k, j] - attached[k, j] * a
+                v += time_step * drive / R
+                travel = time_step * v
+                room = side - np.sign(travel) * x
+                if is_hit:
+                    # What the impact adds to the link's velocity it does not add against the rotor.
+                    v = 0.0
+                elif abs(travel) < room:
+                    x += travel
+                    taken += drive
+                elif travel != 0.0:
+                    share = room / abs(travel)
+                    momentum = R * before + share * time_step * drive
+                    coming = share * momentum
+                    taken += share * drive - (momentum - coming) / time_step
+                    x, v = side * np.sign(travel), 0.0
+                a = (w - last) / time_step
             for row, value in enumerate((x, v, coming, w, a)):
                 memory[row, k, j] = value
             torque[k, j] = taken
     return memory, torque
+
+
+@njit(cache=True)
+def _pushed_back(
+    x: float, v: float, drive: float, side: float, contact: float, time_step: float
+) -> tuple[float, float]:
+    """Offset and velocity of a rotor after a step between the sides of a gap, which push it back.
+
+    Args:
+        drive: its acceleration but for what the sides push [rad/s^2].
+        side: half the gap; contact: see `contact_time` of `Backlash`.
+    """
+    steps = math.ceil(time_step / (_RESOLVED * contact))
+    h, stiffness, damping = time_step / steps, contact**-2, 2.0 * _DAMPING_RATIO / contact
+    for _ in range(steps):
+        free, beyond = v + h * drive, abs(x + h * v) - side
+        if beyond > 0.0:
+            # Semi-implicit, so that it is stable however stiff the contact is.
+            sign = np.sign(x + h * v)
+            start = x - sign * side
+            pushed = (free - h * stiffness * start) / (1.0 + h * damping + h * h * stiffness)
+            push = stiffness * (start + h * pushed) + damping * pushed
+            v = pushed if push * sign > 0.0 else free
+        else:
+            v = free
+        x += h * v
+    return x, v
