@@ -222,7 +222,9 @@ class AnalysisResult(Result):
         tests = tuple(str(folder / f"{name}.npz") for name, _ in self._further_tests)
         logs = tuple(str(folder / f"{name}.npz") for name in self.case.recordings or ["log"])
         scenario = str(folder / "scenario.yaml")
-        return Inputs(self.case.name, scenario, logs, str(folder), tests, hygiene=self.hygiene)
+        return Inputs(
+            self.case.name, scenario, logs, str(folder), tests=tests, hygiene=self.hygiene
+        )
 
     @property
     def _further_tests(self) -> list[tuple[str, Log]]:
@@ -314,6 +316,10 @@ class StudyResult(Study, AnalysisResult):
 
     def table(self) -> Table:
         return steps_table(self, tested=bool(self.case.tests))
+
+    def further_tables(self) -> list[Table]:
+        """What was found, with its values."""
+        return [findings_table(self.found)] if self.found else []
 
     def picture(self) -> Figure:
         """The error falling, step by step."""

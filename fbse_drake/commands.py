@@ -23,7 +23,7 @@ from rich.text import Text
 from fbse_drake.analysis import AnalysisResult, compare, diagnose, identify, reveal, study
 from fbse_drake.cli import LISTED
 from fbse_drake.console import Console
-from fbse_drake.discrepancy.diagnosis.add import add, read_findings
+from fbse_drake.discrepancy.diagnosis.add import add, read_findings, settled
 from fbse_drake.discrepancy.diagnosis.diagnose import Finding
 from fbse_drake.discrepancy.diagnosis.identify import identifiability_text
 from fbse_drake.discrepancy.exercises.hidden import make_exercise, seal
@@ -260,9 +260,17 @@ def _scenario_and_logs(options: argparse.Namespace, paths: Sequence[Path], suffi
         options.scenario,
         tuple(map(str, paths)),
         str(out),
-        tuple(map(str, getattr(options, "test", ()))),
+        changes=_changes(options),
+        reading=("--map", str(options.map)) if options.map else (),
+        tests=tuple(map(str, getattr(options, "test", ()))),
     )
     return _Given(Console(quiet=options.quiet), scenario, logs, inputs, out)
+
+
+def _changes(options: argparse.Namespace) -> tuple[str, ...]:
+    """The options with which a scenario is read, as they were given."""
+    named = ("--name", options.name) if options.name else ()
+    return (*named, *(part for change in options.overrides for part in ("--set", change)))
 
 
 def _errors_located(inputs: Inputs) -> AbstractContextManager[None]:
@@ -348,7 +356,11 @@ def _add(options: argparse.Namespace) -> bool:
         raise InputError(f"--out {out}: the new scenario would overwrite the old one")
     lines = [
         f"{_ADDED} to {options.scenario}, from {path}.",
-        *(f"# {line}" for finding in findings for line in _value_lines(finding)),
+        *(
+            f"# {line}"
+            for finding, added in zip(findings, settled(findings), strict=True)
+            for line in _value_lines(finding, added)
+        ),
     ]
     header = "\n".join(map(on_one_line, lines))
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -359,18 +371,22 @@ def _add(options: argparse.Namespace) -> bool:
     return True
 
 
-def _value_lines(finding: Finding) -> list[str]:
-    """Values with their 95 % intervals, and what they bring; for the comments of a scenario."""
+def _value_lines(finding: Finding, added: Finding) -> list[str]:
+    """Values with their 95 % intervals, and what they bring; for the comments of a scenario.
+
+    Args:
+        added: the same with the values that its model gets.
+    """
     where = f"{finding.effect} in {targets_text(finding.targets)}"
-    errors = (
+    lines = [
         f"{where}: held-out error {finding.held_out_before:.3g} times the noise before, "
         f"{finding.held_out_after:.3g} after"
-    )
-    values = [
-        f"{where}: {parameter_text(name, estimate)}, with its 95 % interval"
-        for name, estimate in finding.parameters.items()
     ]
-    return [errors, *values]
+    for name, found in finding.parameters.items():
+        value = added.parameters[name].value
+        other = "" if value == found.value else f"; it is {value:g} here, the default"
+        lines.append(f"{where}: {parameter_text(name, found)}, with its 95 % interval{other}")
+    return lines
 
 
 def _hide(options: argparse.Namespace) -> bool:

@@ -619,6 +619,10 @@ def test_diagnose_then_add_then_compare(
     """From a log to a model that fits it."""
     few = [library()[name] for name in ("TorqueBias", "ViscousFriction")]
     monkeypatch.setattr("fbse_drake.commands.diagnose", functools.partial(diagnose, effects=few))
+    monkeypatch.setattr(
+        "fbse_drake.analysis.write_diagnosis_report",
+        lambda path, diagnosis, predictor, inputs, *_: path.write_text(inputs.changed_scenario),
+    )
     found = tmp_path / "found"
     assert main(["diagnose", *BIASED, str(biased), "--out", str(found)]) == DONE
     assert sorted(path.name for path in found.iterdir()) == sorted([*FOUND, "diagnosis.json"])
@@ -642,6 +646,8 @@ def test_diagnose_then_add_then_compare(
     assert comments[1].startswith("# TorqueBias in left knee pitch: held-out error ")
     assert comments[2].startswith("# TorqueBias in left knee pitch: bias ")
     assert comments[2].endswith("with its 95 % interval")
+    # The commands that it proposes read the scenario as it was read.
+    assert (found / "report.html").read_text() == " ".join(BIASED)
 
     # What fbse add wrote may be written again, but not over the scenario that is added to, nor over
     # a file of somebody else.

@@ -19,7 +19,7 @@ from fbse_drake.discrepancy.residual.rollout import RolloutError
 from fbse_drake.report import discrepancy as reports
 from fbse_drake.report import discrepancy_figures as figures
 from fbse_drake.report.discrepancy_tables import findings_table
-from fbse_drake.report.sentences import diagnosis_outcome, steps_after_diagnosis
+from fbse_drake.report.sentences import diagnosis_outcome, steps_after_diagnosis, verdicts_text
 
 INPUTS = reports.Inputs("a_walk", "paper_walk", ("walk.npz",), "out/a_walk")
 KNEES = ("left_knee_pitch", "right_knee_pitch")
@@ -565,6 +565,48 @@ def test_effects_in_one_place_are_named_together():
     assert text.startswith(
         "The model lacks Coulomb friction and torque bias in left and right knee pitch and body "
         "mass in trunk;"
+    )
+
+
+def test_nothing_is_missing_only_where_noise_alone_is_left():
+    loud = dataclasses.replace(NOTHING, held_out_before=2.31)
+    said = diagnosis_outcome(loud)
+    assert said.startswith("No effect of the library is seen, but the model leaves over 2.31 times")
+    assert said.endswith("more may hide in it; 1 of 4 effects would not show in this log.")
+
+
+@pytest.mark.parametrize(("joints", "misread"), [(1, False), (3, False), (4, True)])
+def test_what_many_joints_leave_may_be_misread(joints: int, misread: bool):
+    left = [Structure(f"joint_{k}", k, 3.0, "load", 0.5) for k in range(joints)]
+    left += [Structure(f"base/force_{axis}", 12, 3.0, "load", 0.5) for axis in "xyz"]
+    diagnosis = dataclasses.replace(UNKNOWN, unexplained=tuple(left))
+    steps = steps_after_diagnosis(diagnosis, INPUTS)
+    assert any("command_time" in step.text for step in steps) == misread
+
+
+def test_next_commands_read_scenario_and_logs_as_they_were_read():
+    changes = ("--set", "ground.slope=[0.04, 0]")
+    inputs = dataclasses.replace(INPUTS, changes=changes, reading=("--map", "a b.yaml"))
+    (command, *_) = (step.command for step in steps_after_diagnosis(made_diagnosis(), inputs))
+    assert command.startswith("fbse add paper_walk --set 'ground.slope=[0.04, 0]' out/a_walk --out")
+    diagnose = "fbse diagnose paper_walk --set 'ground.slope=[0.04, 0]' walk.npz --map 'a b.yaml'"
+    assert inputs.diagnose == diagnose
+
+
+def test_what_may_stand_for_something_else_is_not_simply_added():
+    unknown = made_diagnosis("unknown_effect", (FRICTION,), unexplained=UNKNOWN.unexplained)
+    for diagnosis, hedged in ((unknown, True), (made_diagnosis(), False)):
+        (step, *_) = steps_after_diagnosis(diagnosis, INPUTS)
+        assert step.text.startswith("Add it to the model")
+        assert ("may stand for part of what is left" in step.text) == hedged
+
+
+def test_absent_means_less_where_something_unknown_is_left():
+    everywhere = verdicts_text(STATUSES)
+    assert everywhere.endswith("Absent means that it would have been seen.")
+    somewhere = verdicts_text(STATUSES, UNKNOWN.unexplained)
+    assert somewhere.endswith(
+        "in the row with something unknown, that what is left does not look like it."
     )
 
 

@@ -21,6 +21,7 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.study import study, train_and_rest
 from fbse_drake.discrepancy.diagnosis.validation import (
     Measured,
+    Validation,
     batch_length,
     root_of_ratio,
     validated,
@@ -31,9 +32,11 @@ from fbse_drake.effects.friction import CoulombFriction
 from fbse_drake.effects.inertia import BodyMass
 from fbse_drake.estimators.fbse import Fbse
 from fbse_drake.files import write_text
+from fbse_drake.report.html import number
 from fbse_drake.report.sentences import (
     Inputs,
     diagnosis_outcome,
+    set_aside_rows,
     steps_after_diagnosis,
     steps_after_study,
     study_outcome,
@@ -210,6 +213,27 @@ def test_a_study_is_headed_by_what_was_set_aside(
     assert not any(
         "fbse add" in (step.command or "") for step in steps_after_study(nothing, inputs)
     )
+
+
+@pytest.mark.parametrize(
+    ("share", "course", "said"),
+    [(0.5, "falls", True), (0.999, "falls", False), (1.3, "rises", True)],
+)
+def test_the_share_of_the_torque_is_told_where_it_shows_what_is_said(
+    share: float, course: str, said: bool
+):
+    """What is found in the feet, or amid noise, hardly changes it, and would seem nothing."""
+    same = Measured(1.0, (0.9, 1.1))
+    low, high = (0.4, 0.6) if course == "falls" else (1.2, 1.4)
+    change = Measured((low + high) / 2, (low, high))
+    result = Validation(
+        same, change, change, same, Measured(share, (0.0, 9.0)), Measured(share, (0.0, 9.0))
+    )
+    ((_, text),) = set_aside_rows({"rest of the log": result})
+    value, bounds = number(change.value), f"{number(low)} to {number(high)}"
+    assert f"the error {course}: from 1.00 to {value} times" in text
+    assert f"which is {value} ({bounds}) of it" in text
+    assert ("% of the torque" in text) == said
 
 
 def test_a_part_too_short_for_an_interval_refutes_only_what_does_not_fall():

@@ -1,5 +1,6 @@
 """The reports of compare, diagnose and study."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -681,7 +682,7 @@ def _reproduce(
             of = "the log" if len(inputs.logs) == 1 else log.name
             rows.append((f"SHA-256 of {of}", sha256(log.read_bytes()).hexdigest()))
     again = [
-        f"fbse {command} {inputs.out}/scenario.yaml {' '.join(inputs.logs)}",
+        f"fbse {command} {inputs.out}/scenario.yaml {shlex.join([*inputs.logs, *inputs.reading])}",
         *(f"--test {test}" for test in inputs.tests),
         f"--out {inputs.out}_again",
     ]

@@ -63,13 +63,10 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
         InputError: an effect that the library does not have.
     """
     by_effect: dict[str, dict[str, dict[str, float]]] = {}
-    # Inertia was fitted beside just these values.
-    as_fitted = any(finding.effect == InertialParameters.__name__ for finding in findings)
-    for finding in findings:
+    for finding in settled(findings):
         values = by_effect.setdefault(finding.effect, {})
         for name, estimate in finding.parameters.items():
-            value = estimate.value if as_fitted else _settled(finding.effect, name, estimate)
-            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, value))
+            values.setdefault(name, {}).update(dict.fromkeys(finding.targets, estimate.value))
     model = scenario.believed
     effects = dict(model.effects)
     names, _ = load_description(model.description)
@@ -89,17 +86,23 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
     return replace(scenario, model=replace(model, effects=effects))
 
 
-def _settled(effect: str, name: str, estimate: Estimate) -> float:
-    """The value that a parameter gets. A velocity of transition of which the data do not say that
-    the default is wrong keeps it: friction must hold a joint at rest also where nobody saw how
-    steep it is.
-    """
-    kind = library().get(effect)
-    if kind is None or name != "transition":
-        return estimate.value
-    default = kind().transition["all"]
-    low, high = estimate.interval
-    return default if low <= default <= high else estimate.value
+def settled(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings with the values that a model gets. A velocity of transition of which the data do not
+    say that the default is wrong keeps it: friction must hold a joint at rest also where nobody saw
+    how steep it is."""
+    # Inertia was fitted beside just these values.
+    if any(finding.effect == InertialParameters.__name__ for finding in findings):
+        return list(findings)
+    result = []
+    for finding in findings:
+        kind, estimate = library().get(finding.effect), finding.parameters.get("transition")
+        if kind is not None and estimate is not None:
+            default = kind().transition["all"]
+            if estimate.interval[0] <= default <= estimate.interval[1]:
+                kept = {"transition": replace(estimate, value=default)}
+                finding = replace(finding, parameters={**finding.parameters, **kept})
+        result.append(finding)
+    return result
 
 
 def _make(name: str, values: Mapping[str, Mapping[str, float]]) -> Effect:

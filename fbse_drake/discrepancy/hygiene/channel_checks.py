@@ -43,8 +43,9 @@ _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
 _REPEATED = 0.2
 # Number of samples from which on spectra are looked at.
 SPECTRUM = 512
-# Power at the upper end of the spectrum against that half way: of white noise 1.
-_EMPTY = 0.05
+# Power at the upper end of the spectrum against that half way: of white noise 1, of what falls with
+# the eighth power of the frequency, as motions do, 0.02.
+_EMPTY = 0.002
 # Share of a channel's variance that may lie above the corner of what filtered it.
 _EDGE = 1e-6
 # Correlation of a velocity's changes from sample to sample below which it alternates (white noise
@@ -263,7 +264,10 @@ def check_filtered(evidence: Evidence) -> Iterable[HygieneFinding]:
             column = values[:, k]
             if np.ptp(column) <= 20 * max(evidence.quantum[name][k], 1e-12):
                 continue
-            frequency, power = welch(column, 1.0 / evidence.period, nperseg=SPECTRUM)
+            # An impact is in few of the segments.
+            frequency, power = welch(
+                column, 1.0 / evidence.period, nperseg=SPECTRUM, average="median"
+            )
             # Relative to half the sampling rate.
             share = frequency / frequency[-1]
             middle, top = (

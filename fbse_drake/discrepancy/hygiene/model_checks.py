@@ -360,6 +360,10 @@ def _tilt(vector: np.ndarray, axis: int) -> float:
     return float(np.arctan2(vector[axis], vector[2]))
 
 
+# Correlation below which a force moves against what is needed of it.
+_AGAINST = -0.2
+
+
 def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
     """While one foot alone carries the robot, its force is what the masses need: in its mean
     direction, and in its course."""
@@ -368,6 +372,7 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
     motion, n = evidence.motion, len(evidence.joints)
     at, (required, _) = motion.blocks, evidence.over_blocks
     kinematic = motion.equation.residual(at)[:, n + 6 :]
+    against_motion: dict[str, dict[str, float]] = {}
     for foot, (side, R_BF) in enumerate(
         zip(evidence.sides, motion.equation.sole_rotations(at.joint_position), strict=True)
     ):
@@ -387,29 +392,33 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
         }
         lean = {f"force_{axis}": angle for axis, angle in lean.items() if abs(angle) > _TILT}
         cause = (
-            "stands level by IMU and angles, so that it is the force sensor's frame or cross-talk"
+            "the sole stands level by IMU and angles, so that it is the force sensor's frame or "
+            "cross-talk, and not the masses"
             if level
-            else "seems tilted too"
+            else "the sole seems tilted too, by IMU and angles"
         )
-        text = (
-            "{where} leans {size} from what gravity and motion need, with the load; the sole "
-            + cause
-            + ", and not the masses"
-        )
+        text = "{where} leans {size} from what gravity and motion need, with the load; " + cause
         yield from remarks("force_frame", "warning", f"foot/{side}", lean, "rad", text)
-        against = {}
-        for k, axis in enumerate("xyz"):
-            correlation = _correlation(needed[:, k], measured[:, k])
-            if correlation < -0.2 and needed[:, k].std() > _AIR * motion.equation.weight:
-                against[f"force_{axis}"] = correlation
-        text = (
-            "{where} moves against what the motion needs while this foot alone carries the robot "
-            "(correlation {size}); its sign or calibration is wrong, and so is what is found in "
-            "the base's rows that it enters"
-        )
-        yield from remarks(
-            "force_against_motion", "untrustworthy", f"foot/{side}", against, "1", text
-        )
+        against_motion[side] = {
+            f"force_{axis}": correlation
+            for k, axis in enumerate("xyz")
+            if needed[:, k].std() > _AIR * motion.equation.weight
+            and (correlation := _correlation(needed[:, k], measured[:, k])) < _AGAINST
+        }
+    feet = list(against_motion.values())
+    others = (
+        ", or, as every foot shows it, the accelerometer's axes are"
+        if len(feet) > 1 and set.intersection(*map(set, feet))
+        else ""
+    )
+    text = (
+        "{where} moves against what the motion needs while this foot alone carries the robot "
+        f"(correlation {{size}}); its sign or calibration is wrong{others}, and so is what is "
+        "found in the base's rows that it enters"
+    )
+    for side, sizes in against_motion.items():
+        channel = f"foot/{side}"
+        yield from remarks("force_against_motion", "untrustworthy", channel, sizes, "1", text)
 
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> float:

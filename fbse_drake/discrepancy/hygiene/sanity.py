@@ -205,7 +205,7 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
             if slope < -0.5
             else "are these degrees per second?"
             if 40 < slope < 75
-            else "its unit or frame is wrong"
+            else "its unit or frame is wrong, or joints or feet change places"
         )
         raise InputError(
             f"channel imu/angular_velocity: reads {slope:.2g} times the rate at which the legs "
