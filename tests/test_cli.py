@@ -621,7 +621,7 @@ def test_diagnose_then_add_then_compare(
     monkeypatch.setattr("fbse_drake.commands.diagnose", functools.partial(diagnose, effects=few))
     monkeypatch.setattr(
         "fbse_drake.analysis.write_diagnosis_report",
-        lambda path, diagnosis, predictor, inputs, *_: path.write_text(inputs.changed_scenario),
+        lambda path, *given: path.write_text(given[2].changed_scenario),
     )
     found = tmp_path / "found"
     assert main(["diagnose", *BIASED, str(biased), "--out", str(found)]) == DONE

@@ -20,6 +20,7 @@ from fbse_drake.log import Log
 H = 1e-3
 WALK, GANTRY = ("paper_walk", "duration=2.6"), ("leg_swing_gantry", "duration=3")
 KNEE, HIP = 3, 2
+SIDES = (("left", "right"), ("right", "left"))
 Run = Callable[..., Log]
 
 
@@ -213,6 +214,42 @@ def test_filtered_before_it_was_recorded(run: Run) -> None:
     assert 30 < found.size < 250
 
 
+def test_a_motion_is_no_filter(run: Run) -> None:
+    """Its spectrum falls with the eighth power of the frequency; impacts are some samples long."""
+    log, random = run(*GANTRY), np.random.default_rng(3)
+    smooth = random.standard_normal(log["joint/velocity"].shape)
+    for _ in range(4):
+        smooth = np.cumsum(smooth, axis=0)
+        smooth -= np.linspace(0.0, 1.0, len(smooth))[:, None] * smooth[-1]
+    smooth /= smooth.std(axis=0)
+    smooth[[500, 1500, 2400]] += 0.1 * np.sin(np.arange(12))
+    found = findings(GANTRY, changed(log, joint__velocity=smooth))
+    assert not [f for f in found if f.kind == "filtered"]
+
+
+@pytest.mark.parametrize("joint", ["knee_pitch", "hip_roll"])
+def test_joints_that_change_places_are_found_by_the_gyroscope(run: Run, joint: str) -> None:
+    log = run(*WALK)
+    places = [log.joints.index(f"{side}_{joint}") for side in ("left", "right")]
+    order = np.arange(len(log.joints))
+    order[places] = places[::-1]
+    swapped = {
+        f"joint__{name}": log[f"joint/{name}"][:, order] for name in ("position", "velocity")
+    }
+    predictor = Predictor(scenario(*WALK), changed(log, **swapped))
+    with pytest.raises(
+        InputError, match=f"the joints left_{joint} and right_{joint} change places"
+    ):
+        check_sensors(predictor.motion)
+    # Feet that do, or a gyroscope in another frame, are no exchange of joints.
+    feet = {f"foot__{a}__pad_force": log[f"foot/{b}/pad_force"] for a, b in SIDES}
+    turned = {"imu__angular_velocity": log["imu/angular_velocity"][:, [1, 2, 0]]}
+    for wrong in (feet, turned):
+        predictor = Predictor(scenario(*WALK), changed(log, **wrong))
+        with pytest.raises(InputError, match="wrong, or joints or feet change places"):
+            check_sensors(predictor.motion)
+
+
 @pytest.mark.parametrize(
     ("factor", "severity"), [(0.1, "untrustworthy"), (5.0, "untrustworthy"), (0.6, "warning")]
 )
@@ -346,6 +383,12 @@ def test_force_that_moves_against_the_motion(run: Run) -> None:
     ]
     assert only(found).channel == "foot/left"
     assert only(found).where == ("force_y",)
+    assert "accelerometer" not in only(found).text
+    # What both feet show may be what they share.
+    found = findings(("paper_walk", "duration=2.8"), forces(log, mirrored, ("left", "right")))
+    both = [f for f in found if f.kind == "force_against_motion"]
+    assert {f.channel for f in both} == {"foot/left", "foot/right"}
+    assert all("or, as every foot shows it, the accelerometer's axes are" in f.text for f in both)
 
 
 def test_gravity_on_the_accelerometer(run: Run) -> None:

@@ -2,6 +2,7 @@
 before anybody looks for physics in it."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from pydrake.multibody.tree import RevoluteJoint
@@ -24,6 +25,8 @@ _LARGEST_ANGLE, _BEYOND_LIMITS, _BEYOND = 4 * np.pi, 3.0, 1.0
 _SMALLEST_MOTION = 0.05
 # A base that turns less than this, root mean square, says nothing about its gyroscope [rad/s].
 _SMALLEST_RATE = 0.02
+# Of rates of which one follows the other, inner product over the larger square.
+_AGREES = 0.8
 
 
 def check_sensors(motion: RecordedMotion, evidence: Evidence | None = None) -> None:
@@ -193,8 +196,9 @@ def rate_by_legs(motion: RecordedMotion, at: Instants) -> tuple[np.ndarray, np.n
 
 def _check_gyroscope(motion: RecordedMotion) -> None:
     """While a sole stands, its leg tells how the base turns."""
-    rates, stands = rate_by_legs(motion, motion.blocks)
-    gyro = motion.blocks.angular_velocity @ motion.equation.R_BI.T
+    at = motion.blocks
+    gyro = at.angular_velocity @ motion.equation.R_BI.T
+    rates, stands = rate_by_legs(motion, at)
     power = (rates[stands] ** 2).sum()
     if not stands.any() or np.sqrt(power / stands.sum()) < _SMALLEST_RATE:
         return
@@ -205,12 +209,36 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
             if slope < -0.5
             else "are these degrees per second?"
             if 40 < slope < 75
-            else "its unit or frame is wrong, or joints or feet change places"
+            else _exchanged_joints(motion, at, gyro)
+            or "its unit or frame is wrong, or joints or feet change places"
         )
         raise InputError(
             f"channel imu/angular_velocity: reads {slope:.2g} times the rate at which the legs "
             f"that stand turn the base; {hint}"
         )
+
+
+def _exchanged_joints(motion: RecordedMotion, at: Instants, gyro: np.ndarray) -> str:
+    """Says which two joints change places, if the gyroscope is right where two do; else empty.
+
+    Args:
+        gyro: angular velocity of the base in its axes, (M, 3) [rad/s].
+    """
+    names, best, said = motion.robot.joint_names, _AGREES, ""
+    for i, j in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[i, j]] = j, i
+        moved = ("joint_position", "joint_velocity", "joint_acceleration")
+        exchanged = replace(at, **{name: getattr(at, name)[:, order] for name in moved})
+        rates, stands = rate_by_legs(motion, exchanged)
+        product = float((rates[stands] * gyro[stands]).sum())
+        agreement = product / max((rates[stands] ** 2).sum(), (gyro[stands] ** 2).sum(), 1e-300)
+        if agreement > best:
+            best = agreement
+            said = (
+                f"the joints {names[i]} and {names[j]} change places: with each other's it agrees"
+            )
+    return said
 
 
 def _check_torque(evidence: Evidence) -> None:
