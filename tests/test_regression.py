@@ -70,6 +70,24 @@ def test_a_belief_in_what_does_not_show_leaves_the_rest_as_it_is() -> None:
     assert found == pytest.approx(expected, rel=1e-9)
 
 
+def test_what_is_believed_needs_no_stretches_to_be_known() -> None:
+    """Two columns that are one, of which the log shows the sum, in two of many stretches of time;
+    one parameter is known beforehand. How sure the other is follows from that alone, and its
+    intervals hold the truth as often as they say."""
+    rng, known, held, halves = np.random.default_rng(4), 0.3, 0, []
+    x = np.zeros((1000, 1, 1))
+    x[100:110], x[700:710] = 40.0, -40.0
+    for _ in range(300):
+        truth = np.array([2.0, known * rng.normal()])
+        white = white_of(x[:, :, 0] * truth.sum() + rng.normal(size=(1000, 1)))
+        both = Signature(np.array([0]), np.repeat(x, 2, axis=2), prior=np.array([0.0, known**-2]))
+        low, high = Regression(white).fit([both]).interval()[0]
+        held += low < truth[0] < high
+        halves.append(0.5 * (high - low))
+    assert np.median(halves) == pytest.approx(1.96 * known, rel=0.02)
+    assert 0.92 < held / 300 < 0.98
+
+
 def test_a_signature_that_shows_in_no_row_is_whitened_like_others() -> None:
     white = white_of(np.ones((20, 2)))
     nowhere = Signature(np.array([], dtype=int), np.zeros((20, 0, 3)), np.zeros((20, 0)))

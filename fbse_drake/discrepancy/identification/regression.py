@@ -281,7 +281,12 @@ class PartialFit:
     @cached_property
     def spread(self) -> Spread:
         """Sandwich: what is left in a stretch may be correlated in any way. Of many short stretches
-        and few long ones, the wider counts."""
+        and few long ones, the wider counts.
+
+        What is believed beforehand is no estimate from stretches: variances that it leaves are
+        added to those by the data, and degrees of freedom are as after F. E. Satterthwaite, "An
+        approximate distribution of estimates of variance components", Biometrics 2, 1946.
+        """
         white, size = self._white, len(self.parameters)
         left = leftover(white, self._signatures, self.parameters)[:, self.rows] / self._scale
         by_block, information = np.empty((len(left), size)), np.empty((len(left), size))
@@ -299,6 +304,10 @@ class PartialFit:
         bread = np.linalg.pinv(self._gram / np.outer(norm, norm), hermitian=True)
         bread /= np.outer(norm, norm)
         least = np.sqrt(np.diag(bread))
+        prior = np.concatenate(
+            [np.broadcast_to(s.prior, s.values.shape[2]) for s in self._signatures]
+        )
+        believed = np.minimum(((bread**2) * prior).sum(axis=1), least**2)
         deviation, freedom = least, np.full(size, np.inf)
         for stretch in (white.stretch, white.stretch // _LONG):
             edges = np.flatnonzero(np.diff(stretch, prepend=-1))
@@ -311,7 +320,9 @@ class PartialFit:
                 out=np.ones(size),
                 where=borne.any(axis=0),
             )
-            spread, degrees = np.sqrt(np.maximum(sandwich, least**2)), np.maximum(bearing - 1, 1.0)
+            by_data = np.maximum(sandwich, least**2 - believed)
+            spread = np.sqrt(believed + by_data)
+            degrees = np.maximum(bearing - 1, 1.0) * (spread**2 / np.maximum(by_data, 1e-300)) ** 2
             wider = stdtrit(degrees, 0.975) * spread > stdtrit(freedom, 0.975) * deviation
             deviation, freedom = (
                 np.where(wider, spread, deviation),
