@@ -31,6 +31,8 @@ _COLLINEAR = 1e-4
 # Rounding of a sum of products as a share of its terms, and the share of the sum that may be
 # rounding.
 _ROUNDING, _NEGLIGIBLE = 1e-15, 1e-7
+# Of a variance; what is less counts as this much.
+_LEAST_SHARE = 1e-3
 # So many numbers are kept of columns by fold, and of inner products; and so many fits.
 _MOST_NUMBERS, _KEPT_FITS = 3_000_000, 500
 
@@ -322,7 +324,8 @@ class PartialFit:
             )
             by_data = np.maximum(sandwich, least**2 - believed)
             spread = np.sqrt(believed + by_data)
-            degrees = np.maximum(bearing - 1, 1.0) * (spread**2 / np.maximum(by_data, 1e-300)) ** 2
+            degrees = np.maximum(bearing - 1, 1.0)
+            degrees /= np.maximum(by_data / np.maximum(spread**2, 1e-300), _LEAST_SHARE) ** 2
             wider = stdtrit(degrees, 0.975) * spread > stdtrit(freedom, 0.975) * deviation
             deviation, freedom = (
                 np.where(wider, spread, deviation),
