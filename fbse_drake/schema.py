@@ -208,10 +208,11 @@ def check(schema: Any, value: Any, key: str = "") -> None:
         return
     if options:
         options = tuple(option for option in options if option is not type(None))
-        if len(options) == 1:
-            check(options[0], value, key)
-        elif type(value) in options:
+        if type(value) in options or (isinstance(schema, type) and isinstance(value, schema)):
+            # One of a user's own need not be known to files.
             check(type(value), value, key)
+        elif len(options) == 1:
+            check(options[0], value, key)
         else:
             names = ", ".join(option.__name__ for option in options)
             raise InputError(f"{where}: expected one of {names}; found {describe(value)}")

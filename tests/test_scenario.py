@@ -237,6 +237,16 @@ def test_what_is_made_in_code_is_refused_as_what_is_read(changes: dict, message:
         Scenario(**changes)
 
 
+def test_an_effect_of_ones_own_need_not_be_in_the_library():
+    class Rubbing(CoulombFriction):
+        pass
+
+    made = Scenario(robot=RobotConfig(effects={"rub": Rubbing({"all": 0.5})}))
+    assert isinstance(made.robot.effects["rub"], Rubbing)
+    with pytest.raises(InputError, match=r"^robot.effects.rub.coulomb.all: expected a number"):
+        Scenario(robot=RobotConfig(effects={"rub": Rubbing({"all": "0.5"})}))
+
+
 def test_numbers_of_numpy_are_numbers(tmp_path: Path):
     friction = CoulombFriction({"all": np.float32(0.5)}, {"all": np.float64(0.25)})
     robot = RobotConfig(effects={"rub": friction})
