@@ -269,6 +269,15 @@ def test_sides_that_give_stop_a_rotor_as_springs_and_dampers_do():
     assert np.argmax(found) * h == pytest.approx(times[np.argmax(expected.y[0])], abs=0.002)
 
 
+@pytest.mark.parametrize("contact_time", [0.0, 0.005])
+def test_without_a_gap_there_is_no_contact(contact_time: float):
+    """As in the joints of a robot that one value for all is given for."""
+    command = 6.0 * np.sin(np.arange(500) * H * 20.0)[:, None]
+    effect = Backlash(gap={"all": 0.0}, contact_time={"all": contact_time})
+    torque = law(effect, JointMotion(0.1 * command, command=command, time_step=H))
+    np.testing.assert_array_equal(torque, 0.0)
+
+
 @pytest.mark.parametrize("attached", [0.0, 0.25])
 def test_a_contact_of_less_than_a_step_is_an_impact(attached: float):
     time = np.arange(3000)[:, None] * H

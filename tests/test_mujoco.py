@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import mujoco_hidden
 from benchmarks.cases import Result
 from fbse_drake import Log, load_scenario
-from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.diagnose import Finding, diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.actuation import TorqueSaturation
 from fbse_drake.effects.effect import Effect, library
@@ -409,20 +409,25 @@ def test_noise_of_an_angular_acceleration_moves_no_imu() -> None:
         assert [f.effect for f in diagnosis.chosen] == expected
 
 
-@needs_mujoco
-def test_play_is_found_by_its_impacts() -> None:
-    """A hip that turns to and fro in a gap, with the encoder on the link: what the motor gathers in
-    the gap hits the leg."""
-    case = random_case(463)
+def found_in_play(number: int) -> tuple[Play, Finding]:
+    """A joint that turns to and fro in a gap, with the encoder on the link; the one effect that is
+    found of those that could look like it, in this joint."""
+    case = random_case(number)
     assert isinstance(case.physics, Play)
     scenario, reference = setting(case)
     log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
     names = ("Backlash", "TorqueDelay", "TorqueLag", "ReflectedInertia", "TransmissionElasticity")
-    diagnosis = diagnose(Predictor(scenario, log), [library()[name] for name in names])
-    (finding,) = diagnosis.chosen
+    (finding,) = diagnose(Predictor(scenario, log), [library()[name] for name in names]).chosen
     assert (finding.effect, finding.targets) == ("Backlash", (case.physics.joint,))
+    return case.physics, finding
+
+
+@needs_mujoco
+def test_play_is_found_by_its_impacts() -> None:
+    """What the motor gathers in the gap hits the leg."""
+    play, finding = found_in_play(463)
     low, high = finding.parameters["gap"].interval
-    assert low < case.physics.gap < high
+    assert low < play.gap < high
 
 
 @needs_mujoco
@@ -431,14 +436,7 @@ def test_play_is_found_where_its_sides_give(number: int) -> None:
     """The joint goes to and fro in its gap some 25 times a second, so that an impact which is too
     short by 5 ms is soon in the wrong phase: as an impact of a step it explained nothing, and a
     delay was named."""
-    case = random_case(number)
-    assert isinstance(case.physics, Play)
-    scenario, reference = setting(case)
-    log = record(Run(scenario, case.seed, case.physics, gain=case.gain), reference, case.robot)
-    names = ("Backlash", "TorqueDelay", "TorqueLag", "ReflectedInertia", "TransmissionElasticity")
-    diagnosis = diagnose(Predictor(scenario, log), [library()[name] for name in names])
-    (finding,) = diagnosis.chosen
-    assert (finding.effect, finding.targets) == ("Backlash", (case.physics.joint,))
+    _, finding = found_in_play(number)
     # Of the square of what was left.
     assert (finding.held_out_after / finding.held_out_before) ** 2 < 0.1
     assert finding.parameters["contact_time"].interval[0] > 2 * STEP

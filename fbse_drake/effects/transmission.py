@@ -186,7 +186,7 @@ class Backlash(JointTorqueEffect):
 
     with x by how much the rotor is beyond the gap's side, w the link's velocity and a damping ratio
     of 0.7. Then the link's acceleration is that of the step itself; a simulation takes what is
-    expected of it, and needs `solve_twice` to come close.
+    expected of it.
     """
 
     description: ClassVar[str] = (
@@ -331,7 +331,7 @@ def _crossings(
         for k in range(command.shape[0]):
             R, side, contact = inertia[k, j], 0.5 * gap[k, j], contact_time[k, j]
             last, w = w, link_velocity[k, j]
-            if contact > time_step:
+            if contact > time_step and side > 0.0:
                 a = (w - last) / time_step
                 before, drive, coming = v, command[k, j] - attached[k, j] * a, 0.0
                 x, v = _pushed_back(x, v, drive / R, side, contact, time_step)

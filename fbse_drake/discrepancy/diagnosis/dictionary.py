@@ -294,7 +294,7 @@ class Dictionary:
         searched = [p for p in self.parameters(effect, joint).values() if not p.linear]
         if not searched:
             return np.zeros((0, 1))
-        most = {0: 1, 1: 9, 2: 5}.get(sum(p.grid > 1 for p in searched), 3)
+        most = {0: 1, 1: Parameter.grid, 2: 5}.get(sum(p.grid > 1 for p in searched), 3)
         # What needs more than the usual points needs them beside others too.
         axes = [
             np.geomspace(*p.plausible, p.grid if p.grid > Parameter.grid else min(most, p.grid))

@@ -102,8 +102,11 @@ def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> V
     known = first.known & last.known
     white = WhitenedResidual(replace(first, known=known))
     before, after = (
-        np.sum([white.whiten(row, of_row) ** 2 for row, of_row in enumerate(one.value.T)], axis=0)
-        for one in (first, last)
+        (values**2).sum(axis=1)
+        for values in (
+            white.y,
+            np.stack([white.whiten(k, values) for k, values in enumerate(last.value.T)], axis=1),
+        )
     )
     left, left_after, torque, noise, noise_after = (
         np.where(known[:, :n], values[:, :n], 0.0).sum(axis=1)

@@ -49,6 +49,8 @@ _SWAP_BLOCKS = 40
 # Static checks: share of the weight, tilt of the force [rad], share of gravity, share of the weight
 # on a foot in the air.
 _WEIGHT, _TILT, _GRAVITY, _AIR = 0.02, 0.025, 0.01, 0.01
+# Correlation below which a force moves against what is needed of it.
+_AGAINST = -0.2
 # Fewest blocks from which something is said of a foot, and how long it takes a foot to read nothing
 # after it is lifted [s].
 _FEWEST, _SETTLED = 20, 0.1
@@ -358,10 +360,6 @@ def check_weight(evidence: Evidence) -> Iterable[HygieneFinding]:
 def _tilt(vector: np.ndarray, axis: int) -> float:
     """Angle by which a force leans towards x (0) or y (1) [rad]."""
     return float(np.arctan2(vector[axis], vector[2]))
-
-
-# Correlation below which a force moves against what is needed of it.
-_AGAINST = -0.2
 
 
 def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:

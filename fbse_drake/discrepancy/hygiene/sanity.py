@@ -219,13 +219,16 @@ def _check_gyroscope(motion: RecordedMotion) -> None:
 
 
 def _exchanged_joints(motion: RecordedMotion, at: Instants, gyro: np.ndarray) -> str:
-    """Says which two joints change places, if the gyroscope is right where two do; else empty.
+    """Says which two joints of legs change places, if with each other's the gyroscope is right;
+    else empty.
 
     Args:
         gyro: angular velocity of the base in its axes, (M, 3) [rad/s].
     """
     names, best, said = motion.robot.joint_names, _AGREES, ""
-    for i, j in combinations(range(len(names)), 2):
+    legs = motion.robot.description.legs.values()
+    places = [names.index(joint) for leg in legs for joint in leg.joints]
+    for i, j in combinations(places, 2):
         order = np.arange(len(names))
         order[[i, j]] = j, i
         moved = ("joint_position", "joint_velocity", "joint_acceleration")
