@@ -409,7 +409,7 @@ def test_noise_of_an_angular_acceleration_moves_no_imu() -> None:
         assert [f.effect for f in diagnosis.chosen] == expected
 
 
-def found_in_play(number: int) -> tuple[Play, Finding]:
+def found_in_play(number: int) -> "tuple[Play, Finding]":
     """A joint that turns to and fro in a gap, with the encoder on the link; the one effect that is
     found of those that could look like it, in this joint."""
     case = random_case(number)
