@@ -53,7 +53,23 @@ class GroundEffect(Effect):
 
 @dataclass(frozen=True)
 class ContactEffect(GroundEffect):
-    """Base of the contact effects, which move standing soles in proportion to their parameters."""
+    """Base of the contact effects, which move standing soles in proportion to their linear
+    parameters."""
+
+    @staticmethod
+    def usual(contact: "PadContact") -> np.ndarray:  # noqa: ARG004
+        """Values of the nonlinear parameters, (m,), with which the effect is like this contact."""
+        return np.zeros(0)
+
+    @staticmethod
+    def retardation_of(nonlinear: np.ndarray, contact: "PadContact") -> float:  # noqa: ARG004
+        """That of a contact with the effect, see `PadContact` [s/N].
+
+        Args:
+            nonlinear: values of the nonlinear parameters, shape (m,).
+            contact: without it.
+        """
+        return contact.retardation
 
     @staticmethod
     @abstractmethod
@@ -159,19 +175,26 @@ class GroundCompliance(ContactEffect):
     """Ground and soles that give way: each pad sinks by compliance * (its normal force), more than
     the contact's stiffness says.
 
-    The prediction is that of springs. In a simulation sinking comes late by dissipation * depth; so
-    that this time stays what it is without the effect (a hundredth of a second for the biped on the
-    default ground), the dissipation is lowered with the stiffness.
+    By how long it sinks late grows with the force (Hunt and Crossley 1975): by retardation * force,
+    where retardation is the dissipation over the stiffness of the contact that has the effect.
     """
 
     description: ClassVar[str] = "Ground or soles give way under load."
     signature: ClassVar[str] = "Standing feet sink and tilt as load and centre of pressure move."
     experiment: ClassVar[str] = "Sway from foot to foot, and lean forward and back."
     parameters: ClassVar[dict[str, Parameter]] = {
-        "compliance": Parameter("m/N", linear=True, plausible=(5e-7, 5e-6))
+        # From rubber soles to a foam mat.
+        "compliance": Parameter("m/N", linear=True, plausible=(5e-7, 1e-4)),
+        "retardation": Parameter(
+            "s/N",
+            linear=False,
+            plausible=(1e-5, 1e-2),
+            meaning="by how long soles sink late, per force; 0 for as long as without the effect",
+        ),
     }
 
     compliance: float = 0.0
+    retardation: float = 0.0
 
     def contact(
         self,
@@ -181,10 +204,17 @@ class GroundCompliance(ContactEffect):
     ) -> tuple[Ground, MultibodyPlantConfig]:
         # Drake puts the springs of both surfaces in series, so this adds to the compliance of the
         # contact as a whole.
-        share = 1.0 / (1.0 + self.compliance * ground.stiffness)
-        return replace(
-            ground, stiffness=share * ground.stiffness, dissipation=share * ground.dissipation
-        ), plant
+        stiffness = 1.0 / (1.0 / ground.stiffness + self.compliance)
+        retardation = self.retardation or ground.dissipation / ground.stiffness
+        return replace(ground, stiffness=stiffness, dissipation=retardation * stiffness), plant
+
+    @staticmethod
+    def usual(contact: "PadContact") -> np.ndarray:
+        return np.array([contact.retardation])
+
+    @staticmethod
+    def retardation_of(nonlinear: np.ndarray, contact: "PadContact") -> float:
+        return float(nonlinear[0]) or contact.retardation
 
     @staticmethod
     def sole_motion(
@@ -268,6 +298,11 @@ class PadContact:
     # Velocity at which it creeps per tangential over normal force [m/s].
     creep: float
 
+    @property
+    def retardation(self) -> float:
+        """By how long depth follows a force late, per force [s/N]."""
+        return self.dissipation / self.stiffness
+
 
 def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -> PadContact:
     """The contact between a robot's pads and the ground, as Drake combines the two and solves it
@@ -293,24 +328,26 @@ def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -
     )
 
 
-def spring_force(normal_force: np.ndarray, contact: PadContact, period: float) -> np.ndarray:
+def spring_force(normal_force: np.ndarray, retardation: float, period: float) -> np.ndarray:
     """Share of the normal force on each pad that the contact's spring carries: stiffness times
     depth, without the dissipation.
 
     Args:
         normal_force: shape (N, P) [N].
+        retardation: dissipation over stiffness, see `PadContact` [s/N].
         period: between samples [s].
     """
-    result = np.empty_like(normal_force)
-    _fill_spring_force(
-        result, np.maximum(normal_force, 0.0), contact.stiffness * period / contact.dissipation
-    )
+    pushed = np.maximum(normal_force, 0.0)
+    if retardation == 0.0:
+        return pushed
+    result = np.empty_like(pushed)
+    _fill_spring_force(result, pushed, period / retardation)
     return result
 
 
 @njit(cache=True)
 def _fill_spring_force(spring: np.ndarray, force: np.ndarray, rate: float) -> None:
-    # d(spring)/dt = (stiffness / dissipation) (force / spring - 1), by implicit Euler: stable
+    # d(spring)/dt = (force / spring - 1) / retardation, by implicit Euler: stable
     # however shallow the contact is.
     samples, pads = force.shape
     for pad in range(pads):

@@ -63,6 +63,7 @@ _WITH_MASS = {
     "N s^2/m^2": 1 / 3,
     "rad/Nm": -4 / 3,
     "m/N": -2 / 3,
+    "s/N": -1.0,
 }
 
 E = TypeVar("E", bound="Effect")

@@ -142,6 +142,11 @@ def _course(log: str, validation: Validation) -> str:
     """As `on the rest of the log, which was set aside, the error falls from 4.20 to 0.99 times the
     sensors' noise, which is 0.24 (0.20 to 0.28) of it`."""
     before, after = validation.before, validation.after
+    if not validation.tells:
+        return (
+            f"{_set_aside_name(log)}, which was set aside, shows nothing of it: the error stays "
+            f"{number(before.value)} times the sensors' noise"
+        )
     text = (
         f"on {_set_aside_name(log)}, which was set aside, {_said_course(validation)}: "
         f"from {number(before.value)} to {number(after.value)} times the sensors' noise, which is "

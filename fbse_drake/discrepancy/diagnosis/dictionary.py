@@ -216,7 +216,7 @@ class Dictionary:
         usual = self._fixed_columns(effect, target, self.usual_at(effect, target))
         if not len(usual.signature.rows):
             return []
-        around = self._around(effect, target) if self.is_deflection(usual.signature) else []
+        around = self._around(effect, target) if self.is_of_motion(usual.signature) else []
         return [*(self._fixed_columns(effect, target, values) for values in around), usual]
 
     def _fixed_columns(
@@ -244,12 +244,13 @@ class Dictionary:
         noise = motion.torque_variance(motion.signals.torque_command)
         return not self.per_step or bool(noise.any())
 
-    def is_deflection(self, signature: Signature) -> bool:
-        """Does an effect show in a transmission alone? Elsewhere the data hardly tell nonlinear
-        parameters of what is no joint torque effect from others: they keep their default."""
+    def is_of_motion(self, signature: Signature) -> bool:
+        """Does an effect show in a transmission or in standing soles alone? Elsewhere the data
+        hardly tell nonlinear parameters of what is no joint torque effect from others: they keep
+        their default."""
         rows = self.predictor.motion.rows
         kinds = {rows[row].kind for row in signature.rows}
-        return kinds == {"transmission"}
+        return kinds in ({"transmission"}, {"kinematic"})
 
     def _around(self, effect: type[Effect], target: str) -> list[np.ndarray]:
         """Values over the plausible ranges of nonlinear parameters, (m,) each; none without any."""
@@ -341,6 +342,8 @@ class Dictionary:
         plausible there, (m,)."""
         ranges = [p.plausible for p in self.parameters(effect, target).values() if not p.linear]
         low, high = np.array(ranges).reshape(-1, 2).T
+        if issubclass(effect, ContactEffect):
+            return np.clip(effect.usual(self.predictor.pad_contact), low, high)
         return np.clip(usual_values(effect) * self._factors(effect, target), low, high)
 
     def columns(

@@ -9,7 +9,6 @@ import numpy as np
 
 from fbse_drake.discrepancy.identification.regression import Fit, Signature
 from fbse_drake.effects.effect import Effect, Parameter
-from fbse_drake.effects.joint_torque import JointTorqueEffect
 
 # An effect and its targets.
 Name = tuple[type[Effect], tuple[str, ...]]
@@ -26,7 +25,8 @@ class Candidate:
     parameters: Mapping[str, Parameter]
     # Values of its nonlinear parameters, shape (m,).
     nonlinear: np.ndarray
-    # Whitened; columns are the linear parameters, then the change of the nonlinear ones.
+    # Whitened; columns are the linear parameters, then, if they are fitted, the change of the
+    # nonlinear ones.
     signature: Signature
     # The same as it is, or what makes it: it is seldom asked for.
     source: Signature | Callable[[], Signature]
@@ -68,6 +68,12 @@ class Candidate:
     def nonlinear_names(self) -> list[str]:
         return [name for name, parameter in self.effect.parameters.items() if not parameter.linear]
 
+    @property
+    def fitted_names(self) -> list[str]:
+        """Of its columns."""
+        names = [*self.linear_names, *self.nonlinear_names]
+        return names[: self.signature.values.shape[2]]
+
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
@@ -98,9 +104,7 @@ class Explanation:
     def fitted(self, candidate: Candidate) -> tuple[list[str], np.ndarray, slice]:
         """Names of a candidate's fitted parameters, their values (m,), and their places in the
         fit."""
-        names = list(candidate.linear_names)
-        if issubclass(candidate.effect, JointTorqueEffect):
-            names += candidate.nonlinear_names
+        names = candidate.fitted_names
         offsets = np.concatenate([np.zeros(len(candidate.linear_names)), candidate.nonlinear])
         start = self.start(candidate)
         part = slice(start, start + len(names))
@@ -119,7 +123,7 @@ class Explanation:
         """Values of a candidate's parameters and their 95 % intervals, by name, within the
         parameters' bounds.
 
-        A nonlinear parameter that was not searched for has its plausible range as interval.
+        A nonlinear parameter that was not fitted has its plausible range as interval.
         """
         fitted, values, part = self.fitted(candidate)
         intervals = self.solved.interval()[part] + (values - self.solved.parameters[part])[:, None]

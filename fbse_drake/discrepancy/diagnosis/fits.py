@@ -370,7 +370,6 @@ class Fits:
         """
         places = self.dictionary.rows_of(effect, group)
         parameters = self.dictionary.parameters(effect, *group)
-        names = [name for name, parameter in parameters.items() if not parameter.linear]
         smallest = np.array([p.bounds[0] for p in parameters.values() if p.linear])
         steps = _SLOPE_STEP * nonlinear
         # The values themselves, then for each of them a bit less and a bit more.
@@ -395,22 +394,7 @@ class Fits:
             together = [columns[:, :, 0], *(slope[..., None] for slope in slopes)]
             return np.moveaxis(np.concatenate(together, axis=2), 0, 1)
 
-        # A weak belief in the middle of the plausible range keeps values that the data say nothing
-        # about from running away.
-        ranges = np.log([parameters[name].plausible for name in names]).reshape(-1, 2)
-        spread = 0.25 * (ranges[:, 1] - ranges[:, 0]) * nonlinear
-        middle = nonlinear * (ranges.mean(axis=1) - np.log(nonlinear))
-        near = np.array([parameters[name].linear_within for name in names])
-        # Beyond where its slopes hold a law would mimic what no law of its kind does.
-        down, up = _nearby(parameters, nonlinear)
-        unbounded, unknown = np.full(len(smallest), np.inf), np.zeros(len(smallest))
-        beliefs = {
-            "prior": np.append(unknown, spread**-2.0),
-            "expected": np.append(unknown, middle),
-            "steadying": np.append(unknown, (near * nonlinear) ** -2.0),
-            "lowest": np.append(smallest, down),
-            "highest": np.append(unbounded, up),
-        }
+        beliefs = _beliefs(parameters, nonlinear, np.zeros(len(smallest)), smallest)
 
         def signature(columns: np.ndarray) -> Signature:
             values = linearised(columns)
@@ -461,6 +445,39 @@ class Fits:
             return _noise_drop(signature, noise, realization)
 
         return replace(candidate, source=raw, signature=signature, noise_drop=noise_drop)
+
+    def with_slopes(self, candidate: Candidate, linear: np.ndarray) -> Candidate:
+        """A candidate that is no joint torque effect whose nonlinear values are fitted as well, by
+        slopes over them.
+
+        Args:
+            linear: values of its linear parameters at which these are taken, (p,).
+        """
+        raw, here, predictor = candidate.raw, candidate.nonlinear, self.dictionary.predictor
+        steps = _SLOPE_STEP * here
+
+        def added(nonlinear: np.ndarray) -> np.ndarray:
+            near = predictor.signature_near(
+                candidate.effect, candidate.targets[0], linear, nonlinear, raw
+            )
+            return near.values @ linear + near.offset
+
+        slopes = [
+            (added(here + change) - added(here - change)) / (2 * step)
+            for change, step in zip(np.diag(steps), steps, strict=True)
+        ]
+        p = len(linear)
+        wider = replace(
+            raw,
+            values=np.concatenate([raw.values, np.stack(slopes, axis=2)], axis=2),
+            **_beliefs(
+                candidate.parameters,
+                here,
+                np.broadcast_to(raw.prior, p),
+                np.broadcast_to(raw.lowest, p),
+            ),
+        )
+        return replace(candidate, source=wider, signature=self.white.whiten_signature(wider))
 
     def signatures(self, explanation: Explanation) -> tuple[Signature, ...]:
         """Whitened, in the order of the explanation's parameters."""
@@ -521,6 +538,37 @@ def _noise_drop(signature: Signature, noise: Signature, realization: np.ndarray)
     right = np.einsum("brp,br->p", noise.values, realization[:, signature.rows])
     gram = np.tensordot(signature.values, signature.values, axes=((0, 1), (0, 1)))
     return _SPURIOUS * fixed_gain(gram, right)
+
+
+def _beliefs(
+    parameters: Mapping[str, Parameter],
+    nonlinear: np.ndarray,
+    prior: np.ndarray,
+    lowest: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """What is believed of the parameters of an effect that is linearised about nonlinear values,
+    (m,), and where that holds; see `Signature`, (p + m,) each.
+
+    Args:
+        prior, lowest: of the linear parameters, (p,).
+    """
+    searched = [parameter for parameter in parameters.values() if not parameter.linear]
+    # A weak belief in the middle of the plausible range keeps values that the data say nothing
+    # about from running away.
+    ranges = np.log([parameter.plausible for parameter in searched]).reshape(-1, 2)
+    spread = 0.25 * (ranges[:, 1] - ranges[:, 0]) * nonlinear
+    middle = nonlinear * (ranges.mean(axis=1) - np.log(nonlinear))
+    near = np.array([parameter.linear_within for parameter in searched])
+    # Beyond where its slopes hold a law would mimic what no law of its kind does.
+    down, up = _nearby(parameters, nonlinear)
+    unknown, unbounded = np.zeros(len(prior)), np.full(len(prior), np.inf)
+    return {
+        "prior": np.append(prior, spread**-2.0),
+        "expected": np.append(unknown, middle),
+        "steadying": np.append(unknown, (near * nonlinear) ** -2.0),
+        "lowest": np.append(lowest, down),
+        "highest": np.append(unbounded, up),
+    }
 
 
 def _nearby(

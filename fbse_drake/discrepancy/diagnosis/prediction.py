@@ -25,6 +25,7 @@ from fbse_drake.effects.contact import (
     ContactEffect,
     GroundCompliance,
     GroundSlope,
+    PadContact,
 )
 from fbse_drake.effects.effect import Effect, ResolvedEffect
 from fbse_drake.effects.geometry import GeometryEffect
@@ -52,8 +53,6 @@ _ROUNDING = 1e-9
 _EVALUATIONS = 8
 # Most numbers that one array of columns may have before it is averaged over blocks.
 _CHUNK = 250_000
-# Effects that add in proportion to their linear parameters, however large these are.
-_PROPORTIONAL = (JointTorqueEffect, ContactEffect)
 
 
 class Predictor:
@@ -173,13 +172,20 @@ class Predictor:
         if self.robot.has_floating_base:
             residual = residual.minus(self._soles.on_slope(self._believed_slope))
             residual = residual.minus(self._soles.on_believed_ground())
-            sinking = self._soles.sinking_variance / self._soles.contact.stiffness**2
+            contact = self.pad_contact
+            sinking = self._soles.sinking_variance(contact.retardation) / contact.stiffness**2
             residual = replace(residual, variance=residual.variance + sinking)
+            residual = self._soles.settled(residual, contact.retardation)
         return self.doubted(residual, self._known)
 
     @cached_property
     def _soles(self) -> StandingSoles:
         return StandingSoles(self.motion, self.scenario)
+
+    @cached_property
+    def pad_contact(self) -> PadContact:
+        """Of the pads under the model's feet with its ground."""
+        return self._soles.contact
 
     @cached_property
     def _believed_slope(self) -> np.ndarray:
@@ -198,12 +204,15 @@ class Predictor:
         doubt[:, : len(self.robot.joint_names)] = self.law_variance(
             e for e in effects if isinstance(e, ResolvedJointTorque)
         )
-        softer = sum(
-            float(effect.linear[0, 0]) for effect in effects if effect.effect is GroundCompliance
-        )
-        if softer:
-            nominal = 1.0 / self._soles.contact.stiffness
-            doubt += ((nominal + softer) ** 2 - nominal**2) * self._soles.sinking_variance
+        soles, contact = self._soles, self.pad_contact
+        for effect in effects:
+            if effect.effect is GroundCompliance:
+                (softer,), firm = effect.linear[:, 0], 1.0 / contact.stiffness
+                late = GroundCompliance.retardation_of(effect.nonlinear[:, 0], contact)
+                sinking = (firm + softer) ** 2 * soles.sinking_variance(late)
+                usual = firm**2 * soles.sinking_variance(contact.retardation)
+                doubt += np.maximum(sinking - usual, 0.0)
+                residual = soles.settled(residual, late)
         return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
 
     def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
@@ -280,7 +289,8 @@ class Predictor:
             result[:, rows] = np.einsum("pbn,pn->bn", columns, amounts[:, joint])
         elif issubclass(effect.effect, ContactEffect):
             signature = self.signature(effect.effect, "robot", effect.nonlinear[:, 0])
-            result[:, signature.rows] = signature.values @ effect.linear[:, 0]
+            amounts = effect.linear[:, 0]
+            result[:, signature.rows] = signature.values @ amounts + signature.offset
         return result
 
     @cached_property
@@ -437,16 +447,19 @@ class Predictor:
             rows = self.rows_of(effect, np.array([joint]))
             values = np.repeat(nonlinear[:, None], len(rows), axis=1)
             return Signature(rows, np.moveaxis(self.joint_columns(effect, values, rows), 0, 2))
+        point = self._expansion_point(effect, target)
         if issubclass(effect, ContactEffect):
-            values = self._soles.columns(effect)
+            values = self._soles.columns(effect, nonlinear)
+            offset = self._soles.offset(effect, nonlinear)
         else:
-            point = self._expansion_point(effect, target)
             values, offset = self._slopes(effect, target, point, nonlinear)
-            if point is not None:
-                rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
-                return Signature(rows, values[:, rows], offset[:, rows], about=point)
         rows = np.flatnonzero(np.abs(values).max(axis=(0, 2)) > 0)
-        return Signature(rows, values[:, rows])
+        return Signature(
+            rows,
+            values[:, rows],
+            offset[:, rows] if np.any(offset) else 0.0,
+            about=0.0 if point is None else point,
+        )
 
     @cached_property
     def _regressors(self) -> Regressors:
@@ -477,7 +490,7 @@ class Predictor:
     ) -> Signature:
         """What that noise adds to the signature of an effect: regressors are measured too."""
         if issubclass(effect, ContactEffect):
-            return replace(clean, values=self._soles.noise_in(effect)[:, clean.rows])
+            return replace(clean, values=self._soles.noise_in(effect, nonlinear)[:, clean.rows])
         if np.any(clean.about):
             about = np.asarray(clean.about)
             values, _ = self._slopes(effect, target, about, nonlinear, noisier=True)
@@ -533,8 +546,11 @@ class Predictor:
             linear, nonlinear: values of the parameters, shapes (p,) and (m,).
             elsewhere: the signature about zero; it stays that of any other effect.
         """
-        if issubclass(effect, _PROPORTIONAL):
+        if issubclass(effect, JointTorqueEffect):
             return elsewhere
+        if issubclass(effect, ContactEffect):
+            of_soles = self.signature(effect, target, nonlinear)
+            return replace(elsewhere, values=of_soles.values, offset=of_soles.offset)
         values, offset = self._slopes(effect, target, linear, nonlinear)
         rows, lowest = elsewhere.rows, elsewhere.lowest
         if issubclass(effect, InertiaEffect):

@@ -114,9 +114,9 @@ def _narrowed(
     fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray
 ) -> Candidate:
     """A candidate that is no joint torque effect with its nonlinear values where they fit best
-    beside others, if the log tells them at all: what shows in a transmission alone, or far
-    better with another value."""
-    needed = 0.0 if fits.dictionary.is_deflection(candidate.signature) else MARGIN
+    beside others, if the log tells them at all: what shows in motion alone, or far better
+    with another value."""
+    needed = 0.0 if fits.dictionary.is_of_motion(candidate.signature) else MARGIN
     for k in range(len(candidate.nonlinear)):
         narrower = _with_fitting_value(fits, others, candidate, linear, k)
         there, here = (fits.explain([*others, c]).deviance for c in (narrower, candidate))
@@ -143,6 +143,23 @@ def _with_fitting_value(
         options={"xatol": _TOLERANCE},
     )
     return with_value(found.x)
+
+
+def with_slopes(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation in which the nonlinear values of what shows in motion alone are fitted along,
+    so that what is not known of them is in the intervals of the others."""
+
+    def widened(candidate: Candidate) -> Candidate:
+        is_law = issubclass(candidate.effect, JointTorqueEffect)
+        if is_law or not len(candidate.nonlinear):
+            return candidate
+        if not fits.dictionary.is_of_motion(candidate.signature):
+            return candidate
+        _, linear, _ = explanation.fitted(candidate)
+        return fits.with_slopes(candidate, linear)
+
+    members = [widened(candidate) for candidate in explanation.candidates]
+    return explanation if members == [*explanation.candidates] else fits.explain(members)
 
 
 def consistent(

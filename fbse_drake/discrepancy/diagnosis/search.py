@@ -21,7 +21,13 @@ from fbse_drake.discrepancy.diagnosis.parsimony import (
 )
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
-from fbse_drake.discrepancy.diagnosis.refinement import added, consistent, polished, remeasured
+from fbse_drake.discrepancy.diagnosis.refinement import (
+    added,
+    consistent,
+    polished,
+    remeasured,
+    with_slopes,
+)
 from fbse_drake.discrepancy.diagnosis.rivals import in_parts, indistinguishable, rivals, settled
 from fbse_drake.discrepancy.diagnosis.selection import select
 from fbse_drake.discrepancy.identification.inertial import IdentifiedInertia
@@ -253,7 +259,7 @@ def _searched(
         partial = str(stop)
     linear = path[-1]
     final, inertia = consistent(proposals.fits, linear)
-    path[-1], remaining, left = added(proposals.fits, final)
+    path[-1], remaining, left = added(proposals.fits, with_slopes(proposals.fits, final))
     significance = proposals.fits.dictionary.significance
     structures = leftover_structure(predictor.motion, remaining, left)
 

@@ -5,6 +5,7 @@ between them; see `fbse_drake.discrepancy.residual.rows`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.residual.blocks import block_means
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
-from fbse_drake.discrepancy.residual.residual import rms
+from fbse_drake.discrepancy.residual.residual import Residual, rms
 from fbse_drake.discrepancy.residual.rows import foot_pairs
 from fbse_drake.effects.contact import (
     ContactEffect,
@@ -28,6 +29,10 @@ from fbse_drake.robot.plant import gravity_on_slope
 from fbse_drake.scenario import Scenario
 from fbse_drake.sensors.foot_force import force_noise
 
+# After so many times that by which they sink late, soles have sunk in; a load is more than this
+# [N]. A robot whose joints are slower than this share of what they usually are is at rest.
+_SINKING, _LEAST_LOAD, _AT_REST = 3.0, 1.0, 0.1
+
 
 class StandingSoles:
     """The feet of a robot over one log, on the ground that a scenario believes in."""
@@ -37,22 +42,43 @@ class StandingSoles:
         # Blocks and rows of the residual.
         self._shape = len(motion.time), len(motion.rows)
 
-    def columns(self, effect: type[ContactEffect]) -> np.ndarray:
-        """What an effect adds to the residual per unit of each of its parameters, by the motion of
-        the standing soles that it predicts, (B, R, p)."""
-        if not self._robot.has_floating_base:
-            return np.zeros((*self._shape, len(effect.parameters)))
-        return self._columns(effect, self._foot_forces)
+    def columns(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
+        """What an effect adds to the residual per unit of each of its linear parameters, by the
+        motion of the standing soles that it predicts, (B, R, p).
 
-    def noise_in(self, effect: type[ContactEffect]) -> np.ndarray:
+        Args:
+            nonlinear: values of its nonlinear parameters, shape (m,).
+        """
+        return self._columns(effect, nonlinear, self._motion.signals.pad_force)
+
+    def offset(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
+        """What an effect adds whatever its linear parameters are, (B, R): the soles sink into
+        the model's ground with another retardation.
+
+        Args:
+            nonlinear: values of its nonlinear parameters, shape (m,).
+        """
+        retardation = effect.retardation_of(nonlinear, self.contact)
+        if retardation == self.contact.retardation or not self._robot.has_floating_base:
+            return np.zeros(self._shape)
+        late, usual = (
+            self.columns(GroundCompliance, values)[:, :, 0]
+            for values in (np.array([retardation]), GroundCompliance.usual(self.contact))
+        )
+        return (late - usual) / self.contact.stiffness
+
+    def noise_in(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
         """What noise that is added to the measured forces once more adds to these columns."""
-        if not self._robot.has_floating_base:
-            return np.zeros((*self._shape, len(effect.parameters)))
-        return self._columns(effect, self._noisier_forces) - self.columns(effect)
+        noisier = self._columns(effect, nonlinear, self._noisier_force)
+        return noisier - self.columns(effect, nonlinear)
 
     def _columns(
-        self, effect: type[ContactEffect], forces: Sequence[tuple[np.ndarray, np.ndarray]]
+        self, effect: type[ContactEffect], nonlinear: np.ndarray, pad_force: np.ndarray
     ) -> np.ndarray:
+        if not self._robot.has_floating_base:
+            linear = [parameter for parameter in effect.parameters.values() if parameter.linear]
+            return np.zeros((*self._shape, len(linear)))
+        forces = self._split_feet(pad_force, effect.retardation_of(nonlinear, self.contact))
         motions = [effect.sole_motion(force, pads, self._sample_time) for force, pads in forces]
         columns = [
             self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))
@@ -70,11 +96,7 @@ class StandingSoles:
         return self._motion.start + samples * self._motion.period
 
     @cached_property
-    def _foot_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        return self._split_feet(self._motion.signals.pad_force)
-
-    @cached_property
-    def _noisier_forces(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _noisier_force(self) -> np.ndarray:
         force = self._motion.signals.pad_force
         noise = force_noise(
             self._motion.sensors_by_row.foot_force,
@@ -82,16 +104,22 @@ class StandingSoles:
             len(force),
             np.random.default_rng(0),
         )
-        return self._split_feet(force + noise)
+        return force + noise
 
-    def _split_feet(self, pad_force: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _split_feet(
+        self, pad_force: np.ndarray, retardation: float
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Force (N, P, 3) on the pads of each foot, of which the normal component is their springs'
-        share, and places (P, 3) of these; in the axes of its contact, see `_contact_rotations`."""
+        share, and places (P, 3) of these; in the axes of its contact, see `_contact_rotations`.
+
+        Args:
+            retardation: see `spring_force`.
+        """
         pads, force = self._motion.equation.pads, pad_force.copy()
         for foot, R_LF in self._point_feet.items():
             of_foot = pads.foot == foot
             force[:, of_foot] = np.einsum("nij,npj->npi", R_LF, force[:, of_foot])
-        force[:, :, 2] = spring_force(force[:, :, 2], self.contact, self._motion.period)
+        force[:, :, 2] = spring_force(force[:, :, 2], retardation, self._motion.period)
         return list(zip(pads.split(force), pads.split(pads.position), strict=True))
 
     def _sole_rows(self, motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -164,10 +192,11 @@ class StandingSoles:
 
     @cached_property
     def contact(self) -> PadContact:
-        """Of the pads under the feet with the ground."""
-        return pad_contact(
-            self._scenario.believed.description, self._scenario.ground, self._scenario.plant
-        )
+        """Of the pads under the feet with the ground; without feet, the ground's own."""
+        ground = self._scenario.ground
+        if not self._robot.description.legs:
+            return PadContact(ground.stiffness, ground.dissipation, creep=0.0)
+        return pad_contact(self._scenario.believed.description, ground, self._scenario.plant)
 
     @cached_property
     def _headings(self) -> np.ndarray:
@@ -204,17 +233,39 @@ class StandingSoles:
     def on_believed_ground(self) -> np.ndarray:
         """What the model's own ground adds: it gives way a little under the soles and lets them
         creep, (B, R)."""
-        sinking = self.columns(GroundCompliance)[:, :, 0] / self.contact.stiffness
-        return sinking + self.contact.creep * self.columns(FootCreep)[:, :, 0]
+        sinking, creeping = (
+            self.columns(effect, effect.usual(self.contact))[:, :, 0]
+            for effect in (GroundCompliance, FootCreep)
+        )
+        return sinking / self.contact.stiffness + self.contact.creep * creeping
 
-    @cached_property
-    def sinking_variance(self) -> np.ndarray:
+    def settled(self, residual: Residual, retardation: float) -> Residual:
+        """A residual in which rows of soles are not known before these have sunk in, if the robot
+        moved when the recording began: how far they had then nothing tells.
+
+        Args:
+            retardation: of the contact, see `PadContact` [s/N].
+        """
+        motion = self._motion
+        force = np.maximum(motion.signals.pad_force[:, :, 2], 0.0)
+        load = (force**2).sum() / max(force.sum(), _LEAST_LOAD)
+        speed = np.linalg.norm(motion.blocks.joint_velocity, axis=1)
+        moves = speed > _AT_REST * np.sqrt(np.mean(speed**2))
+        first = np.searchsorted(motion.time, motion.time - motion.since_start)
+        sinking = moves[first] & (motion.since_start < _SINKING * retardation * load)
+        of_soles = np.array([row.kind == "kinematic" for row in residual.rows])
+        return replace(residual, known=residual.known & ~(sinking[:, None] & of_soles))
+
+    def sinking_variance(self, retardation: float) -> np.ndarray:
         """What the noise of the force sensors puts into the predicted sinking of the soles, per
         unit of compliance squared, (R,).
 
         A robot that does not stand has no soles that sink.
+
+        Args:
+            retardation: of the contact, see `PadContact` [s/N].
         """
-        noise = self.noise_in(GroundCompliance)[:, :, 0]
+        noise = self.noise_in(GroundCompliance, np.array([retardation]))[:, :, 0]
         return np.nan_to_num(rms(noise, self._motion.known) ** 2)
 
 

@@ -2,10 +2,11 @@
 at?
 
 Both models are put against the same blocks, whitened by the same noise, so that what both do not
-know cancels in the change of the error. (Unwhitened, noise that is differentiated would drown what
-is slow; and a model with more inertia, which makes more of it, would seem worse.) Its intervals are
-those of a ratio of sums by batch means: consecutive blocks are taken together until their sums are
-hardly correlated (with B blocks, a multiple of sqrt(B) at a time; Flegal and Jones 2010).
+know cancels in the change of the error: row by row by that of the one which passes on more of the
+sensors' noise, as one with more inertia or softer ground does, which would seem worse otherwise.
+(Unwhitened, noise that is differentiated would drown what is slow.) Its intervals are those of a
+ratio of sums by batch means: consecutive blocks are taken together until their sums are hardly
+correlated (with B blocks, a multiple of sqrt(B) at a time; Flegal and Jones 2010).
 """
 
 from dataclasses import dataclass, replace
@@ -57,11 +58,18 @@ class Validation:
         return "falls" if self.change.interval[1] < 1.0 else "unclear"
 
     @property
+    def tells(self) -> bool:
+        """Is there anything in the log in which the models differ?"""
+        return self.change.value != 1.0
+
+    @property
     def refutes(self) -> bool:
         """Does the log speak against the completed model? One that is too short for an interval
         does so only if the error does not fall there."""
+        if self.course == "falls" or not self.tells:
+            return False
         tested = np.isfinite(self.change.interval[1])
-        return self.course != "falls" and bool(tested or not self.change.value < 1.0)
+        return bool(tested or not self.change.value < 1.0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +108,15 @@ def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> V
     """
     first, last, n = given.residual, completed.residual, len(given.robot.joint_names)
     known = first.known & last.known
-    white = WhitenedResidual(replace(first, known=known))
+    more = rms(np.sqrt(last.variance), known) > rms(np.sqrt(first.variance), known)
+    white = WhitenedResidual(
+        replace(
+            first,
+            known=known,
+            variance=np.where(more, last.variance, first.variance),
+            covariance=np.where(more, last.covariance, first.covariance),
+        )
+    )
     before, after = (
         (values**2).sum(axis=1)
         for values in (

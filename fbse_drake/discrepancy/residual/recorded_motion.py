@@ -270,9 +270,7 @@ class RecordedMotion:
             block_means(np.abs(self.steps.joint_velocity) >= least, self.length) == 1.0
         )
         kinematic = np.array([row.kind == "kinematic" for row in rows])
-        starts = [self.start, *(part["start"] for part in self.log.meta.get("segments", ()))]
-        since = self.time[:, None] - np.array(starts)
-        settling = np.any((since >= 0) & (since <= _SETTLING), axis=1)
+        settling = self.since_start <= _SETTLING
         # Nor is it known where a motor stands in its gap at first.
         begins = kinematic | np.array([row.kind == "transmission" for row in rows])
         known &= ~begins | ~settling[:, None]
@@ -290,6 +288,13 @@ class RecordedMotion:
             feet = tuple(self.robot.description.sides[foot] for foot in (one, other))
             known[:, [row.feet == feet for row in rows]] &= still[:, None]
         return known
+
+    @cached_property
+    def since_start(self) -> np.ndarray:
+        """Time of each average since its recording began, (B,) [s]."""
+        starts = [self.start, *(part["start"] for part in self.log.meta.get("segments", ()))]
+        since = self.time[:, None] - np.array(starts)
+        return np.where(since >= 0, since, np.inf).min(axis=1)
 
     def torque_variance(self, torque: np.ndarray) -> np.ndarray:
         """Variance of the white noise of a sample of torques (M, n), as the recording says it, (M,
