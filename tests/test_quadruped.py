@@ -306,7 +306,7 @@ def test_soft_ground_shows_between_point_feet(run, compliance: float):
     rows = [k for k, row in enumerate(residual.rows) if "relative_velocity" in row.name]
     known = residual.known[:, rows]
     deviation = np.sqrt(residual.variance[:, rows])[known]
-    signature = predictor.signature(GroundCompliance, "robot", np.zeros(0))
+    signature = predictor.signature(GroundCompliance, "robot", np.zeros(1))
     places = [list(signature.rows).index(k) for k in rows]
     column = signature.values[:, places, 0][known] / deviation
     value = residual.value[:, rows][known] / deviation
