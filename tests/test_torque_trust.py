@@ -14,8 +14,8 @@ from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.hygiene.hygiene import Hygiene, inspect
 from fbse_drake.discrepancy.hygiene.sanity import check_sensors
-from fbse_drake.discrepancy.hygiene.torque_readings import chance, gain
-from fbse_drake.discrepancy.residual.evidence import HygieneFinding
+from fbse_drake.discrepancy.hygiene.torque_readings import JointTorques, chance, gain
+from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
@@ -129,6 +129,26 @@ def test_a_scale_is_asserted_where_nothing_else_explains_it(arm: Course, scale: 
     assert finding.size == pytest.approx(scale, rel=0.02)
     hopeless = not 1 / 3 < scale < 3
     assert finding.severity == ("untrustworthy" if hopeless else "warning")
+
+
+def test_noise_in_what_the_model_needs_is_no_scale(arm: Course) -> None:
+    """It makes a regression of the torque find too small a scale, and noise in the torque one by
+    the torque too large a scale; between them is the true one."""
+    torques = JointTorques(Evidence(ARM.predictor(ARM.log(arm, arm.torque)).motion))
+    columns, random = torques.columns(AXIS), np.random.default_rng(0)
+
+    def scales() -> tuple[float, float]:
+        return torques.scaled(AXIS, columns).amounts[-1], torques.largest_scale(AXIS, columns)
+
+    assert scales() == pytest.approx((1.0, 1.0), abs=0.01)
+    size = torques.needed[:, AXIS].std()
+    for column in (torques.needed, torques.torque):
+        exact = column[:, AXIS].copy()
+        column[:, AXIS] += size * random.standard_normal(len(exact))
+        least, largest = scales()
+        assert 0.99 * least < 1.0 < 1.01 * largest
+        assert largest > 1.4 * least
+        column[:, AXIS] = exact
 
 
 def test_a_pendulum_s_scale_may_be_its_weight(pendulum: Course) -> None:

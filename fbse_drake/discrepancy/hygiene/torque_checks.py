@@ -178,13 +178,16 @@ def _test_scale(torques: JointTorques, k: int, joint: str, found: _Found) -> Non
     simple = simple.part([cause in ("a bias", "friction") for cause in simple.causes])
     scaled = torques.scaled(k, simple)
     torque = torques.torque[torques.known[:, k], k]
-    if not _off(scaled.amounts[-1]) or scaled.left.var() > (1 - _EXPLAINED) * torque.var():
+    if not _off(scaled.amounts[-1], torques.largest_scale(k, simple)):
+        return
+    if scaled.left.var() > (1 - _EXPLAINED) * torque.var():
         return
     if not _is_better(torques, k, scaled, torques.as_recorded(k, simple)):
         return
     columns = torques.columns(k, everything=True)
     recorded, rival = torques.as_recorded(k, columns), torques.scaled(k, columns)
-    if _off(rival.amounts[-1]) and _is_better(torques, k, rival, recorded):
+    is_off = _off(rival.amounts[-1], torques.largest_scale(k, columns))
+    if is_off and _is_better(torques, k, rival, recorded):
         found.scale[joint] = float(scaled.amounts[-1])
     else:
         found.open_scale[joint] = float(scaled.amounts[-1])
@@ -199,8 +202,9 @@ def _is_better(torques: JointTorques, k: int, rival: Reading, recorded: Reading)
     return chance(gain(recorded.left, rival.left), torques.stretches(k)) < level(torques)
 
 
-def _off(scale: float) -> bool:
-    return not 1 / _DOUBTFUL < scale < _DOUBTFUL
+def _off(least: float, largest: float) -> bool:
+    """Is a scale between these off by more than a doubtful factor?"""
+    return largest < 1 / _DOUBTFUL or least > _DOUBTFUL
 
 
 def _findings(evidence: Evidence, found: _Found) -> Iterable[HygieneFinding]:

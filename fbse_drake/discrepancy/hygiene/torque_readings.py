@@ -262,6 +262,22 @@ class JointTorques:
         scale."""
         return fitted(sign * self.torque[:, k], self._with_scale(k, columns), self.known[:, k])
 
+    def largest_scale(self, k: int, columns: Columns) -> float:
+        """The scale of a torque by what the model needs per torque rather than the other way round.
+
+        Noise in what the model needs, of the sensors of forces and motion, makes that of `scaled`
+        too small; noise in the torque makes this one too large (Frisch 1934: the scale is between
+        the two).
+        """
+        wider = Columns(
+            (*columns.causes, "the torque"),
+            np.column_stack([-columns.values, self.torque[:, k]]),
+            np.append(columns.lowest, 0.0),
+            np.append(columns.highest, np.inf),
+        )
+        per_torque = fitted(self.needed[:, k], wider, self.known[:, k]).amounts[-1]
+        return 1.0 / max(float(per_torque), 1e-300)
+
     def without_sign(self, k: int, columns: Columns) -> Reading:
         """Its absolute value alone was recorded: its sign is guessed from what fits."""
         known, wider = self.known[:, k], self._with_scale(k, columns)
