@@ -316,6 +316,29 @@ def test_soft_ground_shows_between_point_feet(run, compliance: float):
     assert rms(value - found * column) < 1.4
 
 
+def test_a_foot_at_the_limit_of_friction_is_not_known_to_stand(run):
+    """Its forces pull sideways as hard as friction holds, from 0.2 to 0.3 s: rows in which it has a
+    part are not known then, and a little before and after; all others are."""
+    log = run("quadruped_trot", *SHORT, "estimator=!NoEstimator {}")
+    config = scenario("quadruped_trot", *SHORT)
+    side = make_robot("quadruped")[0].description.sides[0]
+    name = f"foot/{side}/pad_force"
+    force = log[name].copy()
+    pulls = (log.time >= 0.2) & (log.time < 0.3)
+    force[pulls] = np.linalg.norm(force[pulls], axis=-1, keepdims=True) * [0.7, 0.0, 0.7]
+    before, after = (
+        Predictor(replace(config, model=config.robot), one).residual
+        for one in (log, Log(log.channels | {name: force}, log.meta))
+    )
+    lost = before.known & ~after.known
+    mine = np.array([side in row.feet for row in before.rows])
+    assert not lost[:, ~mine].any()
+    at = before.time - log.time[0]
+    assert before.known[(at > 0.2) & (at < 0.3)][:, mine].any()
+    assert not after.known[(at > 0.2) & (at < 0.3)][:, mine].any()
+    assert np.all(np.abs(at[lost.any(axis=1)] - 0.25) < 0.1)
+
+
 def test_four_feet_that_read_too_much_are_not_taken_for_weak_motors_and_payloads(run):
     """Alone none of the front feet explains anything."""
     gains = dict.fromkeys(make_robot("quadruped")[0].description.sides, 0.05)

@@ -297,6 +297,8 @@ class PadContact:
     dissipation: float
     # Velocity at which it creeps per tangential over normal force [m/s].
     creep: float
+    # Coulomb friction coefficient.
+    friction: float
 
     @property
     def retardation(self) -> float:
@@ -308,23 +310,21 @@ def pad_contact(description: str, ground: Ground, plant: MultibodyPlantConfig) -
     """The contact between a robot's pads and the ground, as Drake combines the two and solves it
     with these settings."""
     slides = plant.discrete_contact_approximation in _CREEPING
-    creep = (
-        plant.stiction_tolerance / _friction(description, ground)
-        if slides and ground.friction > 0
-        else 0.0
-    )
+    friction = _friction(description, ground)
+    creep = plant.stiction_tolerance / friction if slides and ground.friction > 0 else 0.0
     properties = _pad_properties(description)
     of_pad = properties.GetPropertyOrDefault("material", "point_contact_stiffness", np.inf)
     dissipation = properties.GetPropertyOrDefault(
         "material", "hunt_crossley_dissipation", ground.dissipation
     )
     if np.isinf(of_pad):
-        return PadContact(ground.stiffness, ground.dissipation, creep)
+        return PadContact(ground.stiffness, ground.dissipation, creep, friction)
     total = of_pad + ground.stiffness
     return PadContact(
         of_pad * ground.stiffness / total,
         (ground.stiffness * dissipation + of_pad * ground.dissipation) / total,
         creep,
+        friction,
     )
 
 

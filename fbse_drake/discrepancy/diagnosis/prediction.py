@@ -175,7 +175,7 @@ class Predictor:
             contact = self.pad_contact
             sinking = self._soles.sinking_variance(contact.retardation) / contact.stiffness**2
             residual = replace(residual, variance=residual.variance + sinking)
-            residual = self._soles.settled(residual, contact.retardation)
+            residual = self._soles.held(self._soles.settled(residual, contact.retardation))
         return self.doubted(residual, self._known)
 
     @cached_property

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 from pydrake.math import RotationMatrix
-from scipy.ndimage import shift
+from scipy.ndimage import binary_dilation, shift
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.residual.blocks import block_means
@@ -32,6 +32,9 @@ from fbse_drake.sensors.foot_force import force_noise
 # After so many times that by which they sink late, soles have sunk in; a load is more than this
 # [N]. A robot whose joints are slower than this share of what they usually are is at rest.
 _SINKING, _LEAST_LOAD, _AT_REST = 3.0, 1.0, 0.1
+# A sole whose tangential force is this share of the largest that friction holds may slide, and does
+# not stand for this long before and after [s].
+_AT_LIMIT, _SLIDING_ON = 0.9, 0.03
 
 
 class StandingSoles:
@@ -195,7 +198,7 @@ class StandingSoles:
         """Of the pads under the feet with the ground; without feet, the ground's own."""
         ground = self._scenario.ground
         if not self._robot.description.legs:
-            return PadContact(ground.stiffness, ground.dissipation, creep=0.0)
+            return PadContact(ground.stiffness, ground.dissipation, 0.0, ground.friction)
         return pad_contact(self._scenario.believed.description, ground, self._scenario.plant)
 
     @cached_property
@@ -255,6 +258,21 @@ class StandingSoles:
         sinking = moves[first] & (motion.since_start < _SINKING * retardation * load)
         of_soles = np.array([row.kind == "kinematic" for row in residual.rows])
         return replace(residual, known=residual.known & ~(sinking[:, None] & of_soles))
+
+    def held(self, residual: Residual) -> Residual:
+        """A residual in which rows of soles are not known while their forces are at the limit of
+        friction, where they slide as fast as they like."""
+        motion = self._motion
+        margin = 2 * round(_SLIDING_ON / (motion.length * motion.period)) + 1
+        known = residual.known.copy()
+        feet = self._split_feet(motion.signals.pad_force, retardation=0.0)
+        for side, (force, _) in zip(self._robot.description.sides, feet, strict=True):
+            x, y, normal = force[:-1].sum(axis=1).T
+            at_limit = np.hypot(x, y) > _AT_LIMIT * self.contact.friction * normal
+            slides = block_means((at_limit & (normal > _LEAST_LOAD)).astype(float), motion.length)
+            near = binary_dilation(slides > 0.5, np.ones(margin))
+            known[:, [side in row.feet for row in residual.rows]] &= ~near[:, None]
+        return replace(residual, known=known)
 
     def sinking_variance(self, retardation: float) -> np.ndarray:
         """What the noise of the force sensors puts into the predicted sinking of the soles, per
