@@ -391,6 +391,23 @@ def test_force_that_moves_against_the_motion(run: Run) -> None:
     assert all("or, as every foot shows it, the accelerometer's axes are" in f.text for f in both)
 
 
+def test_a_robot_that_trembles_has_no_wrong_forces(run: Run) -> None:
+    """At 40 Hz the accelerometer reads 3 m/s^2, and feet that are pressed by it the other way."""
+
+    def pressed(force: np.ndarray) -> np.ndarray:
+        result = force.copy()
+        result[:, :, 1] -= 15.0 * tremble[:, None] * (force[:, :, 2] > 20)
+        return result
+
+    log = run("paper_walk", "duration=2.8")
+    tremble = np.sin(2 * np.pi * 40.0 * log.time)
+    acceleration = log["imu/linear_acceleration"] + 3.0 * tremble[:, None] * [0.0, 1.0, 0.0]
+    trembling = forces(log, pressed, ("left", "right"))
+    trembling = changed(trembling, imu__linear_acceleration=acceleration)
+    found = findings(("paper_walk", "duration=2.8"), trembling)
+    assert not [f for f in found if f.kind == "force_against_motion"]
+
+
 def test_gravity_on_the_accelerometer(run: Run) -> None:
     log = run(*WALK)
     found = of_kind(

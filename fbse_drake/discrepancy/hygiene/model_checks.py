@@ -49,8 +49,8 @@ _SWAP_BLOCKS = 40
 # Static checks: share of the weight, tilt of the force [rad], share of gravity, share of the weight
 # on a foot in the air.
 _WEIGHT, _TILT, _GRAVITY, _AIR = 0.02, 0.025, 0.01, 0.01
-# Correlation below which a force moves against what is needed of it.
-_AGAINST = -0.2
+# Correlation below which a force moves against what is needed of it, of means over this long [s].
+_AGAINST, _SLOW = -0.2, 0.1
 # Fewest blocks from which something is said of a foot, and how long it takes a foot to read nothing
 # after it is lifted [s].
 _FEWEST, _SETTLED = 20, 0.1
@@ -379,8 +379,8 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
         )
         if len(evidence.sides) < 2 or alone.sum() < _FEWEST:
             continue
-        needed = np.einsum("mij,mi->mj", R_BF[alone], required[alone, 3:])
-        measured = evidence.wrenches[foot][alone, 3:]
+        of_all = np.einsum("mij,mi->mj", R_BF, required[:, 3:]), evidence.wrenches[foot][:, 3:]
+        needed, measured = (force[alone] for force in of_all)
         # Does the sole stand level, by IMU and angles? Its specific force says so.
         tilt = kinematic[alone, 6 * foot + 3 : 6 * foot + 5].mean(axis=0)
         level = np.hypot(*tilt) / motion.equation.gravity < _TILT
@@ -397,6 +397,12 @@ def check_force_frames(evidence: Evidence) -> Iterable[HygieneFinding]:
         )
         text = "{where} leans {size} from what gravity and motion need, with the load; " + cause
         yield from remarks("force_frame", "warning", f"foot/{side}", lean, "rad", text)
+        # A robot may tremble faster than its rows can show, so that neither says what it does then.
+        window = max(1, round(_SLOW / (motion.length * evidence.period)))
+        within = binary_erosion(alone, np.ones(window))
+        if within.sum() < _FEWEST:
+            continue
+        needed, measured = (uniform_filter1d(force, window, axis=0)[within] for force in of_all)
         against_motion[side] = {
             f"force_{axis}": correlation
             for k, axis in enumerate("xyz")
