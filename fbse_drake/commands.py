@@ -333,6 +333,8 @@ def _folding(title: str, header: Sequence[str]) -> Table:
 def _printed(table: ReportTable, title: str) -> Table:
     """A table of a report for the terminal; names and texts as they are."""
     shown = _folding(title, table.header)
+    if table.caption:
+        shown.caption, shown.caption_justify = Text(table.caption), "left"
     for row in table.rows:
         shown.add_row(
             *(Text(number(cell) if isinstance(cell, float) else str(cell)) for cell in row)

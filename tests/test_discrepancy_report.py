@@ -656,6 +656,15 @@ def test_one_effect_in_several_places_is_one_row_of_the_table():
     assert rival[0] == "(Coulomb friction)"
 
 
+def test_a_table_says_what_parameters_are_whose_names_do_not():
+    humped = dataclasses.replace(FRICTION, effect="StribeckFriction")
+    caption = findings_table([FRICTION, humped, humped]).caption
+    assert caption.startswith("Stribeck friction: gamma1 is friction at the start of a motion")
+    assert "; gamma4 is Coulomb friction; " in caption
+    assert caption.count("gamma4") == 1
+    assert findings_table([FRICTION, MASS]).caption == ""
+
+
 def test_detectability_is_relative_to_what_is_plausible():
     (axes,) = figures.detectability(STATUSES).axes
     dots = {

@@ -55,7 +55,10 @@ def findings_table(findings: Sequence[Finding]) -> Table:
         key = k if is_alternative else (finding.effect, finding.tentative)
         groups.setdefault(key, []).append(finding)
     shown = list(groups.values())[:_FAILURES]
-    return Table(header, tuple(_findings_row(group) for group in shown))
+    known, named = library(), dict.fromkeys(group[0].effect for group in shown)
+    meanings = {name: parameters_explained(known[name]) for name in named if name in known}
+    caption = " ".join(f"{spaced(name)}: {text}." for name, text in meanings.items() if text)
+    return Table(header, tuple(_findings_row(group) for group in shown), caption)
 
 
 def _findings_row(group: Sequence[Finding]) -> tuple[str, ...]:
@@ -248,7 +251,7 @@ def value_tables(rounds: Sequence[Sequence[Finding]]) -> list[Table]:
         if effect in known:
             says += [known[effect].description, known[effect].signature]
             if meanings := parameters_explained(known[effect]):
-                says.append(meanings)
+                says.append(f"Here {meanings}.")
         tables.append(Table(header, tuple(rows), f"{' '.join(says)} Values with 95 % intervals."))
     return tables
 
@@ -265,7 +268,7 @@ def parameters_explained(effect: type[Effect]) -> str:
     meanings = [
         f"{name} is {one.meaning}" for name, one in effect.parameters.items() if one.meaning
     ]
-    return f"Here {'; '.join(meanings)}." if meanings else ""
+    return "; ".join(meanings)
 
 
 def _value_text(estimate: Estimate) -> str:
