@@ -25,6 +25,9 @@ from fbse_drake.sensors.encoders import differentiated_noise
 from fbse_drake.signals import port_values, signals_of
 from fbse_drake.wiring import release
 
+# Samples of a log are apart by its period, but for gaps and stamps that scatter: by a factor.
+_SAME_PERIOD = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class EstimationResult(RunResult):
@@ -173,6 +176,21 @@ def _believed_sensors(scenario: Scenario, log: Log) -> SensorBeliefs:
     return scenario.believed_sensors
 
 
+def _require_period(log: Log) -> None:
+    """
+    Raises:
+        InputError: most samples are further apart, or closer together, than the log says.
+    """
+    if len(log.time) < 2:
+        return
+    said, found = float(log.meta["period"]), float(np.median(np.diff(log.time)))
+    if not 1 / _SAME_PERIOD < found / said < _SAME_PERIOD:
+        raise InputError(
+            f"meta.period: the log says {said:.4g} s, but most of its samples are {found:.4g} s "
+            "apart (`Log.part` keeps the two together)"
+        )
+
+
 def _ticks(log: Log) -> tuple[str | None, np.ndarray]:
     """The channel of joints or feet that is read most seldom, if one is not read in every row, and
     the rows in which it is. (The base moves so slowly that an IMU may be late.)"""
@@ -192,6 +210,7 @@ class Replay:
         """Builds the estimator, and others that run beside it, see `EstimatorDiagram`."""
         with located("model: "):
             robot = build_robot(scenario.believed)
+        _require_period(log)
         slowest, ticks = _ticks(log)
         # The tick that each row of the log tells of.
         self._tick_of_row = np.searchsorted(ticks[1:], np.arange(len(log.time)), side="right")

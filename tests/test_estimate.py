@@ -169,6 +169,11 @@ def test_refusals(run: Run):
         ),
         (
             WALK,
+            dataclasses.replace(log, meta={**log.meta, "period": 0.2 * log.meta["period"]}),
+            "most of its samples are 0.001 s apart",
+        ),
+        (
+            WALK,
             cut(log, slice(0, 5), **{"foot/left/pad_force": log["foot/left/pad_force"][:, :3]}),
             "expected 4 pads",
         ),
