@@ -17,6 +17,7 @@ from fbse_drake.discrepancy.hygiene.sanity import check_sensors
 from fbse_drake.discrepancy.hygiene.torque_readings import JointTorques, chance, gain
 from fbse_drake.discrepancy.residual.evidence import Evidence, HygieneFinding
 from fbse_drake.effects.friction import CoulombFriction, ViscousFriction
+from fbse_drake.effects.transmission import TorqueRipple
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.report.sentences import diagnosis_outcome
@@ -454,3 +455,17 @@ def test_a_low_pass_beyond_half_the_rate_leaves_all(pendulum: Course) -> None:
     assert np.array_equal(motion.low_passed(torque, 12.5), torque)
     assert not np.allclose(motion.low_passed(torque, 12.0), torque, atol=1e-6)
     assert diagnose(Predictor(scenario, log), [CoulombFriction]).verdict == "nothing_missing"
+
+
+@pytest.mark.parametrize(("cycles", "is_ripple"), [(4.5, False), (12.0, True)])
+def test_a_wave_longer_than_any_gear_makes_is_no_ripple(
+    arm: Course, cycles: float, is_ripple: bool
+) -> None:
+    """What an encoder of another scale leaves looks like a piece of such a wave."""
+    size = 0.1 * arm.torque[:, AXIS].std()
+    torque = arm.torque.copy()
+    torque[:, AXIS] += size * np.sin(cycles * arm.position[:, AXIS])
+    found = diagnose(ARM.predictor(ARM.log(arm, torque)), [TorqueRipple])
+    named = [finding.effect for finding in found.chosen]
+    assert named == (["TorqueRipple"] if is_ripple else [])
+    assert found.verdict == ("effect_found" if is_ripple else "unknown_effect")

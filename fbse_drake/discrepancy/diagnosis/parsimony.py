@@ -451,13 +451,13 @@ def _is_repeated(rest: Explanation, member: Candidate) -> bool:
 
 
 def _is_beyond_its_range(member: Candidate) -> bool:
-    """Is a parameter at the upper end of a range that it cannot leave? Then something else is
-    there."""
+    """Is a parameter at the upper end of a range that it cannot leave, or below it? Then something
+    else is there."""
     values = dict(zip(member.nonlinear_names, member.nonlinear, strict=True))
+    ranges = ((values[name], p) for name, p in member.parameters.items() if name in values)
     return any(
-        parameter.closed and values[name] > _AT_THE_END * parameter.plausible[1]
-        for name, parameter in member.parameters.items()
-        if name in values
+        p.closed and not p.plausible[0] <= value / _AT_THE_END <= p.plausible[1]
+        for value, p in ranges
     )
 
 
