@@ -56,10 +56,12 @@ class ContactEffect(GroundEffect):
     """Base of the contact effects, which move standing soles in proportion to their linear
     parameters."""
 
-    @staticmethod
-    def usual(contact: "PadContact") -> np.ndarray:  # noqa: ARG004
-        """Values of the nonlinear parameters, (m,), with which the effect is like this contact."""
-        return np.zeros(0)
+    @classmethod
+    def usual(cls, contact: "PadContact") -> np.ndarray:  # noqa: ARG003
+        """Values of the nonlinear parameters that are usual on this contact, (m,); by default those
+        of an effect of which nothing is said."""
+        names = [name for name, parameter in cls.parameters.items() if not parameter.linear]
+        return np.array([getattr(cls(), name) for name in names], dtype=float)
 
     @staticmethod
     def retardation_of(nonlinear: np.ndarray, contact: "PadContact") -> float:  # noqa: ARG004
@@ -208,8 +210,8 @@ class GroundCompliance(ContactEffect):
         retardation = self.retardation or ground.dissipation / ground.stiffness
         return replace(ground, stiffness=stiffness, dissipation=retardation * stiffness), plant
 
-    @staticmethod
-    def usual(contact: "PadContact") -> np.ndarray:
+    @classmethod
+    def usual(cls, contact: "PadContact") -> np.ndarray:
         return np.array([contact.retardation])
 
     @staticmethod

@@ -182,7 +182,7 @@ class Predictor:
     def _soles(self) -> StandingSoles:
         return StandingSoles(self.motion, self.scenario)
 
-    @cached_property
+    @property
     def pad_contact(self) -> PadContact:
         """Of the pads under the model's feet with its ground."""
         return self._soles.contact
@@ -549,8 +549,9 @@ class Predictor:
         if issubclass(effect, JointTorqueEffect):
             return elsewhere
         if issubclass(effect, ContactEffect):
-            of_soles = self.signature(effect, target, nonlinear)
-            return replace(elsewhere, values=of_soles.values, offset=of_soles.offset)
+            at, soles = elsewhere.rows, self._soles
+            values, offset = soles.columns(effect, nonlinear), soles.offset(effect, nonlinear)
+            return replace(elsewhere, values=values[:, at], offset=offset[:, at])
         values, offset = self._slopes(effect, target, linear, nonlinear)
         rows, lowest = elsewhere.rows, elsewhere.lowest
         if issubclass(effect, InertiaEffect):

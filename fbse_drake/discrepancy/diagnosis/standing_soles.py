@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation, shift
 from scipy.spatial.transform import Rotation
 
 from fbse_drake.discrepancy.residual.blocks import block_means
+from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.discrepancy.residual.residual import Residual, rms
 from fbse_drake.discrepancy.residual.rows import foot_pairs
@@ -35,6 +36,8 @@ _SINKING, _LEAST_LOAD, _AT_REST = 3.0, 1.0, 0.1
 # A sole whose tangential force is this share of the largest that friction holds may slide, and does
 # not stand for this long before and after [s].
 _AT_LIMIT, _SLIDING_ON = 0.9, 0.03
+# So many predictions of an effect are kept.
+_KEPT = 4
 
 
 class StandingSoles:
@@ -44,6 +47,8 @@ class StandingSoles:
         self._motion, self._scenario, self._robot = motion, scenario, motion.robot
         # Blocks and rows of the residual.
         self._shape = len(motion.time), len(motion.rows)
+        # By effect and retardation: a search for one asks for the model's own again and again.
+        self._predicted: Memory[np.ndarray] = Memory(_KEPT)
 
     def columns(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
         """What an effect adds to the residual per unit of each of its linear parameters, by the
@@ -52,7 +57,9 @@ class StandingSoles:
         Args:
             nonlinear: values of its nonlinear parameters, shape (m,).
         """
-        return self._columns(effect, nonlinear, self._motion.signals.pad_force)
+        late = effect.retardation_of(nonlinear, self.contact)
+        force = self._motion.signals.pad_force
+        return self._predicted.or_made((effect, late), lambda: self._columns(effect, late, force))
 
     def offset(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
         """What an effect adds whatever its linear parameters are, (B, R): the soles sink into
@@ -72,16 +79,16 @@ class StandingSoles:
 
     def noise_in(self, effect: type[ContactEffect], nonlinear: np.ndarray) -> np.ndarray:
         """What noise that is added to the measured forces once more adds to these columns."""
-        noisier = self._columns(effect, nonlinear, self._noisier_force)
-        return noisier - self.columns(effect, nonlinear)
+        late = effect.retardation_of(nonlinear, self.contact)
+        return self._columns(effect, late, self._noisier_force) - self.columns(effect, nonlinear)
 
     def _columns(
-        self, effect: type[ContactEffect], nonlinear: np.ndarray, pad_force: np.ndarray
+        self, effect: type[ContactEffect], retardation: float, pad_force: np.ndarray
     ) -> np.ndarray:
         if not self._robot.has_floating_base:
             linear = [parameter for parameter in effect.parameters.values() if parameter.linear]
             return np.zeros((*self._shape, len(linear)))
-        forces = self._split_feet(pad_force, effect.retardation_of(nonlinear, self.contact))
+        forces = self._split_feet(pad_force, retardation)
         motions = [effect.sole_motion(force, pads, self._sample_time) for force, pads in forces]
         columns = [
             self._sole_rows([(r[k], d[k]) for r, d in motions]) for k in range(len(motions[0][0]))

@@ -178,9 +178,9 @@ def _test_scale(torques: JointTorques, k: int, joint: str, found: _Found) -> Non
     simple = simple.part([cause in ("a bias", "friction") for cause in simple.causes])
     scaled = torques.scaled(k, simple)
     torque = torques.torque[torques.known[:, k], k]
-    if not _off(scaled.amounts[-1], torques.largest_scale(k, simple)):
-        return
     if scaled.left.var() > (1 - _EXPLAINED) * torque.var():
+        return
+    if not _off(scaled.amounts[-1], torques.largest_scale(k, simple)):
         return
     if not _is_better(torques, k, scaled, torques.as_recorded(k, simple)):
         return

@@ -53,6 +53,15 @@ class Columns:
     lowest: np.ndarray
     highest: np.ndarray
 
+    def beside(self, cause: str, column: np.ndarray) -> "Columns":
+        """With one more, (B,), the last, of which there is no negative amount."""
+        return Columns(
+            (*self.causes, cause),
+            np.column_stack([self.values, column]),
+            np.append(self.lowest, 0.0),
+            np.append(self.highest, np.inf),
+        )
+
     def part(self, chosen: list[bool]) -> "Columns":
         """Some of them."""
         causes = tuple(c for c, wanted in zip(self.causes, chosen, strict=True) if wanted)
@@ -269,12 +278,8 @@ class JointTorques:
         too small; noise in the torque makes this one too large (Frisch 1934: the scale is between
         the two).
         """
-        wider = Columns(
-            (*columns.causes, "the torque"),
-            np.column_stack([-columns.values, self.torque[:, k]]),
-            np.append(columns.lowest, 0.0),
-            np.append(columns.highest, np.inf),
-        )
+        taken = replace(columns, values=-columns.values)
+        wider = taken.beside("the torque", self.torque[:, k])
         per_torque = fitted(self.needed[:, k], wider, self.known[:, k]).amounts[-1]
         return 1.0 / max(float(per_torque), 1e-300)
 
@@ -300,12 +305,7 @@ class JointTorques:
 
     def _with_scale(self, k: int, columns: Columns) -> Columns:
         """With what the model needs as the last column."""
-        return Columns(
-            (*columns.causes, "what the model needs"),
-            np.column_stack([columns.values, self.needed[:, k]]),
-            np.append(columns.lowest, 0.0),
-            np.append(columns.highest, np.inf),
-        )
+        return columns.beside("what the model needs", self.needed[:, k])
 
 
 def causes_of(reading: Reading, columns: Columns, known: np.ndarray) -> list[str]:
