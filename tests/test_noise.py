@@ -290,6 +290,18 @@ def test_what_is_as_believed_or_no_noise_is_not_taken_for_more_noise(
     assert likeliest_noise(left_in_a_row(0.05, 0.0, 3), 5, []) is None
 
 
+def test_jolts_are_no_noise() -> None:
+    """Impacts now and then, at random, are white too; their tails are none of noise."""
+    random = np.random.default_rng(5)
+    for jolt, is_noise in ((0.0, True), (15.0, False)):
+        residual = left_in_a_row(0.05, 0.0, 3)
+        hit = random.random(len(residual.time)) < 0.01
+        value = residual.value.copy()
+        value[:, 0] += jolt * random.standard_normal(len(hit)) * hit
+        found = likeliest_noise(replace(residual, value=value), 5, [0])
+        assert (found is not None) == is_noise
+
+
 def test_sensors_may_be_less_noisy_than_they_look() -> None:
     """Noise of a filtered velocity is measured where it is loudest. What white noise there is
     beside shows all the same."""

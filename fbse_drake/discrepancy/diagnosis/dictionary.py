@@ -288,20 +288,26 @@ class Dictionary:
 
     def points(self, effect: type[JointTorqueEffect]) -> np.ndarray:
         """First grid of an effect's nonlinear values for each joint, (m, G, n)."""
-        return np.stack([self._points_on(effect, joint) for joint in self.joints], axis=2)
+        of_joint = [
+            [p for p in self.parameters(effect, joint).values() if not p.linear]
+            for joint in self.joints
+        ]
+        # All joints have as many, though a value may be known well enough in some.
+        grids = [max(p.grid for p in alike) for alike in zip(*of_joint, strict=True)]
+        return np.stack([self._points_on(searched, grids) for searched in of_joint], axis=2)
 
-    def _points_on(self, effect: type[JointTorqueEffect], joint: str) -> np.ndarray:
-        """The same of one joint, (m, G)."""
-        searched = [p for p in self.parameters(effect, joint).values() if not p.linear]
+    @staticmethod
+    def _points_on(searched: Sequence[Parameter], grids: Sequence[int]) -> np.ndarray:
+        """The same of one joint, (m, G), whose axes have grids of these sizes."""
         if not searched:
             return np.zeros((0, 1))
-        most = {0: 1, 1: Parameter.grid, 2: 5}.get(sum(p.grid > 1 for p in searched), 3)
+        most = {0: 1, 1: Parameter.grid, 2: 5}.get(sum(grid > 1 for grid in grids), 3)
         # What needs more than the usual points needs them beside others too.
         axes = [
-            np.geomspace(*p.plausible, p.grid if p.grid > Parameter.grid else min(most, p.grid))
-            if p.grid > 1
+            np.geomspace(*p.plausible, grid if grid > Parameter.grid else min(most, grid))
+            if grid > 1
             else np.sqrt(np.prod(p.plausible, keepdims=True))
-            for p in searched
+            for p, grid in zip(searched, grids, strict=True)
         ]
         return np.array(list(itertools.product(*axes))).T
 

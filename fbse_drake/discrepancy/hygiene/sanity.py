@@ -18,9 +18,10 @@ from fbse_drake.errors import InputError
 _TOLERANCE = 0.3
 # A torque that is so many times what the model needs is in another unit.
 _ANOTHER_UNIT = 20.0
-# Angles beyond this, or this many times as large as the joint's limits and beyond them by so much,
-# are no angles in radians [rad].
-_LARGEST_ANGLE, _BEYOND_LIMITS, _BEYOND = 4 * np.pi, 3.0, 1.0
+# Angles this many times as large as the joint's limits and beyond them by so much are no angles in
+# radians [rad]; nor, of a joint without limits, beyond this if it is so fast on the mean [rad/s].
+_BEYOND_LIMITS, _BEYOND = 3.0, 1.0
+_LARGEST_ANGLE, _LARGEST_RATE = 4 * np.pi, 20.0
 # A joint that moves less than this, root mean square, says nothing about its second encoder [rad].
 _SMALLEST_MOTION = 0.05
 # A base that turns less than this, root mean square, says nothing about its gyroscope [rad/s].
@@ -51,13 +52,19 @@ def check_sensors(motion: RecordedMotion, evidence: Evidence | None = None) -> N
 
 def _check_angles(motion: RecordedMotion) -> None:
     robot = motion.robot
-    largest = np.abs(motion.signals.joint_position).max(axis=0)
-    for joint, angle in zip(robot.joint_names, largest, strict=True):
+    angles = motion.signals.joint_position
+    largest = np.abs(angles).max(axis=0)
+    # So long an average that no digit of an encoder counts.
+    length = motion.length
+    rates = np.abs(np.diff(angles[::length], axis=0)).mean(axis=0) / (length * motion.period)
+    for joint, angle, rate in zip(robot.joint_names, largest, rates, strict=True):
         model = robot.plant.GetJointByName(joint)
         if model.type_name() != RevoluteJoint.kTypeName:
             continue
         limit = float(max(-model.position_lower_limits()[0], model.position_upper_limits()[0]))
-        if angle > _LARGEST_ANGLE or angle > max(_BEYOND_LIMITS * limit, limit + _BEYOND):
+        is_beyond = angle > max(_BEYOND_LIMITS * limit, limit + _BEYOND)
+        spins = not np.isfinite(limit) and angle > _LARGEST_ANGLE and rate > _LARGEST_RATE
+        if is_beyond or spins:
             allowed = f" (the model's limit is {limit:.2g} rad)" if np.isfinite(limit) else ""
             raise InputError(
                 f"channel joint/position: {joint} reaches {angle:.3g} "

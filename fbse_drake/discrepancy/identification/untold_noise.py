@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cholesky_banded, solve_banded
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.stats import chi2, kurtosis
 
 from fbse_drake.discrepancy.identification.structure import is_white
 from fbse_drake.discrepancy.residual.noise import Noise
@@ -19,6 +19,9 @@ _NO_SHARE, _SHARE = 1e-9, 1e-2
 # Logarithms of the least that there may be of what is believed, for noise of a velocity that is
 # filtered is measured where it is loudest, and of more than there is in any log.
 _LEAST, _MOST = -3.0, 30.0
+# Noise has no such tails: that much excess kurtosis is of jolts, as of a gear that is hit. (What
+# stiction leaves has some 8.)
+_JOLTS = 20.0
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 
@@ -84,7 +87,8 @@ class _Left:
 
     def is_noise(self, more: float, beside: float) -> bool:
         """Is nothing but that noise left?"""
-        return is_white(self.whitened(more, beside), len(self.value))
+        left = self.whitened(more, beside)
+        return is_white(left, len(left)) and float(kurtosis(left)) < _JOLTS
 
     def deviance(self, more: float, beside: float) -> float:
         """With that noise."""
