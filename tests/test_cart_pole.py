@@ -1,5 +1,5 @@
-"""A cart on a rail with a pole that nothing drives: a joint that slides, one that turns as far as it
-likes, and a motor's inertia that the model knows in one of them only.
+"""A cart on a rail with a pole that nothing drives: a joint that slides, one that turns as far as
+it likes, and a motor's inertia that the model knows in one of them only.
 
 The logs come from the equations of motion written down by hand.
 """
@@ -134,5 +134,3 @@ def test_a_joint_without_limits_may_go_round(scenario: Scenario) -> None:
     }
     with pytest.raises(InputError, match="are these degrees"):
         check_sensors(Predictor(scenario, replace(log, channels=log.channels | channels)).motion)
-
-

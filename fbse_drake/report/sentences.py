@@ -229,6 +229,28 @@ def _partly(diagnosis: Diagnosis) -> str:
     )
 
 
+def _explaining_as_well(found: Sequence[Finding]) -> dict[tuple[str, ...], list[Finding]]:
+    """Findings by the effects that explain the log as well, as far as there are any."""
+    equal: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in found:
+        if finding.confusable_with:
+            equal.setdefault(finding.confusable_with, []).append(finding)
+    return equal
+
+
+def _doubt(found: Sequence[Finding]) -> str:
+    """Says which effects the log cannot tell from which others."""
+    equal = _explaining_as_well(found)
+    if not equal:
+        return ""
+    told = (
+        f"{'that' if len(findings) == len(found) else listed_effects(findings)} "
+        f"from {either_effect(names)}"
+        for names, findings in equal.items()
+    )
+    return f"; this log cannot tell {', nor '.join(told)}"
+
+
 def _surplus(findings: Sequence[Finding]) -> str:
     """Says that the model has too much of what cannot be negative by itself but was found so."""
     is_surplus = any(
@@ -243,10 +265,7 @@ def _surplus(findings: Sequence[Finding]) -> str:
 def _verdict(diagnosis: Diagnosis) -> str:
     found = listed_effects(diagnosis.chosen)
     if diagnosis.verdict == "effect_found":
-        doubtful = dict.fromkeys(
-            name for finding in diagnosis.chosen for name in finding.confusable_with
-        )
-        doubt = f"; this log cannot tell that from {either_effect(doubtful)}" if doubtful else ""
+        doubt = _doubt(diagnosis.chosen)
         if is_refuted(diagnosis.set_aside):
             return f"{_suggested(found)}{doubt}.{_tentative(diagnosis.tentative)}"
         text = f"The model lacks {found}{doubt}.{_surplus(diagnosis.chosen)}"
@@ -302,10 +321,12 @@ def _tentative(findings: Sequence[Finding]) -> str:
     if not findings:
         return ""
     listed = listed_effects(findings)
-    what, each = ("it", "it takes") if len(findings) == 1 else ("them", "each of them takes")
+    what, each, its = (
+        ("it", "it takes", "its") if len(findings) == 1 else ("them", "each of them takes", "their")
+    )
     return (
         f" Tentative: {listed}. The completed model has {what}, but more is left there than {each} "
-        "off, so something else may be missing in its place."
+        f"off, or {its} size may be none, so something else may be missing in its place."
     )
 
 
@@ -596,14 +617,10 @@ def what_else(found: Sequence[Finding], *, partial: bool) -> str:
     """What explains the log as well."""
     if partial:
         return "The search ended before other effects of the library were compared."
-    equal: dict[tuple[str, ...], list[Finding]] = {}
-    for finding in found:
-        equal.setdefault(finding.confusable_with, []).append(finding)
     told = [
         f"{as_sentence(either_effect(names))[:-1]} explains this log as well as "
         f"{listed_effects(findings)}."
-        for names, findings in equal.items()
-        if names
+        for names, findings in _explaining_as_well(found).items()
     ]
     if told:
         return " ".join(told)

@@ -240,7 +240,11 @@ def diagnose(
         c: fits.explain([other for other in final.candidates if other is not c])
         for c in final.candidates
     }
-    named = [c for c in matters if _takes_most(white, without[c], final, c)]
+    named = [
+        c
+        for c in matters
+        if _takes_most(white, without[c], final, c) and not _may_be_none(final, c)
+    ]
     tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
@@ -351,10 +355,17 @@ def _takes_most(
     most = np.array([tolerated(white, row) for row in rows])
     left = np.where(after > most**2 * count, after - count, 0.0)
     taken = np.maximum(before - after, 0.0)
-    if not left.any():
-        return True
     share = taken / np.maximum(taken + left, 1e-30)
     return bool(taken.any() and np.average(share, weights=taken) >= _MOSTLY)
+
+
+def _may_be_none(final: Explanation, member: Candidate) -> bool:
+    """Does the interval of a size that is none at zero hold zero, as a gap's may?"""
+    _, intervals = final.values(member)
+    return any(
+        member.parameters[name].neutral == 0.0 and intervals[name][0] <= 0.0
+        for name in member.nonlinear_names
+    )
 
 
 def _members(
@@ -375,10 +386,31 @@ def _members(
     for k in sorted(places, key=lambda k: -without[final.candidates[k]].deviance):
         member = final.candidates[k]
         names = tuple(dict.fromkeys(rival_name(e.candidates[-1], member) for e in equal.get(k, ())))
-        finding = finding_of(
-            fits.white, without[member], final, member, names, chosen=member in named
-        )
-        yield member, replace(finding, spread=spread.get(member, {}))
+        finding = finding_of(fits.white, without[member], final, member, (), chosen=member in named)
+        names = tuple(dict.fromkeys((*names, *smaller_laws(member, finding.parameters))))
+        yield member, replace(finding, confusable_with=names, spread=spread.get(member, {}))
+
+
+def smaller_laws(member: Candidate, found: Mapping[str, Estimate]) -> tuple[str, ...]:
+    """Effects of the library that a law turns into at values that the log does not exclude, or that
+    are as good as there: friction that builds up within a displacement smaller than any real one
+    holds a joint that rests, as Coulomb friction does.
+
+    The law was kept, for the smaller one at its usual values leaves more.
+    """
+    if not issubclass(member.effect, JointTorqueEffect):
+        return ()
+
+    def is_there(name: str, value: float) -> bool:
+        estimate, parameter = found[name], member.parameters[name]
+        (low, high), rounding = estimate.interval, max(0.0, parameter.bounds[0])
+        is_smaller = not parameter.linear and value < estimate.value <= parameter.plausible[0]
+        return low - rounding <= value <= high or is_smaller
+
+    for reduction in member.effect.reductions:
+        if all(is_there(name, value) for name, value in reduction.at.items()):
+            return tuple(effect.__name__ for effect in reduction.effects)
+    return ()
 
 
 def _late_findings(late: LateTorques) -> list[Finding]:
