@@ -150,6 +150,18 @@ def test_friction_of_a_walk_with_a_foot_that_reads_wrong(run: Run, share: float)
     assert found == pytest.approx(-100 * share, abs=0.3)
 
 
+def test_a_foot_that_reads_far_too_little_does_not_make_the_imu_suspect(run: Run):
+    """A share of what the foot carries is what accelerometer and feet always contradict each other
+    by: nobody is doubted for it, and the velocity is as good as with feet that read right."""
+    effect = "robot.effects.gain=!FootForceGain {gain: {left: -0.12}}"
+    log = run("paper_walk_fbse", "duration=3", effect)
+    assert not log["estimate/sensors/status"].any()
+    later = log.time > 1.0
+    error = (log["estimate/base/velocity"] - log["truth/base/velocity"])[later]
+    assert rms(error) < 1e-3
+    assert coverage(log) > 0.98
+
+
 @pytest.mark.parametrize(
     "override",
     [

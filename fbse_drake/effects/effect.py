@@ -90,8 +90,8 @@ class Parameter:
     grid: int = 9
     # For a nonlinear one: share of its value within which slopes over it hold.
     linear_within: float = np.inf
-    # For a nonlinear one: the value with which there is no effect; targets that are not named get
-    # it.
+    # The value with which there is no effect, whatever the others are; targets that are not named
+    # get it, if it is of a nonlinear one.
     neutral: float | None = None
     # For a linear one: what is believed of it beforehand is 0 with this standard deviation, so that
     # a log which does not show it does not make it large; by default nothing is believed.

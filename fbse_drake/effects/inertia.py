@@ -241,7 +241,7 @@ class Payload(InertiaEffect):
     linear_nearby: ClassVar[bool] = True
     parts: ClassVar[tuple[type[InertiaEffect], ...]] = (BodyMass, BodyCentreOfMass)
     parameters: ClassVar[dict[str, Parameter]] = {
-        "mass": Parameter("kg", linear=True, plausible=(0.0, 10.0)),
+        "mass": Parameter("kg", linear=True, plausible=(0.0, 10.0), neutral=0.0),
         **{
             axis: Parameter(
                 "m", linear=True, plausible=(-0.5, 0.5), bounds=(-np.inf, np.inf), belief=0.5

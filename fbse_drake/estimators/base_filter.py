@@ -120,6 +120,9 @@ _LOST_AFTER = 0.25
 _LOST_AGAIN, _LOST_LONG = 3.0, 0.75
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
+# When all feet slide that carry more than this share of the weight, for how long they do until the
+# velocity is as uncertain as they are fast, and how long a wrong tilt takes to make that [s].
+_FIRM_SHARE, _SLIDING_TIME, _TILT_TIME = 0.3, 0.1, 0.5
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 
@@ -376,7 +379,7 @@ def _estimate_base(
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
-    all_move, resting, least_moved = True, False, math.inf
+    all_move, resting, least_moved, least_slides = True, False, math.inf, math.inf
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
@@ -384,10 +387,12 @@ def _estimate_base(
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
             pivot = centre_of_pressure(wrench[foot], known.soles[foot])
-            moves = listen_to_foot(
+            moves, slides = listen_to_foot(
                 x, P, correction, foot, share, pivot, w_raw, model, elapsed, known
             )
             all_move, resting = all_move and moves, True
+            if share > _FIRM_SHARE:
+                least_slides = min(least_slides, slides)
             least_moved = min(least_moved, norm(vector(x.foot_agreement[foot, FOOT_VELOCITY])))
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
@@ -435,6 +440,11 @@ def _estimate_base(
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     correct(x, correction)
+    if least_slides < math.inf:
+        # Whoever is wrong, the velocity is not known better than that, nor the tilt that makes it.
+        unknown = least_slides * elapsed / _SLIDING_TIME
+        add_noise(P, VELOCITY, unknown)
+        add_noise(P, ATTITUDE, unknown / (9.81 * _TILT_TIME) ** 2)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
     if not first:
@@ -570,11 +580,11 @@ class InvariantBaseFilter(RecursiveEstimator):
         check                  what `cross_check` remembers: `doubt` (1 + feet,), positive for the
                                IMU and the feet that contradict the rest; `mean` (2, 3, 3) and
                                `load` (2, feet, 3) of the last 10 ms and 50 ms; `spread`; `rolling`
-                               (3,); `habit` (3,), what always contradicts; `last_rate`,
-                               `last_rolling` (3,) and `was_firm` of the tick before; `stepped`,
-                               `age`, `habit_age` and `agreed`, for how long the gyro is doubted for
-                               its step, all is watched, the habit is learned, and nothing
-                               contradicts [s]
+                               (3,); `habit` (3 + feet,), what always contradicts: an acceleration
+                               and a share of what each foot carries, and `habit_covariance`;
+                               `last_rate`, `last_rolling` (3,) and `was_firm` of the tick before;
+                               `stepped`, `age` and `agreed`, for how long the gyro is doubted for
+                               its step, all is watched, and nothing contradicts [s]
         force_delay            what `watch_force_delay` remembers: the `delay` of the foot forces
                                [s], and more, see `force_delay_type`
         force_lag              what `watch_force_lag` remembers: the `time_constant` of the foot

@@ -25,9 +25,14 @@ from fbse_drake.estimators.standing_foot import centre_of_pressure
 # sensors are believed again.
 _BRIEF, _LONG, _AGREED = 0.01, 0.05, 0.02
 # By how much accelerometer, joints and foot forces may contradict each other: sensors that are 6 %
-# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; how
-# long it takes to learn what they always do [s].
-_CONTRADICTION, _TIMING, _HABIT_TIME = 0.6, 0.3, 5.0
+# off in a robot at rest [m/s^2], and the share of what changes over `_BRIEF` that 3 ms make; and
+# how many standard deviations of what they always do.
+_CONTRADICTION, _TIMING, _HABIT_DOUBT = 0.6, 0.3, 3.0
+# What they always do is an acceleration and a share of what each foot carries. How large these are
+# at first, and how they wander: [m/s^2], [m/s^2/sqrt(s)]; [1], [1/sqrt(s)].
+_HABIT, _HABIT_WALK, _GAIN, _GAIN_WALK = 1.0, 0.01, 0.1, 0.01
+# What else they usually contradict each other by [m/s^2], and for how long it lasts [s].
+_USUAL, _USUAL_TIME = 0.2, 0.05
 # The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
 _ROLLING, _FIRM_SHARE = 0.4, 0.3
 # A foot rolls over an edge of its sole, where its load is then: beyond this share of the way there
@@ -49,14 +54,14 @@ def cross_check_type(feet: int, clock: Clock) -> np.dtype:
         mean=(2, 3, 3),
         load=(2, feet, 3),
         rolling=(3,),
-        habit=(3,),
+        habit=(3 + feet,),
+        habit_covariance=(3 + feet, 3 + feet),
         last_rate=(3,),
         last_rolling=(3,),
         was_firm=(),
         stepped=(),
         spread=(),
         age=(),
-        habit_age=(),
         agreed=(),
     )
 
@@ -145,8 +150,8 @@ def cross_check(
     x.was_firm = 1.0 if rests else 0.0
     put(x.last_rate, rate)
     put(x.last_rolling, rolling)
-    z = subtract(add(vector(x.mean[0, 0]), vector(x.mean[0, 1])), vector(x.mean[0, 2]))
-    excess = norm(subtract(z, vector(x.habit))) - _TIMING * math.sqrt(x.spread)
+    z, doubt = _unusual(x, 0)
+    excess = norm(z) - _TIMING * math.sqrt(x.spread) - _HABIT_DOUBT * doubt
     is_late = 0.0 < x.stepped < _PATIENCE
     turns = norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
     turns = turns or (is_late and not rests)
@@ -160,11 +165,53 @@ def cross_check(
             _blame(x, turns)
     if x.agreed > _AGREED:
         x.doubt[:], x.stepped = 0.0, 0.0
-    if x.doubt.max() == 0:
-        x.habit_age += elapsed
-        gain = elapsed / min(_HABIT_TIME, x.habit_age)
-        for i in range(3):
-            x.habit[i] += gain * (z[i] - x.habit[i])
+    _learn_habit(x, x.doubt.max() == 0, elapsed)
+
+
+@njit(cache=True)
+def _unusual(x: np.ndarray, span: int) -> tuple[Vector, float]:
+    """What contradicts that does not always [m/s^2], and how sure that is: its standard deviation.
+
+    Args:
+        span: 0 for the last `_BRIEF`, 1 for the last `_LONG`.
+    """
+    z = subtract(add(vector(x.mean[span, 0]), vector(x.mean[span, 1])), vector(x.mean[span, 2]))
+    habit = vector(x.habit)
+    for foot in range(len(x.doubt) - 1):
+        habit = add(habit, scale(x.habit[3 + foot], vector(x.load[span, foot])))
+    variance = 0.0
+    for i in range(3):
+        h = _habit_row(x, span, i)
+        variance += h @ x.habit_covariance @ h
+    return subtract(z, habit), math.sqrt(max(variance, 0.0))
+
+
+@njit(cache=True)
+def _habit_row(x: np.ndarray, span: int, i: int) -> np.ndarray:
+    """How what contradicts along an axis depends on the habit."""
+    h = np.zeros(len(x.habit))
+    h[i] = 1.0
+    h[3:] = x.load[span, :, i]
+    return h
+
+
+@njit(cache=True)
+def _learn_habit(x: np.ndarray, learns: bool, elapsed: float) -> None:
+    """A Kalman filter of what sensors always contradict each other by; of sensors that are doubted
+    it only forgets."""
+    P = x.habit_covariance
+    for i in range(len(P)):
+        deviation, walk = (_HABIT, _HABIT_WALK) if i < 3 else (_GAIN, _GAIN_WALK)
+        P[i, i] = deviation**2 if P[i, i] == 0.0 else P[i, i] + walk**2 * elapsed
+    if not learns:
+        return
+    noise = _USUAL**2 * max(1.0, 2.0 * _USUAL_TIME / elapsed)
+    for i in range(3):
+        h, z = _habit_row(x, 0, i), x.mean[0, 0, i] + x.mean[0, 1, i] - x.mean[0, 2, i]
+        shared = P @ h
+        gain = shared / (h @ shared + noise)
+        x.habit[:] += gain * (z - h @ x.habit)
+        P -= np.outer(gain, shared)
 
 
 @njit(cache=True)
@@ -179,8 +226,7 @@ def force_contradiction(x: np.ndarray, largest: Vector) -> float:
     """
     if x.age < _LONG:
         return 0.0
-    z = subtract(add(vector(x.mean[1, 0]), vector(x.mean[1, 1])), vector(x.mean[1, 2]))
-    z = subtract(z, vector(x.habit))
+    z, _ = _unusual(x, 1)
     for i in range(3):
         if abs(z[i]) > largest[i]:
             return norm(z)

@@ -1,4 +1,6 @@
-"""Which friction laws are learned from a tick, and what they may not be."""
+"""Which friction laws are learned from a tick, how far they hold, and what they may not be."""
+
+import math
 
 import numpy as np
 from numba import njit
@@ -77,6 +79,39 @@ def forget_unproven(x: Record, T: float, known: Record) -> None:
 
 
 @njit(cache=True)
+def remember_speeds(x: Record, velocity: np.ndarray, learning: np.ndarray) -> None:
+    """Keeps the highest speed that has taught each law, `fastest`, and its friction there.
+
+    Args:
+        velocity: of the joints in this tick (n,) [rad/s].
+        learning: see `learning_states`.
+    """
+    n, m = x.weights.shape
+    for joint in range(n):
+        speed = abs(velocity[joint])
+        if learning[len(learning) + m * (joint - n)] > 0.0 and speed > x.fastest[joint]:
+            x.fastest[joint], x.at_fastest[joint] = speed, abs(x.friction_there[joint])
+
+
+@njit(cache=True)
+def beyond_known_speeds(x: Record, joint: int, velocity: float, known: Record) -> float:
+    """Standard deviation of a law's friction at a speed above those that taught it [Nm].
+
+    Its parameters' covariance takes its form for granted. Friction that is known up to a speed goes
+    on between Coulomb's, which stays as it is, and viscous, which grows with the speed; but nothing
+    is known less than at the start.
+    """
+    beyond = abs(velocity) - x.fastest[joint]
+    if beyond <= 0.0 or x.fastest[joint] == 0.0:
+        return 0.0
+    first = 0.0
+    for j in range(x.weights.shape[1]):
+        first += x.regressor[joint, j] ** 2 * known.weight_variance[j]
+    grown = 0.5 * x.at_fastest[joint] * beyond / x.fastest[joint]
+    return min(grown, math.sqrt(first))
+
+
+@njit(cache=True)
 def _is_known(x: Record, joint: int, times: float, known: Record) -> bool:
     """Is a joint's law, where it is asked, known so many times as well as at the start?"""
     n, m = x.weights.shape
@@ -130,6 +165,7 @@ def _forget_law(x: Record, joint: int, known: Record) -> None:
     P, (n, m) = x.covariance, x.weights.shape
     first = len(P) + m * (joint - n)
     x.weights[joint], x.settled[joint] = known.weights[joint], known.weights[joint]
+    x.fastest[joint], x.at_fastest[joint] = 0.0, 0.0
     for at in range(first, first + m):
         P[at], P[:, at] = 0.0, 0.0
         P[at, at] = known.weight_variance[at - first]

@@ -40,10 +40,12 @@ from fbse_drake.estimators.implicit_friction import (
 from fbse_drake.estimators.imu_noise import imu_noise_type, watch_noise
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
 from fbse_drake.estimators.law_learning import (
+    beyond_known_speeds,
     forget_laws,
     forget_unproven,
     learning_states,
     make_dissipative,
+    remember_speeds,
 )
 from fbse_drake.estimators.link_torque import watch_forces, wrench_variance
 from fbse_drake.estimators.missing_inertia import (
@@ -349,6 +351,7 @@ def _update(
     excess, weight, correction = judge(x, last, missed, T, known)
     learning = learning_states(x, last, known)
     listen(x, excess, weight, learning, T, known)
+    remember_speeds(x, tick.velocity, learning)
     listen_to_feet(x, last, then, measured, learning, T, known)
     watch_corrections(x, last, A, correction, expected, T)
     acceleration = (x.velocity - last.velocity) / T
@@ -465,6 +468,7 @@ def _finish(
         # However wrong the velocity may be, the law says no more than it ever has.
         by_velocity = min(ratio * by_velocity, (by_law + x.largest[joint]) ** 2)
         variance = max(0.0, ratio * variance + by_velocity)
+        variance += beyond_known_speeds(x, joint, velocity_now[joint], known) ** 2
         x.friction_std[joint] = math.sqrt(variance + x.doubt[joint] ** 2)
         x.missing_inertia[joint] = x.weights[joint, m - 1]
         x.missing_inertia_std[joint] = math.sqrt(max(0.0, P[first + m - 1, first + m - 1]))
@@ -542,6 +546,8 @@ class WholeBodyFilter(RecursiveEstimator):
         law_velocity, friction_there, slope, regressor   the law where it was linearised
         steepest                 (n,)    the largest slope of late [Nm s/rad]
         largest                  (n,)    the largest friction by the law so far [Nm]
+        fastest, at_fastest      (n,)    the highest speed that taught the law [rad/s], and the
+                                         friction there [Nm]
     """
 
     def __init__(
@@ -571,6 +577,7 @@ class WholeBodyFilter(RecursiveEstimator):
         per_row += ["bend_noise", "reading_step", "reading", "pushed", "agreement", "contradiction"]
         per_joint = ["friction", "friction_std", "link_torque", "residual", "joint_acceleration"]
         per_joint += ["doubt", "rested", "proven", "law_velocity", "friction_there", "largest"]
+        per_joint += ["fastest", "at_fastest"]
         per_joint += ["slope", "steepest", "missing_inertia", "missing_inertia_std"]
         posterior_type = record_type(
             time=(),

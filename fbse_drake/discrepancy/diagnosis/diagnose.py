@@ -360,11 +360,12 @@ def _takes_most(
 
 
 def _may_be_none(final: Explanation, member: Candidate) -> bool:
-    """Does the interval of a size that is none at zero hold zero, as a gap's may?"""
+    """Does the interval of a size without which there is no effect hold zero, as a gap's may, or
+    the mass of a payload?"""
     _, intervals = final.values(member)
     return any(
-        member.parameters[name].neutral == 0.0 and intervals[name][0] <= 0.0
-        for name in member.nonlinear_names
+        parameter.neutral == 0.0 and intervals[name][0] <= 0.0 <= intervals[name][1]
+        for name, parameter in member.parameters.items()
     )
 
 

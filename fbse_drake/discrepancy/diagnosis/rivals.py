@@ -111,8 +111,9 @@ def indistinguishable(
     bound is no parameter of a rival: a payload without extent is a weight at a place.
     """
     judge = Judge(fits, final)
-    # Rivals are taken at what laws of their kind attain.
-    least_left = attained(fits, final).deviance
+    # Rivals are taken at what laws of their kind attain; so is the final explanation.
+    by_slopes = fits.explain(final.candidates)
+    promised = attained(fits, by_slopes).deviance - by_slopes.deviance
 
     def shifts_alike(member: Candidate, rival: Explanation) -> bool:
         if member.has_linear or rival.candidates[-1].has_linear:
@@ -124,7 +125,7 @@ def indistinguishable(
         bound = 0 if is_larger_law else _at_bounds(rival)
         more = len(final.solved.parameters) - (len(rival.solved.parameters) - bound)
         least = fits.threshold[min(12, more)] if more > 0 else MARGIN
-        lost = fits.if_left_is_noise(rival) - COMPLEXITY * bound - least_left
+        lost = fits.if_left_is_noise(rival) - COMPLEXITY * bound - final.deviance - promised
         return lost < least or judge.independent_share(rival, final) * lost < least
 
     return {

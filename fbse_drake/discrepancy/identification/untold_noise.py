@@ -20,8 +20,9 @@ _NO_SHARE, _SHARE = 1e-9, 1e-2
 # filtered is measured where it is loudest, and of more than there is in any log.
 _LEAST, _MOST = -3.0, 30.0
 # Noise has no such tails: that much excess kurtosis is of jolts, as of a gear that is hit. (What
-# stiction leaves has some 8.)
-_JOLTS = 20.0
+# stiction leaves has some 8.) What happens between rare samples has them too, but is not so many
+# times as loud as what is believed.
+_JOLTS, _LOUDEST_JOLTS = 20.0, 3.0
 # Variance below which a row without any noise is rounding.
 _ROUNDING = 1e-18
 
@@ -45,7 +46,8 @@ def likeliest_noise(residual: Residual, length: int, rows: Sequence[int]) -> Noi
         if louder <= 1.0:
             continue
         gained = left.deviance(1.0, 0.0) - left.deviance(more, beside)
-        if gained > least and left.is_noise(more, beside):
+        is_jolted = louder > _LOUDEST_JOLTS and left.kurtosis(more, beside) > _JOLTS
+        if gained > least and not is_jolted and left.is_noise(more, beside):
             sensors[row], white[row], factor[row] = more, beside * length, louder
     return Noise((), white, sensors, factor) if (factor > 1.0).any() else None
 
@@ -87,8 +89,11 @@ class _Left:
 
     def is_noise(self, more: float, beside: float) -> bool:
         """Is nothing but that noise left?"""
-        left = self.whitened(more, beside)
-        return is_white(left, len(left)) and float(kurtosis(left)) < _JOLTS
+        return is_white(self.whitened(more, beside), len(self.value))
+
+    def kurtosis(self, more: float, beside: float) -> float:
+        """In excess of a normal distribution's, whitened by that noise."""
+        return float(kurtosis(self.whitened(more, beside)))
 
     def deviance(self, more: float, beside: float) -> float:
         """With that noise."""

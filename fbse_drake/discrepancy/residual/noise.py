@@ -324,7 +324,7 @@ def noise_finding(motion: RecordedMotion, noise: Noise) -> HygieneFinding | None
     believed = motion.sensor_noise.white.mean(axis=0) + motion.sensor_noise.at_end.mean(axis=0)
     worth = believed > _ROUNDING
     worth[:n] |= torque_noise > _NEGLIGIBLE * rms(torque, motion.known[:, :n])
-    said = [int(k) for k in np.argsort(-noise.factor) if noise.factor[k] > 1 and worth[k]]
+    said = [int(k) for k in np.argsort(-noise.factor) if noise.factor[k] > _LEAST and worth[k]]
     names = [rows[k].name for k in said]
     if said:
         text = f"{names[0]} and {len(said) - 1} more rows are" if said[1:] else f"{names[0]} is"
