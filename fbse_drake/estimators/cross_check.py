@@ -151,7 +151,8 @@ def cross_check(
     put(x.last_rate, rate)
     put(x.last_rolling, rolling)
     z, doubt = _unusual(x, 0)
-    excess = norm(z) - _TIMING * math.sqrt(x.spread) - _HABIT_DOUBT * doubt
+    beyond_habit = norm(z) - _HABIT_DOUBT * doubt
+    excess = beyond_habit - _TIMING * math.sqrt(x.spread)
     is_late = 0.0 < x.stepped < _PATIENCE
     turns = norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
     turns = turns or (is_late and not rests)
@@ -165,7 +166,8 @@ def cross_check(
             _blame(x, turns)
     if x.agreed > _AGREED:
         x.doubt[:], x.stepped = 0.0, 0.0
-    _learn_habit(x, x.doubt.max() == 0, elapsed)
+    # Neither who is doubted nor an impact or a spike is a habit.
+    _learn_habit(x, x.doubt.max() == 0 and beyond_habit < _CONTRADICTION, elapsed)
 
 
 @njit(cache=True)
@@ -181,7 +183,8 @@ def _unusual(x: np.ndarray, span: int) -> tuple[Vector, float]:
         habit = add(habit, scale(x.habit[3 + foot], vector(x.load[span, foot])))
     variance = 0.0
     for i in range(3):
-        h = _habit_row(x, span, i)
+        # By what the feet carry in the long run: a spike is no reason to doubt the habit.
+        h = _habit_row(x, 1, i)
         variance += h @ x.habit_covariance @ h
     return subtract(z, habit), math.sqrt(max(variance, 0.0))
 
@@ -197,8 +200,8 @@ def _habit_row(x: np.ndarray, span: int, i: int) -> np.ndarray:
 
 @njit(cache=True)
 def _learn_habit(x: np.ndarray, learns: bool, elapsed: float) -> None:
-    """A Kalman filter of what sensors always contradict each other by; of sensors that are doubted
-    it only forgets."""
+    """A Kalman filter of what sensors always contradict each other by; where it may not learn, it
+    only forgets."""
     P = x.habit_covariance
     for i in range(len(P)):
         deviation, walk = (_HABIT, _HABIT_WALK) if i < 3 else (_GAIN, _GAIN_WALK)
