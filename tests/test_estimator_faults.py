@@ -4,6 +4,7 @@ Nothing of it may reach the estimates.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import Log, load_scenario
 from fbse_drake.effects.friction import CoulombViscousFriction
+from fbse_drake.estimation import estimate
 from fbse_drake.estimators.disturbance_observer import DisturbanceObserver
 from fbse_drake.estimators.estimator import Estimator
 from fbse_drake.estimators.fbse import Fbse
@@ -20,7 +22,7 @@ from fbse_drake.estimators.fixed_friction import FixedFriction
 from fbse_drake.estimators.model_aided import ModelAided
 from fbse_drake.estimators.recursive import RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import SensorMonitorConfig
-from fbse_drake.report.metrics import ended_step
+from fbse_drake.report.metrics import friction_error
 
 Run = Callable[..., Log]
 
@@ -391,22 +393,21 @@ def test_each_system_alone_survives_what_is_no_number(walk: Log, name: str):
                     )
 
 
-def test_a_law_is_not_believed_at_speeds_that_never_taught_it(run: Run) -> None:
+def test_a_law_is_not_believed_at_speeds_that_never_taught_it(walk: Log) -> None:
     """The IMU is gone before the left knee swings for the first time, at six times the speed at
     which its friction was learned. What the law says there is off by more than a Nm; so it says."""
-    walk = run("paper_walk_fbse", "duration=3")
     gone = (walk.time > 1.785) & (walk.time < 2.841)
-    inputs = inputs_of(walk)
-    imu = inputs["measured_imu"].copy()
-    imu[gone] = np.nan
-    replay = Replay(diagram(Fbse(), scenario("paper_walk_fbse", "duration=3")))
-    said = replay.run(walk.time, inputs | {"measured_imu": imu}, "friction_estimate")
+    stuck = {
+        name: np.where(gone[:, None], walk[name][gone][0], walk[name])
+        for name in ("imu/linear_acceleration", "imu/angular_velocity")
+    }
+    log = replace(walk, channels=walk.channels | stuck)
+    result = estimate(scenario("paper_walk_fbse", "duration=3"), log).log
     knee = walk.joints.index("left_knee_pitch")
-    true = ended_step(walk, "truth/joint/friction_torque")[:, knee]
     speed = np.abs(walk["joint/velocity"][:, knee])
-    error = said["friction_estimate"][:, knee] - true
-    deviation = said["estimate/joint/friction_torque_std"][:, knee]
+    error = np.abs(friction_error(result)[:, knee])
+    deviation = result["estimate/joint/friction_torque_std"][:, knee]
     swings = gone & (speed > 2.0 * speed[walk.time < 1.785].max())
     assert swings.sum() > 100
-    assert np.abs(error[swings]).max() > 1.0
-    assert (np.abs(error) < 1.96 * deviation)[gone].mean() > 0.95
+    assert error[swings].max() > 1.0
+    assert (error < 1.96 * deviation)[gone].mean() > 0.95

@@ -120,9 +120,6 @@ _LOST_AFTER = 0.25
 _LOST_AGAIN, _LOST_LONG = 3.0, 0.75
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
-# When all feet slide that carry more than this share of the weight, for how long they do until the
-# velocity is as uncertain as they are fast, and how long a wrong tilt takes to make that [s].
-_FIRM_SHARE, _SLIDING_TIME, _TILT_TIME = 0.3, 0.1, 0.5
 # Below this share of its weight, the robot is not carried by its feet.
 _CARRIED = 0.3
 
@@ -379,7 +376,7 @@ def _estimate_base(
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
-    all_move, resting, least_moved, least_slides = True, False, math.inf, math.inf
+    all_move, resting, least_moved = True, False, math.inf
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
@@ -387,12 +384,10 @@ def _estimate_base(
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
             pivot = centre_of_pressure(wrench[foot], known.soles[foot])
-            moves, slides = listen_to_foot(
+            moves = listen_to_foot(
                 x, P, correction, foot, share, pivot, w_raw, model, elapsed, known
             )
             all_move, resting = all_move and moves, True
-            if share > _FIRM_SHARE:
-                least_slides = min(least_slides, slides)
             least_moved = min(least_moved, norm(vector(x.foot_agreement[foot, FOOT_VELOCITY])))
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
@@ -440,11 +435,6 @@ def _estimate_base(
     put(x.away, away)
     x.away_known = 1.0 if trust[0] == 0 and trust[1] in (0.0, _IMPLAUSIBLE) else 0.0
     correct(x, correction)
-    if least_slides < math.inf:
-        # Whoever is wrong, the velocity is not known better than that, nor the tilt that makes it.
-        unknown = least_slides * elapsed / _SLIDING_TIME
-        add_noise(P, VELOCITY, unknown)
-        add_noise(P, ATTITUDE, unknown / (9.81 * _TILT_TIME) ** 2)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
     if not first:

@@ -59,11 +59,9 @@ _RESTLESSNESS_TIME, _LEAST_RESTLESSNESS = (0.1, 0.1, 0.03, 0.03), 1e-4
 _MOST_TOLD, _LARGEST_SURPRISE = 0.05, 100.0
 # For how long feet must have erred less than believed to be trusted more [s].
 _HABIT_TIME = 0.4
-# Beyond so many times the variance believed of what a standing foot does it is not usual, and the
+# Beyond so many times the variance believed of a standing foot's velocity it is not usual, and the
 # robot's velocity is wrong.
 _LARGEST_HABIT = 36.0
-# A foot slides that is faster along its sole than so many times what it does in spite of all.
-_SLIDES = 3.0
 # A foot that carries less than this share of the weight moves more easily the less it carries.
 _FIRM_LOAD = 0.5
 
@@ -71,10 +69,10 @@ _FIRM_LOAD = 0.5
 @njit(cache=True)
 def trusted(x: Record, foot: int, told: int, axis: int) -> float:
     """Share of the variance believed of what a standing foot does that it is taken to do: what it
-    usually does, or does at present. (More than is usual on any ground shows as an error that
+    usually does, or does at present, and never more than is believed. (More shows as an error that
     lasts.)"""
     shown = max(x.foot_habit[foot, told, axis], x.foot_restlessness[foot, told, axis])
-    return min(_LARGEST_HABIT, max(LEAST_HABIT, shown))
+    return min(1.0, max(LEAST_HABIT, shown))
 
 
 @njit(cache=True)
@@ -164,7 +162,7 @@ def listen_to_foot(
     model: Record,
     elapsed: float,
     known: Record,
-) -> tuple[bool, float]:
+) -> bool:
     """What a foot that stands tells: where it is, how it is turned, and that it rests. (A point
     foot may turn, and tells nothing of that.)
 
@@ -174,8 +172,7 @@ def listen_to_foot(
         w_raw: the gyro's reading in base axes.
 
     Returns:
-        Has it moved of late by the robot's velocity, more than a foot does in spite of all? And
-        the square of how fast it slides by it, less what a foot does [m^2/s^2].
+        Has it moved of late by the robot's velocity, more than a foot does in spite of all?
     """
     config, sensors, J = known.config, known.sensors, model.foot_jacobian[foot]
     R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
@@ -244,8 +241,6 @@ def listen_to_foot(
         possible += P[VELOCITY + i, VELOCITY + i] / 3.0
     mean = vector(agreement[FOOT_VELOCITY])
     moves = dot(mean, mean) > GATE * possible
-    # Soft ground gives way along the sole's normal.
-    slides = max(0.0, mean[0] ** 2 + mean[1] ** 2 - _SLIDES**2 * own)
 
     if is_flat:
         own, sensed = light * config.foot_rate**2, turning * rate + gyro
@@ -269,7 +264,7 @@ def listen_to_foot(
             P, correction, z, start + 3, IDENTITY, ATTITUDE, NONE, noise, 0.0, spare,
             spare.copy(), np.empty((2, 3)),
         )  # fmt: skip
-    return moves, slides
+    return moves
 
 
 @njit(cache=True)
