@@ -420,6 +420,8 @@ def test_a_law_that_is_contradicted_before_it_has_held_for_some_time_begins_anew
         regressor=np.ones((n, m)),
         covariance=1e-4 * (np.eye(size) + 0.5),
         proven=np.zeros(n),
+        fastest=np.zeros(n),
+        at_fastest=np.zeros(n),
         **{name: np.zeros(3 + n) for name in of_rows},
         **{name: np.ones(3 + n) for name in variances},
     )

@@ -355,6 +355,8 @@ def _takes_most(
     most = np.array([tolerated(white, row) for row in rows])
     left = np.where(after > most**2 * count, after - count, 0.0)
     taken = np.maximum(before - after, 0.0)
+    if not left.any():
+        return True
     share = taken / np.maximum(taken + left, 1e-30)
     return bool(taken.any() and np.average(share, weights=taken) >= _MOSTLY)
 
