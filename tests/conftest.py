@@ -7,13 +7,15 @@ import os
 from collections.abc import Callable
 from functools import lru_cache
 from hashlib import sha256
+from pathlib import Path
 
 import pytest
+import yaml
 from matplotlib.figure import Figure
 
 from fbse_drake import Log, Scenario, load_scenario, simulate
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
-from fbse_drake.scenario import RecordingConfig, SensorsConfig
+from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
 
 # A file that takes long and starts last would keep a single worker busy; one that needs much room
 # for a while finds it best before a worker has grown.
@@ -92,6 +94,26 @@ def scenario(name: str, *overrides: str, noise: bool = True) -> Scenario:
     """A shipped scenario, without sensor errors if so wished."""
     result = load_scenario(name, overrides=overrides)
     return result if noise else dataclasses.replace(result, sensors=SensorsConfig())
+
+
+def pendulum(folder: Path, mass: float, away: float, inertia: float) -> RobotConfig:
+    """A rod that hangs in a joint called `pivot`; files of it are written into a folder.
+
+    Args:
+        away: its centre of mass from the pivot [m]; inertia: about the pivot [kg m^2].
+    """
+    own = inertia - mass * away**2
+    (folder / "pendulum.urdf").write_text(
+        f'''<robot name="pendulum"><link name="stand"/><link name="arm"><inertial>
+        <origin xyz="0 0 {-away}"/><mass value="{mass}"/>
+        <inertia ixx="{own}" iyy="{own}" izz="{own}" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        <joint name="pivot" type="revolute"><parent link="stand"/><child link="arm"/>
+        <axis xyz="0 -1 0"/><limit lower="-9" upper="9" effort="99" velocity="99"/></joint></robot>
+        '''
+    )
+    description = {"urdf": "pendulum.urdf", "base": "stand", "fixed_base": True}
+    (folder / "pendulum.yaml").write_text(yaml.safe_dump(description | {"joints": ["pivot"]}))
+    return RobotConfig(str(folder / "pendulum.yaml"))
 
 
 def swinging_legs(duration: float, noise: float, *changes: str) -> tuple[Scenario, Log]:

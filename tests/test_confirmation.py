@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-import yaml
+from conftest import pendulum
 
 from fbse_drake import Log, Scenario
 from fbse_drake.discrepancy.diagnosis.confirmation import diagnose_confirmed
@@ -14,7 +14,7 @@ from fbse_drake.discrepancy.diagnosis.diagnose import Diagnosis, diagnosis_json
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
 from fbse_drake.report.sentences import diagnosis_outcome
-from fbse_drake.scenario import RecordingConfig, RobotConfig
+from fbse_drake.scenario import RecordingConfig
 
 G, MASS, ARM, INERTIA, PERIOD, NOISE = 9.81, 2.0, 0.3, 0.25, 0.005, 0.02
 COULOMB, STIFFNESS = 0.8, 0.5
@@ -24,19 +24,7 @@ EFFECTS = ("CoulombFriction", "ViscousFriction", "JointSpring", "TorqueBias")
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
     """A pendulum that is believed to swing without friction and spring."""
-    folder = tmp_path_factory.mktemp("pendulum")
-    own = INERTIA - MASS * ARM**2
-    (folder / "pendulum.urdf").write_text(
-        f'''<robot name="pendulum"><link name="stand"/><link name="arm"><inertial>
-        <origin xyz="0 0 {-ARM}"/><mass value="{MASS}"/>
-        <inertia ixx="{own}" iyy="{own}" izz="{own}" ixy="0" ixz="0" iyz="0"/></inertial></link>
-        <joint name="pivot" type="revolute"><parent link="stand"/><child link="arm"/>
-        <axis xyz="0 -1 0"/><limit lower="-9" upper="9" effort="99" velocity="99"/></joint></robot>
-        '''
-    )
-    description = {"urdf": "pendulum.urdf", "base": "stand", "fixed_base": True}
-    (folder / "pendulum.yaml").write_text(yaml.safe_dump(description | {"joints": ["pivot"]}))
-    believed = RobotConfig(str(folder / "pendulum.yaml"))
+    believed = pendulum(tmp_path_factory.mktemp("pendulum"), MASS, ARM, INERTIA)
     recording = RecordingConfig(rows="instantaneous", block=0.05, torque_noise={"all": NOISE})
     return Scenario(robot=believed, model=believed, recording=recording)
 

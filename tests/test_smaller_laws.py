@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from conftest import pendulum
 
 from fbse_drake import Log, Scenario
 from fbse_drake.discrepancy.diagnosis.diagnose import (
@@ -18,10 +19,10 @@ from fbse_drake.effects.friction import StribeckFriction, ThermalDrift
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 from fbse_drake.effects.transmission import JointSpring, PreslidingHysteresis
 from fbse_drake.report.sentences import diagnosis_outcome
-from fbse_drake.scenario import RecordingConfig, RobotConfig, SensorsConfig
+from fbse_drake.scenario import RecordingConfig, SensorsConfig
 from fbse_drake.sensors.encoders import EncoderConfig
 
-# Of a rod that hangs in its hinge: mass [kg], half its length [m], moment of inertia there
+# Of a rod that hangs: mass [kg], half its length [m], moment of inertia there
 # [kg m^2]; friction [Nm]; a step of the simulation and of the log [s].
 MASS, AWAY, INERTIA, COULOMB, VISCOUS, GRAVITY = 1.2, 0.2, 0.07, 0.3, 0.05, 9.81
 STEP, PERIOD, NOISE, RESOLUTION = 2.5e-4, 4e-3, 0.005, 1e-4
@@ -31,28 +32,16 @@ TRIED = ("CoulombFriction", "ViscousFriction", "StribeckFriction", "PreslidingHy
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
-    folder = tmp_path_factory.mktemp("hinge")
-    inertia = INERTIA - MASS * AWAY**2
-    (folder / "robot.urdf").write_text(
-        f"""<robot name="rod"><link name="stand"/>
-<link name="rod"><inertial><origin xyz="0 0 {-AWAY}"/><mass value="{MASS}"/>
-<inertia ixx="{inertia}" iyy="{inertia}" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="hinge" type="revolute"><parent link="stand"/><child link="rod"/><axis xyz="0 1 0"/>
-<limit lower="-3" upper="3" effort="50" velocity="20"/></joint></robot>
-"""
-    )
-    description = folder / "robot.yaml"
-    description.write_text("base: stand\nurdf: robot.urdf\njoints: [hinge]\nfixed_base: true\n")
     return Scenario(
         duration=16.0,
-        robot=RobotConfig(str(description)),
+        robot=pendulum(tmp_path_factory.mktemp("pendulum"), MASS, AWAY, INERTIA),
         sensors=SensorsConfig(encoders=EncoderConfig(resolution=RESOLUTION)),
         recording=RecordingConfig(rows="instantaneous", torque_noise={"all": NOISE}),
     )
 
 
 def recording(displacement: float) -> Log:
-    """A hinge that a position loop moves to a place, where it rests, and on to the next.
+    """A rod that a position loop moves to a place, where it rests, and on to the next.
 
     Args:
         displacement: over which friction builds up [rad]; 0 for Coulomb's, which holds at rest
@@ -87,7 +76,7 @@ def recording(displacement: float) -> Log:
         "joint/velocity": np.gradient(angle, PERIOD, axis=0),
         "joint/torque_command": torques + NOISE * random.standard_normal(angle.shape),
     }
-    return Log(channels, {"joints": ["hinge"], "period": PERIOD, "sides": []})
+    return Log(channels, {"joints": ["pivot"], "period": PERIOD, "sides": []})
 
 
 def found(scenario: Scenario, log: Log) -> Diagnosis:

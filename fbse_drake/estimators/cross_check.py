@@ -150,8 +150,7 @@ def cross_check(
     x.was_firm = 1.0 if rests else 0.0
     put(x.last_rate, rate)
     put(x.last_rolling, rolling)
-    z, doubt = _unusual(x, 0)
-    beyond_habit = norm(z) - _HABIT_DOUBT * doubt
+    beyond_habit = norm(_unusual(x, 0)) - _HABIT_DOUBT * _habit_deviation(x)
     excess = beyond_habit - _TIMING * math.sqrt(x.spread)
     is_late = 0.0 < x.stepped < _PATIENCE
     turns = norm(vector(x.rolling)) > (_RESTING if is_late else _ROLLING)
@@ -171,22 +170,31 @@ def cross_check(
 
 
 @njit(cache=True)
-def _unusual(x: np.ndarray, span: int) -> tuple[Vector, float]:
-    """What contradicts that does not always [m/s^2], and how sure that is: its standard deviation.
+def _unusual(x: np.ndarray, span: int) -> Vector:
+    """What contradicts that does not always [m/s^2].
 
     Args:
         span: 0 for the last `_BRIEF`, 1 for the last `_LONG`.
     """
-    z = subtract(add(vector(x.mean[span, 0]), vector(x.mean[span, 1])), vector(x.mean[span, 2]))
-    habit = vector(x.habit)
-    for foot in range(len(x.doubt) - 1):
-        habit = add(habit, scale(x.habit[3 + foot], vector(x.load[span, foot])))
+    return (_unusual_along(x, span, 0), _unusual_along(x, span, 1), _unusual_along(x, span, 2))
+
+
+@njit(cache=True)
+def _unusual_along(x: np.ndarray, span: int, i: int) -> float:
+    """The same along an axis of the base."""
+    z = x.mean[span, 0, i] + x.mean[span, 1, i] - x.mean[span, 2, i]
+    return z - _habit_row(x, span, i) @ x.habit
+
+
+@njit(cache=True)
+def _habit_deviation(x: np.ndarray) -> float:
+    """Standard deviation of what always contradicts [m/s^2], by what the feet carry in the long
+    run: a spike is no reason to doubt the habit."""
     variance = 0.0
     for i in range(3):
-        # By what the feet carry in the long run: a spike is no reason to doubt the habit.
         h = _habit_row(x, 1, i)
         variance += h @ x.habit_covariance @ h
-    return subtract(z, habit), math.sqrt(max(variance, 0.0))
+    return math.sqrt(max(variance, 0.0))
 
 
 @njit(cache=True)
@@ -210,10 +218,10 @@ def _learn_habit(x: np.ndarray, learns: bool, elapsed: float) -> None:
         return
     noise = _USUAL**2 * max(1.0, 2.0 * _USUAL_TIME / elapsed)
     for i in range(3):
-        h, z = _habit_row(x, 0, i), x.mean[0, 0, i] + x.mean[0, 1, i] - x.mean[0, 2, i]
+        h = _habit_row(x, 0, i)
         shared = P @ h
         gain = shared / (h @ shared + noise)
-        x.habit[:] += gain * (z - h @ x.habit)
+        x.habit[:] += gain * _unusual_along(x, 0, i)
         P -= np.outer(gain, shared)
 
 
@@ -229,7 +237,7 @@ def force_contradiction(x: np.ndarray, largest: Vector) -> float:
     """
     if x.age < _LONG:
         return 0.0
-    z, _ = _unusual(x, 1)
+    z = _unusual(x, 1)
     for i in range(3):
         if abs(z[i]) > largest[i]:
             return norm(z)

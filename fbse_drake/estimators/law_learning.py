@@ -104,24 +104,29 @@ def beyond_known_speeds(x: Record, joint: int, velocity: float, known: Record) -
     beyond = abs(velocity) - x.fastest[joint]
     if beyond <= 0.0 or x.fastest[joint] == 0.0:
         return 0.0
-    first = 0.0
-    for j in range(x.weights.shape[1]):
-        first += x.regressor[joint, j] ** 2 * known.weight_variance[j]
     grown = 0.5 * x.at_fastest[joint] * beyond / x.fastest[joint]
-    return min(grown, math.sqrt(first))
+    return min(grown, math.sqrt(_variance_at_start(x, joint, known)))
+
+
+@njit(cache=True)
+def _variance_at_start(x: Record, joint: int, known: Record) -> float:
+    """Variance of a joint's friction, where its law is asked, when nothing was known yet [Nm^2]."""
+    variance = 0.0
+    for j in range(x.weights.shape[1]):
+        variance += x.regressor[joint, j] ** 2 * known.weight_variance[j]
+    return variance
 
 
 @njit(cache=True)
 def _is_known(x: Record, joint: int, times: float, known: Record) -> bool:
     """Is a joint's law, where it is asked, known so many times as well as at the start?"""
     n, m = x.weights.shape
-    first, now, start = len(x.covariance) + m * (joint - n), 0.0, 0.0
+    first, now = len(x.covariance) + m * (joint - n), 0.0
     for j in range(m):
-        start += x.regressor[joint, j] ** 2 * known.weight_variance[j]
         for k in range(m):
             both = x.regressor[joint, j] * x.regressor[joint, k]
             now += both * x.covariance[first + j, first + k]
-    return now * times**2 < start
+    return now * times**2 < _variance_at_start(x, joint, known)
 
 
 @njit(cache=True)

@@ -6,6 +6,7 @@ They are begun anew for what is learned of the log on the way.
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from typing import cast
 
 import numpy as np
 
@@ -48,6 +49,8 @@ from fbse_drake.progress import Interrupted, Progress
 
 # Where torques are read earlier, the error may be so many times as large: noise is measured anew.
 _AS_GOOD = 1.02
+# Lags of torques that differ by no more than this factor may be those of one recorder.
+_ALIKE = 1.5
 # Of fewer averages than this a test of whiteness says little.
 _TELLING = 400
 # A search is begun so often, at most, for noise that nobody told of.
@@ -109,8 +112,8 @@ class LateTorques:
         return TorqueReadingLag(time_constant=by_joint)
 
     def everywhere(self, proposals: Proposals) -> "LateTorques | None":
-        """With the lag that most joints share in those where none was found, for one recorder reads
-        them all; None if there is no such lag, or all have one.
+        """With a lag also in the joints where none was found, if most have one and all are alike, for
+        one recorder reads them all; None otherwise, or if all have one.
 
         Args:
             proposals: of the search.
@@ -118,14 +121,14 @@ class LateTorques:
         final, is_driven = self.explanation, self.fits.dictionary.predictor.is_driven
         driven = [*compress(self.fits.dictionary.joints, is_driven)]
         shared = max(self.members, key=lambda member: len(member.targets))
-        late = [joint for member in self.members for joint in member.targets]
+        late = cast(dict[str, float], self.effect.time_constant)
         lacking = tuple(joint for joint in driven if joint not in late)
-        if not lacking or 2 * len(shared.targets) <= len(driven):
+        is_one = max(late.values()) < _ALIKE * min(late.values())
+        if not lacking or not is_one or 2 * len(late) <= len(driven):
             return None
         others = [c for c in final.candidates if c is not shared]
-        wider = proposals.beside(
-            self.fits.explain(others), TorqueReadingLag, shared.targets + lacking
-        )
+        targets = tuple(joint for joint in driven if joint in shared.targets + lacking)
+        wider = proposals.beside(self.fits.explain(others), TorqueReadingLag, targets)
         now = dict(zip([*others, shared], wider.candidates, strict=True))
         members = {now[member]: share for member, share in self.members.items()}
         equal = {
