@@ -243,7 +243,9 @@ def diagnose(
     named = [
         c
         for c in matters
-        if _takes_most(white, without[c], final, c) and not _may_be_none(final, c)
+        if _takes_most(white, without[c], final, c)
+        and not _may_be_none(final, c)
+        and not _is_within_rows(predictor, final, c)
     ]
     tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
@@ -368,6 +370,19 @@ def _may_be_none(final: Explanation, member: Candidate) -> bool:
     return any(
         parameter.neutral == 0.0 and intervals[name][0] <= 0.0 <= intervals[name][1]
         for name, parameter in member.parameters.items()
+    )
+
+
+def _is_within_rows(predictor: Predictor, final: Explanation, member: Candidate) -> bool:
+    """Does it say that torques come late by less than lies between samples of them?
+
+    Between two samples they are not known: where a joint turns, friction holds it, and that looks
+    so too.
+    """
+    return (
+        predictor.motion.recording.is_sampled
+        and member.effect in TorqueReadingLag.opposites
+        and max(final.values(member)[0].values()) < predictor.motion.period
     )
 
 
