@@ -53,6 +53,17 @@ def test_two_pushes_are_two(course: Course) -> None:
     assert first.end < 2.4 < 5.4 < second.start
 
 
+def test_a_push_that_becomes_a_pull_is_one(course: Course) -> None:
+    def push(time: np.ndarray) -> np.ndarray:
+        return pulse(3.2, length=0.06)(time) - pulse(3.4, length=0.06)(time)
+
+    diagnosis = diagnosis_of(course, push)
+    (disturbance,) = diagnosis.disturbances
+    assert 3.05 < disturbance.start < 3.2
+    assert 3.46 < disturbance.end < 3.6
+    assert {finding.effect for finding in diagnosis.chosen} == {"CoulombFriction"}
+
+
 def test_pushes_again_and_again_are_unknown(course: Course) -> None:
     diagnosis = diagnosis_of(course, pulse(*np.arange(0.5, 7.5, 0.9)))
     assert diagnosis.disturbances == ()

@@ -57,7 +57,8 @@ def disturbances(
     ]
     merged: list[Disturbance] = []
     for start, end, name in sorted(found):
-        if merged and start <= merged[-1].end:
+        # What acts for a while may pass through zero.
+        if merged and start <= 2.0 * merged[-1].end - merged[-1].start:
             last = merged.pop()
             start, end = last.start, max(end, last.end)
             merged.append(Disturbance(start, end, tuple(dict.fromkeys((*last.rows, name)))))

@@ -112,8 +112,8 @@ class LateTorques:
         return TorqueReadingLag(time_constant=by_joint)
 
     def everywhere(self, proposals: Proposals) -> "LateTorques | None":
-        """With a lag also in the joints where none was found, if most have one and all are alike, for
-        one recorder reads them all; None otherwise, or if all have one.
+        """With a lag also in the joints where none was found, if most have one and all are alike,
+        for one recorder reads them all; None otherwise, or if all have one.
 
         Args:
             proposals: of the search.
