@@ -110,3 +110,21 @@ def test_a_filter_of_the_torque_makes_no_stribeck_hump(hump: float, noise: float
     for effect in (law_found, "TorqueReadingLag"):
         having = {joint for f in diagnosis.chosen if f.effect == effect for joint in f.targets}
         assert having == set(ARM.joints)
+
+
+@pytest.mark.parametrize(("late", "is_named"), [(2, False), (8, True)])
+def test_a_delay_between_two_samples_is_tentative(late: int, is_named: bool):
+    """Torques are not known between samples that are 4 ms apart.
+
+    Args:
+        late: how many milliseconds after their commands torques act.
+    """
+    fine = replace(ARM, period=0.001, duration=30.0)
+    course, every = fine.course(5), 4
+    commands = np.concatenate([course.torque[late:], course.torque[-late:]])
+    seen = Course(*(np.asarray(values)[::every] for values in vars(course).values()))
+    machine = replace(fine, period=fine.period * every)
+    tried = [library()[name] for name in ("CoulombFriction", "ViscousFriction", "TorqueDelay")]
+    diagnosis = diagnose(machine.predictor(machine.log(seen, commands[::every])), tried)
+    assert {f.effect for f in diagnosis.chosen} == ({"TorqueDelay"} if is_named else set())
+    assert {f.effect for f in diagnosis.tentative} == (set() if is_named else {"TorqueDelay"})
