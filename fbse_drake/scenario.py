@@ -537,6 +537,10 @@ def read_scenario(
         allow_code: may its `effect_modules` be run, also where the file came with a log or a
             download?
     """
+    if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+        raise InputError(
+            f"overrides: expected a list of 'KEY=VALUE', as in ['duration=5'], found {overrides!r}"
+        )
     tree = ScenarioTree.read(scenario, name)
     if not allow_code:
         require_trusted(tree.path, tree.code)

@@ -208,6 +208,12 @@ def test_bad_override_gets_one_line(override: str, message: str):
         load_scenario("squat", overrides=[override])
 
 
+@pytest.mark.parametrize("overrides", ["duration=2", {"duration": 2}])
+def test_overrides_are_a_list(overrides: object):
+    with pytest.raises(InputError, match="overrides: expected a list of 'KEY=VALUE'"):
+        load_scenario("paper_walk", overrides=overrides)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
