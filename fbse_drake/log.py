@@ -130,6 +130,10 @@ class Log(Mapping[str, np.ndarray]):
     >>> log = Log(channels, {"joints": ["knee"], "period": 0.01})
     >>> log["joint/position"].shape, log.unit("joint/position")
     ((100, 1), 'rad')
+    >>> log
+    Log of 100 rows, 0 to 0.99 s, one every 0.01 s; joints: knee
+      time            (100,)    s
+      joint/position  (100, 1)  rad
     >>> Log({"time": time}, log.meta)
     Traceback (most recent call last):
     fbse_drake.errors.InputError: channel joint/position is missing (required: time, joint/position)
@@ -179,6 +183,16 @@ class Log(Mapping[str, np.ndarray]):
                 f"channel time: does not increase at row {row} (t = {self.channels['time'][row]:g} "
                 "s)"
             )
+
+    def __repr__(self) -> str:
+        """Rows, joints, and the channels with their shapes and units: what a notebook shows."""
+        start, end, period = self.time[0], self.time[-1], self.meta["period"]
+        head = f"Log of {len(self.time)} rows, {start:g} to {end:g} s, one every {period:g} s"
+        names = max(map(len, self))
+        shapes = {name: str(values.shape) for name, values in self.items()}
+        wide = max(map(len, shapes.values()))
+        rows = [f"  {name:{names}}  {shapes[name]:{wide}}  {self.unit(name)}" for name in self]
+        return "\n".join([f"{head}; joints: {', '.join(self.joints)}", *rows])
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.channels:
