@@ -15,6 +15,7 @@ from fbse_drake.discrepancy.diagnosis.bandwidth import averaged_to_bandwidth
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.effects.effect import library
+from fbse_drake.report.sentences import diagnosis_outcome
 from fbse_drake.scenario import Scenario
 
 TRANSITION = 0.01
@@ -128,3 +129,7 @@ def test_a_delay_between_two_samples_is_tentative(late: int, is_named: bool):
     diagnosis = diagnose(machine.predictor(machine.log(seen, commands[::every])), tried)
     assert {f.effect for f in diagnosis.chosen} == ({"TorqueDelay"} if is_named else set())
     assert {f.effect for f in diagnosis.tentative} == (set() if is_named else {"TorqueDelay"})
+    assert diagnosis.verdict == ("effect_found" if is_named else "not_visible")
+    if not is_named:
+        text = diagnosis_outcome(diagnosis)
+        assert "cannot tell whether something is missing: what the model leaves over looks" in text

@@ -292,6 +292,12 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"Nothing is missing: what the model leaves over is the sensors' noise ({left} times "
             f"it){unseen}."
         )
+    if diagnosis.verdict == "not_visible" and diagnosis.tentative:
+        return (
+            "This log cannot tell whether something is missing: what the model leaves over looks "
+            f"like {listed_effects(diagnosis.tentative)}, but by less than the time between two "
+            "samples of the torque, of which nothing is known there."
+        )
     if diagnosis.verdict == "not_visible" and diagnosis.untested:
         return (
             "This log is too short to tell whether something is missing: the model leaves over "
@@ -522,6 +528,8 @@ def _experiments_next(diagnosis: Diagnosis, found: Sequence[Finding]) -> list[St
     if doubtful:
         steps += _experiments("To tell them apart:", doubtful)
     if diagnosis.partial is None and diagnosis.verdict == "not_visible":
+        if diagnosis.tentative:
+            steps.append(Step("Record torques as often as the control gives them."))
         if diagnosis.untested:
             steps.append(Step("Record for longer, or average over less (recording.block)."))
         if diagnosis.noisy:

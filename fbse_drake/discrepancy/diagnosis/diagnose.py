@@ -240,12 +240,13 @@ def diagnose(
         c: fits.explain([other for other in final.candidates if other is not c])
         for c in final.candidates
     }
+    within_rows = [c for c in matters if _is_within_rows(predictor, final, c)]
     named = [
         c
         for c in matters
-        if _takes_most(white, without[c], final, c)
+        if c not in within_rows
+        and _takes_most(white, without[c], final, c)
         and not _may_be_none(final, c)
-        and not _is_within_rows(predictor, final, c)
     ]
     tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
@@ -278,9 +279,11 @@ def diagnose(
         verdict: Verdict = "unknown_effect"
     elif named or late is not None or has_inertia:
         verdict = "effect_found"
-    elif matters:
+    elif len(within_rows) < len(matters):
         verdict = "unknown_effect"
-    elif partial is not None or hidden > 0.5 * len(statuses) or search.untested or search.noisy:
+    elif hidden > 0.5 * len(statuses) or any(
+        (partial is not None, within_rows, search.untested, search.noisy)
+    ):
         verdict = "not_visible"
     else:
         verdict = "nothing_missing"
