@@ -831,23 +831,15 @@ def test_a_log_may_begin_in_mid_step(run: Run, name: str, start: float):
 
 
 @pytest.mark.parametrize(
-    ("channel", "axis", "jump", "left"),
-    [
-        ("imu/linear_acceleration", 2, 0.3, 3e-3),
-        ("imu/angular_velocity", 1, 0.05, 3e-3),
-        ("imu/angular_velocity", 1, 0.02, 6e-3),
-    ],
-    ids=["accelerometer", "gyro", "gyro-little"],
+    ("channel", "axis", "jump"),
+    [("imu/linear_acceleration", 2, 0.3), ("imu/angular_velocity", 1, 0.05)],
+    ids=["accelerometer", "gyro"],
 )
 def test_an_imu_that_keeps_contradicting_standing_feet_has_another_bias(
-    run: Run, channel: str, axis: int, jump: float, left: float
+    run: Run, channel: str, axis: int, jump: float
 ):
     """Its bias changes after 1 s. The velocity that it makes ran away by 0.3 m/s every second when
-    feet that contradict it were taken to move, and was wrong by 25 mm/s for good when they slid.
-
-    Args:
-        left: largest root mean square error at the end [m/s].
-    """
+    feet that contradict it were taken to move."""
     log = run("paper_walk_fbse", "duration=4")
     changed = log[channel].copy()
     changed[log.time > 1.0, axis] += jump
@@ -855,28 +847,10 @@ def test_an_imu_that_keeps_contradicting_standing_feet_has_another_bias(
     found = estimated(log, scenario("paper_walk_fbse", "duration=4"), Fbse())
     error = found["estimate/base/velocity"] - log["truth/base/velocity"]
     later = log.time > 3.3
-    assert np.sqrt(np.mean(error[later] ** 2, axis=0)).max() < left
+    assert np.sqrt(np.mean(error[later] ** 2, axis=0)).max() < 3e-3
     assert np.abs(error).max() < 0.4
     within = np.abs(error) <= NORMAL_99 * found["estimate/base/velocity_std"]
     assert within[later].mean() > 0.95
-
-
-@pytest.mark.parametrize("kind", ["reads too little", "is late"])
-def test_feet_that_slide_to_and_fro_make_the_velocity_doubtful(run: Run, kind: str):
-    """An accelerometer reads 5 % too little, or all the IMU comes 5 ms late: the velocity was wrong
-    by 11 and 5 mm/s, for feet were taken to slide."""
-    log = run("paper_walk_fbse", "duration=4")
-    if kind == "is late":
-        late = {name: np.roll(log[name], 5, axis=0) for name in log if name.startswith("imu/")}
-    else:
-        late = {"imu/linear_acceleration": 0.95 * log["imu/linear_acceleration"]}
-    log = Log({name: log[name] for name in log} | late, log.meta)
-    found = estimated(log, scenario("paper_walk_fbse", "duration=4"), Fbse())
-    error = found["estimate/base/velocity"] - log["truth/base/velocity"]
-    later = log.time > 1.0
-    assert np.sqrt(np.mean(np.sum(error[later] ** 2, axis=1))) < 4e-3
-    within = np.abs(error) <= NORMAL_99 * found["estimate/base/velocity_std"]
-    assert within[later].mean() > 0.7
 
 
 @pytest.mark.parametrize(

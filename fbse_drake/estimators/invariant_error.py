@@ -33,7 +33,6 @@ from fbse_drake.estimators.spatial import (
     scale,
     scaled,
     skew,
-    transposed,
     vector,
 )
 
@@ -114,29 +113,6 @@ def add_noise_along(P: np.ndarray, start: int, F: Rotation, density: np.ndarray,
         for j in range(3):
             for k in range(3):
                 P[start + i, start + j] += T * density[k] * F[3 * i + k] * F[3 * j + k]
-
-
-@njit(cache=True)
-def add_turns(P: np.ndarray, x: Record, axes: int, variance: float) -> None:
-    """Adds rotations of this variance about the world's first axes [rad^2], x, y and z.
-
-    They turn the attitude alone: velocity, position and feet stay, so their errors on the group
-    take them back. (Or what is known of the legs would depend on how far from the world's origin
-    they are.)
-    """
-    G = np.zeros((3, len(P)))
-    put_columns(G, ATTITUDE, IDENTITY)
-    put_columns(G, VELOCITY, transposed(skew(vector(x.imu_velocity))))
-    put_columns(G, POSITION, transposed(skew(vector(x.imu_position))))
-    for foot in range(len(x.foot_standing)):
-        if x.foot_standing[foot] > 0:
-            put_columns(G, FEET + 6 * foot, transposed(skew(vector(x.foot_position[foot]))))
-    for i in range(len(P)):
-        for j in range(len(P)):
-            total = 0.0
-            for axis in range(axes):
-                total += G[axis, i] * G[axis, j]
-            P[i, j] += variance * total
 
 
 @njit(cache=True)
