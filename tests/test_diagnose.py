@@ -204,14 +204,15 @@ def test_of_a_log_that_is_rarer_than_the_control_the_same_is_found(hidden: str, 
 @pytest.mark.parametrize("hidden", ["", "!BodyMass {mass: {trunk: 2.0}}"])
 def test_samples_that_are_rarer_than_the_control_show_when_commands_act(hidden: str) -> None:
     """What happens between them is noise, and nothing unknown; but a command acts in the
-    millisecond after it was read."""
+    millisecond after it was read, which is no fault of the drive."""
     rare = log_with(hidden).part(slice(None, None, 2))
     recording = replace(scenario().recording, rows="instantaneous")
     diagnosis = diagnose(Predictor(replace(scenario(), recording=recording), rare), effects())
-    assert diagnosis.verdict == "effect_found"
-    found = {finding.effect: finding for finding in diagnosis.chosen}
-    assert set(found) == ({"TorqueLag", "BodyMass"} if hidden else {"TorqueLag"})
-    assert found["TorqueLag"].parameters["time_constant"].value == pytest.approx(1e-3, rel=0.2)
+    assert diagnosis.verdict == ("effect_found" if hidden else "not_visible")
+    assert {finding.effect for finding in diagnosis.chosen} == ({"BodyMass"} if hidden else set())
+    (lag,) = diagnosis.tentative
+    assert lag.effect == "TorqueLag"
+    assert lag.parameters["time_constant"].value == pytest.approx(1e-3, rel=0.2)
 
 
 @pytest.mark.parametrize("seed", [11, 12])
