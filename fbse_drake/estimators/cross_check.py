@@ -182,8 +182,13 @@ def _unusual(x: np.ndarray, span: int) -> Vector:
 @njit(cache=True)
 def _unusual_along(x: np.ndarray, span: int, i: int) -> float:
     """The same along an axis of the base."""
-    z = x.mean[span, 0, i] + x.mean[span, 1, i] - x.mean[span, 2, i]
-    return z - _habit_row(x, span, i) @ x.habit
+    return _contradiction_along(x, span, i) - _habit_row(x, span, i) @ x.habit
+
+
+@njit(cache=True)
+def _contradiction_along(x: np.ndarray, span: int, i: int) -> float:
+    """What accelerometer, joints and feet contradict each other by there [m/s^2]."""
+    return x.mean[span, 0, i] + x.mean[span, 1, i] - x.mean[span, 2, i]
 
 
 @njit(cache=True)
@@ -221,7 +226,7 @@ def _learn_habit(x: np.ndarray, learns: bool, elapsed: float) -> None:
         h = _habit_row(x, 0, i)
         shared = P @ h
         gain = shared / (h @ shared + noise)
-        x.habit[:] += gain * _unusual_along(x, 0, i)
+        x.habit[:] += gain * (_contradiction_along(x, 0, i) - h @ x.habit)
         P -= np.outer(gain, shared)
 
 

@@ -57,8 +57,8 @@ def disturbances(
     ]
     merged: list[Disturbance] = []
     for start, end, name in sorted(found):
-        # What acts for a while may pass through zero.
-        if merged and start <= 2.0 * merged[-1].end - merged[-1].start:
+        # What acts for a while may pass through zero, for no longer than it has acted.
+        if merged and start - merged[-1].end <= merged[-1].end - merged[-1].start:
             last = merged.pop()
             start, end = last.start, max(end, last.end)
             merged.append(Disturbance(start, end, tuple(dict.fromkeys((*last.rows, name)))))
