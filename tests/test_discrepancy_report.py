@@ -601,6 +601,14 @@ def test_what_may_stand_for_something_else_is_not_simply_added():
         assert ("may stand for part of what is left" in step.text) == hedged
 
 
+def test_where_a_log_cannot_tell_a_better_one_comes_before_what_it_suggests():
+    suggests = dataclasses.replace(FRICTION, chosen=False, confusable_with=(), tentative=True)
+    first, *_, last = steps_after_diagnosis(made_diagnosis("not_visible", (suggests,)), INPUTS)
+    assert first.text == "Record torques as often as the control gives them."
+    assert last.text == "If no better log can be had, add what is tentative to the model:"
+    assert last.command.startswith("fbse add")
+
+
 def test_absent_means_less_where_something_unknown_is_left():
     everywhere = verdicts_text(STATUSES)
     assert everywhere.endswith("Absent means that it would have been seen.")

@@ -469,20 +469,23 @@ def steps_after_compare(comparison: Comparison, inputs: Inputs) -> tuple[Step, .
 
 def steps_after_diagnosis(diagnosis: Diagnosis, inputs: Inputs) -> tuple[Step, ...]:
     """What to do after a diagnosis, the most important first."""
-    steps = []
+    adding: tuple[Step, ...] = ()
+    cannot_tell = diagnosis.verdict == "not_visible"
     if diagnosis.completing and not is_refuted(diagnosis.set_aside):
         completed = f"{inputs.name}_completed.yaml"
         command = f"fbse add {inputs.changed_scenario} {inputs.out} --out {completed}"
-        says = (
-            "Add it to the model; it may stand for part of what is left:"
-            if diagnosis.verdict == "unknown_effect"
-            else "Add it to the model:"
-        )
-        steps.append(Step(says, command))
+        says = "Add it to the model:"
+        if diagnosis.verdict == "unknown_effect":
+            says = "Add it to the model; it may stand for part of what is left:"
+        elif cannot_tell:
+            says = "If no better log can be had, add what is tentative to the model:"
+        adding = (Step(says, command),)
     elif diagnosis.completing:
         command = f"{inputs.diagnose} --test ANOTHER_LOG"
-        steps.append(Step("See whether another log confirms it, before it is added:", command))
-    return (*steps, *_experiments_next(diagnosis, diagnosis.completing)) or (_NOTHING,)
+        adding = (Step("See whether another log confirms it, before it is added:", command),)
+    experiments = tuple(_experiments_next(diagnosis, diagnosis.completing))
+    steps = (*experiments, *adding) if cannot_tell else (*adding, *experiments)
+    return steps or (_NOTHING,)
 
 
 def steps_after_study(study: Study, inputs: Inputs) -> tuple[Step, ...]:
