@@ -581,13 +581,13 @@ class InvariantBaseFilter(RecursiveEstimator):
                                sensors' low-pass [s], and more, see `force_lag_type`
         pad_force, pad_force_read      (P, 3)  force on each pad over the tick, and as it was read
                                        before that low-pass was undone [N]
-        kept_biases, kept_for  (2, 2, 3), ()  biases of gyro and accelerometer, older and newer, in
-                               base axes, and the newer's age [s]
+        kept_biases, kept_for  (2, 4, 3), ()  biases of gyro and accelerometer in base axes and
+                               their variances, older and newer, and the newer's age [s]
         lost_for, lost_by      (), ()  for how long all feet that stand have contradicted the
                                        velocity [s], and by how much [m/s]
         lost_since, lost_ago   (), ()  how long ago that made the filter start over, for the first
                                        and for the last time of late [s]
-        leash, leashed_for     (2, 4, 3), ()  biases and their standard deviations, older and newer,
+        leash, leashed_for     (2, 4, 3), ()  biases and their variances, older and newer,
                                and the newer's age [s]
         away, away_known       (3,), ()  velocity of the centre of mass relative to the IMU in base
                                        axes [m/s], and whether it was measured
@@ -698,7 +698,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         foot_innovation=(feet, TOLD, 3),
         foot_innovation_variance=(feet, TOLD, 3),
         error_covariance=(n, n),
-        kept_biases=(2, 2, 3),
+        kept_biases=(2, 4, 3),
         kept_for=(),
         leash=(2, 4, 3),
         leashed_for=(),

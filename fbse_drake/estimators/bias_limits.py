@@ -11,6 +11,9 @@ from fbse_drake.estimators.spatial import put, vector
 
 # Biases of the IMU of at least so long ago [s] are taken back when a sensor is not trusted.
 _MEMORY = 0.1
+# Their variance is then at least this share of what it was: while they were being found out, most
+# of that came from sensors that were about to fail.
+_STILL_UNKNOWN = 0.25
 # They stay within so many standard deviations of what was known of them so long ago [s]: they
 # hardly walk, and a sensor that drifts faster is at fault. What a filter finds out moves its
 # estimate by a variance as large as what it takes from its own; and at least by so many random
@@ -26,13 +29,11 @@ def leash_biases(x: Record, first: bool, elapsed: float, config: Record) -> None
     if first or x.leashed_for > _LEASH_TIME:
         x.leashed_for = 0.0
         _copy_rows(leash[0], leash[1])
+        _put_biases(leash[1], x)
         for i in range(3):
-            leash[1, 0, i], leash[1, 1, i] = x.gyro_bias_B[i], x.accelerometer_bias_B[i]
             for sensor in range(2):
-                at = (GYRO_BIAS if sensor == 0 else ACCELEROMETER_BIAS) + i
                 walk = config.gyro_walk if sensor == 0 else config.accelerometer_walk
-                least = _LEAST_WALKS * walk * math.sqrt(_LEASH_TIME)
-                leash[1, 2 + sensor, i] = P[at, at] + least**2
+                leash[1, 2 + sensor, i] += (_LEAST_WALKS * walk) ** 2 * _LEASH_TIME
         if first:
             _copy_rows(leash[0], leash[1])
     for sensor in range(2):
@@ -77,15 +78,19 @@ def _copy_rows(to: np.ndarray, source: np.ndarray) -> None:
 
 @njit(cache=True)
 def _put_biases(to: np.ndarray, x: Record) -> None:
-    """Fills (2, 3) with the biases of gyro and accelerometer in base axes."""
+    """Fills (4, 3) with the biases of gyro and accelerometer in base axes, and their variances."""
     put(to[0], vector(x.gyro_bias_B))
     put(to[1], vector(x.accelerometer_bias_B))
+    for i in range(3):
+        to[2, i] = x.error_covariance[GYRO_BIAS + i, GYRO_BIAS + i]
+        to[3, i] = x.error_covariance[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i]
 
 
 @njit(cache=True)
 def remember_biases(x: Record, is_doubtful: bool, first: bool, elapsed: float) -> None:
-    """While sensors are doubtful the IMU's biases are those from before they began to fail."""
-    kept = x.kept_biases
+    """While sensors are doubtful the IMU's biases are those from before they began to fail, and
+    hardly better known."""
+    kept, P = x.kept_biases, x.error_covariance
     if first:
         _put_biases(kept[0], x)
         _put_biases(kept[1], x)
@@ -95,6 +100,8 @@ def remember_biases(x: Record, is_doubtful: bool, first: bool, elapsed: float) -
         for sensor in range(2):
             for axis in range(3):
                 _set_bias(x, sensor, axis, kept[0, sensor, axis])
+                at = (GYRO_BIAS if sensor == 0 else ACCELEROMETER_BIAS) + axis
+                P[at, at] = max(P[at, at], _STILL_UNKNOWN * kept[0, 2 + sensor, axis])
         x.kept_for = 0.0
     else:
         x.kept_for += elapsed
