@@ -19,7 +19,7 @@ from pydrake.systems.framework import Context
 from fbse_drake.errors import require_not_negative, require_positive, required
 from fbse_drake.estimators.attitude import AttitudeConfig
 from fbse_drake.estimators.beliefs import SensorBeliefs
-from fbse_drake.estimators.bias_limits import leash_biases, remember_biases, unleash_biases
+from fbse_drake.estimators.bias_limits import leash_biases, remember_biases
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.cross_check import (
     cross_check,
@@ -61,6 +61,14 @@ from fbse_drake.estimators.invariant_error import (
     put_columns,
     turn_to,
     update,
+)
+from fbse_drake.estimators.lost_velocity import (
+    FIRM_SHARE,
+    TILT_BY_VELOCITY,
+    doubt_velocity,
+    forget_sliding,
+    never_lost,
+    watch_for_losses,
 )
 from fbse_drake.estimators.records import Record, as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
@@ -113,11 +121,6 @@ _START = {
 # While the IMU is not trusted, what its readings are taken to be wrong by [rad/s, m/s^2], and how
 # long that lasts [s].
 _UNKNOWN_RATE, _UNKNOWN_ACCELERATION, _UNKNOWN_TIME = 0.3, 3.0, 0.1
-# When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
-_LOST_AFTER = 0.25
-# When that happens again within this time [s], and still after this time [s], it is the IMU's
-# biases: a fault that lasts for a second is over by then.
-_LOST_AGAIN, _LOST_LONG = 3.0, 0.75
 # What the rate is off by that standing feet show [rad/s].
 _FOOT_RATE_ERROR = 0.05
 # Below this share of its weight, the robot is not carried by its feet.
@@ -269,7 +272,7 @@ def _start(x: Record, measured: Record, model: Record, known: Record) -> None:
     x.foot_habit[:] = 1.0
     x.foot_age[:] = known.config.foot_time
     x.force_habit[:] = 1.0
-    x.lost_ago = 2.0 * _LOST_AGAIN
+    never_lost(x)
     R, middle, feet = rotation(x.rotation), (0.0, 0.0, 0.0), len(x.foot_standing)
     for foot in range(feet):
         middle = add(middle, scale(1.0 / feet, vector(model.foot_position[foot])))
@@ -376,7 +379,8 @@ def _estimate_base(
     x.foot_innovation[:] = 0.0
     x.foot_innovation_variance[:] = 0.0
     correction = np.zeros(len(P))
-    all_move, resting, least_moved = True, False, math.inf
+    all_move, resting, least_moved, least_slides = True, False, math.inf, math.inf
+    sliding = (math.inf, math.inf, math.inf)
     for foot in range(feet):
         load, stands = wrench[foot, 5], measured.support[foot] > 0
         if stands and not x.foot_standing[foot] > 0:
@@ -384,10 +388,14 @@ def _estimate_base(
         elif stands and not first and trust[0] == 0 and trust[1] == 0 and trust[2 + foot] == 0:
             share = max(load, 1.0) / weight
             pivot = centre_of_pressure(wrench[foot], known.soles[foot])
-            moves = listen_to_foot(
+            moves, slides, velocity = listen_to_foot(
                 x, P, correction, foot, share, pivot, w_raw, model, elapsed, known
             )
             all_move, resting = all_move and moves, True
+            if share > FIRM_SHARE:
+                least_slides = min(least_slides, slides)
+                if norm(velocity) <= norm(sliding):
+                    sliding = velocity
             least_moved = min(least_moved, norm(vector(x.foot_agreement[foot, FOOT_VELOCITY])))
         x.foot_standing[foot] = measured.support[foot]
         R_BF = rotation(model.foot_rotation[foot])
@@ -437,41 +445,19 @@ def _estimate_base(
     correct(x, correction)
     if resting:
         x.lost_for = x.lost_for + elapsed if all_move and contradiction == 0.0 else 0.0
-    if not first:
-        x.lost_ago += elapsed
-        x.lost_since += elapsed
     x.lost_by = least_moved if resting and all_move else 0.0
-    # Nor is it they if the IMU is found to be wrong meanwhile: it was so before.
-    if x.lost_for > _LOST_AFTER or (x.lost_for > 0.0 and trust[1] == _IMPLAUSIBLE):
-        _start_over(x, model, known)
+    x.slides_by = 0.0
+    if trust.max() > 0 or contradiction > 0.0 or x.lost_for > 0.0:
+        forget_sliding(x)
+    elif least_slides < math.inf:
+        doubt_velocity(x, least_slides, sliding, elapsed, model, known)
+    if not first:
+        watch_for_losses(x, trust[1] == _IMPLAUSIBLE, elapsed, model, known)
     leash_biases(x, first, elapsed, known.config)
     is_doubtful = trust.max() > 0 or x.check.doubt.max() > 0
     is_doubtful = is_doubtful or contradiction > 0.0 or x.lost_for > 0.0
     remember_biases(x, is_doubtful, first, elapsed)
     _conclude(x, w_raw, wrench, measured, model, known)
-
-
-@njit(cache=True)
-def _start_over(x: Record, model: Record, known: Record) -> None:
-    """Attitude, velocity and place are no better known than at the start, nor are the IMU's biases
-    if that goes on happening.
-
-    All feet that stand are put down anew.
-    """
-    P, spare = x.error_covariance, np.zeros(len(x.error_covariance))
-    add_noise(P, ATTITUDE, known.start.tilt**2)
-    add_noise(P, VELOCITY, known.start.velocity**2)
-    add_noise(P, POSITION, (known.start.velocity * _LOST_AFTER) ** 2)
-    for foot in range(len(x.foot_standing)):
-        if x.foot_standing[foot] > 0:
-            land(x, P, spare, foot, model, known)
-    if x.lost_ago > _LOST_AGAIN:
-        x.lost_since = 0.0
-    if x.lost_since > _LOST_LONG:
-        add_noise(P, GYRO_BIAS, known.sensors.angular_velocity_bias**2)
-        add_noise(P, ACCELEROMETER_BIAS, known.sensors.acceleration_bias**2)
-        unleash_biases(x)
-    x.lost_for, x.lost_ago = 0.0, 0.0
 
 
 @njit(cache=True)
@@ -510,12 +496,14 @@ def _conclude(
         put(x.zmp, (zmp_x / total, zmp_y / total))
     # The group's errors turn with the attitude's: v - v_hat = xi_v + phi x v.
     for i in range(3):
-        x.attitude_std[i] = math.sqrt(max(0.0, P[ATTITUDE + i, ATTITUDE + i]))
+        tilted = x.slides_by * TILT_BY_VELOCITY if i < 2 else 0.0
+        x.attitude_std[i] = math.hypot(math.sqrt(max(0.0, P[ATTITUDE + i, ATTITUDE + i])), tilted)
         x.angular_velocity_bias_std[i] = math.sqrt(max(0.0, P[GYRO_BIAS + i, GYRO_BIAS + i]))
         at = ACCELEROMETER_BIAS + i
         x.acceleration_bias_std[i] = math.sqrt(max(0.0, P[at, at]))
         # Whether it is the feet that move or the robot nobody knows yet.
-        x.velocity_std[i] = math.hypot(moved_std(P, VELOCITY, i, velocity), x.lost_by)
+        unsure = math.hypot(x.lost_by, x.slides_by)
+        x.velocity_std[i] = math.hypot(moved_std(P, VELOCITY, i, velocity), unsure)
         x.position_std[i] = moved_std(P, POSITION, i, position)
 
 
@@ -583,6 +571,10 @@ class InvariantBaseFilter(RecursiveEstimator):
                                        before that low-pass was undone [N]
         kept_biases, kept_for  (2, 4, 3), ()  biases of gyro and accelerometer in base axes and
                                their variances, older and newer, and the newer's age [s]
+        sliding_share, slides_by       (), ()  for what share of the last second all feet slid that
+                               carry the robot, and how fast they do if they keep doing so [m/s]
+        sliding, sliding_square        (3,), ()  mean velocity and mean square velocity, over that
+                               second, of the foot that slid least [m/s], [m^2/s^2]
         lost_for, lost_by      (), ()  for how long all feet that stand have contradicted the
                                        velocity [s], and by how much [m/s]
         lost_since, lost_ago   (), ()  how long ago that made the filter start over, for the first
@@ -675,6 +667,7 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         "away",
         "force_innovation",
         "force_agreement",
+        "sliding",
     )
     return record_type(
         time=(),
@@ -702,6 +695,9 @@ def base_filter_type(robot: Robot, clock: Clock) -> np.dtype:
         kept_for=(),
         leash=(2, 4, 3),
         leashed_for=(),
+        sliding_share=(),
+        sliding_square=(),
+        slides_by=(),
         lost_for=(),
         lost_by=(),
         lost_since=(),

@@ -62,6 +62,8 @@ _HABIT_TIME = 0.4
 # Beyond so many times the variance believed of a standing foot's velocity it is not usual, and the
 # robot's velocity is wrong.
 _LARGEST_HABIT = 36.0
+# A foot slides that is faster along its sole than so many times what it does in spite of all.
+SLIDES = 3.0
 # A foot that carries less than this share of the weight moves more easily the less it carries.
 _FIRM_LOAD = 0.5
 
@@ -162,7 +164,7 @@ def listen_to_foot(
     model: Record,
     elapsed: float,
     known: Record,
-) -> bool:
+) -> tuple[bool, float, Vector]:
     """What a foot that stands tells: where it is, how it is turned, and that it rests. (A point
     foot may turn, and tells nothing of that.)
 
@@ -172,7 +174,9 @@ def listen_to_foot(
         w_raw: the gyro's reading in base axes.
 
     Returns:
-        Has it moved of late by the robot's velocity, more than a foot does in spite of all?
+        Has it moved of late by the robot's velocity, more than a foot does in spite of all? The
+        square of how fast it slides by it, less what a foot does [m^2/s^2]; and its mean velocity
+        by it along the sole, in world axes [m/s].
     """
     config, sensors, J = known.config, known.sensors, model.foot_jacobian[foot]
     R, v, p = rotation(x.rotation), vector(x.imu_velocity), vector(x.imu_position)
@@ -241,6 +245,10 @@ def listen_to_foot(
         possible += P[VELOCITY + i, VELOCITY + i] / 3.0
     mean = vector(agreement[FOOT_VELOCITY])
     moves = dot(mean, mean) > GATE * possible
+    # Soft ground gives way along the sole's normal.
+    along = (mean[0], mean[1], 0.0)
+    slides = max(0.0, dot(along, along) - SLIDES**2 * own)
+    sliding = rotate(rotation_matrix(quaternion(x.foot_orientation[foot])), along)
 
     if is_flat:
         own, sensed = light * config.foot_rate**2, turning * rate + gyro
@@ -264,7 +272,7 @@ def listen_to_foot(
             P, correction, z, start + 3, IDENTITY, ATTITUDE, NONE, noise, 0.0, spare,
             spare.copy(), np.empty((2, 3)),
         )  # fmt: skip
-    return moves
+    return moves, slides, sliding
 
 
 @njit(cache=True)
