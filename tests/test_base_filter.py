@@ -844,7 +844,7 @@ def test_an_imu_that_keeps_contradicting_standing_feet_has_another_bias(
     run: Run, channel: str, axis: int, jump: float, left: float
 ):
     """Its bias changes after 1 s. The velocity that it makes ran away by 0.3 m/s every second when
-    feet that contradict it were taken to move, and was wrong by 25 mm/s for good when they slid.
+    feet that contradict it were taken to move, and was wrong by 25 mm/s for seconds when they slid.
 
     Args:
         left: largest root mean square error at the end [m/s].

@@ -63,7 +63,6 @@ from fbse_drake.estimators.invariant_error import (
     update,
 )
 from fbse_drake.estimators.lost_velocity import (
-    FIRM_SHARE,
     TILT_BY_VELOCITY,
     doubt_velocity,
     forget_sliding,
@@ -94,6 +93,7 @@ from fbse_drake.estimators.spatial import (
     vector,
 )
 from fbse_drake.estimators.standing_foot import (
+    FIRM_SHARE,
     FOOT_ORIENTATION,
     FOOT_POSITION,
     FOOT_RATE,

@@ -19,7 +19,7 @@ from fbse_drake.estimators.spatial import (
     subtract,
     vector,
 )
-from fbse_drake.estimators.standing_foot import centre_of_pressure
+from fbse_drake.estimators.standing_foot import FIRM_SHARE, centre_of_pressure
 
 # Over which times accelerations are compared [s], and after how long without contradiction the
 # sensors are believed again.
@@ -33,8 +33,8 @@ _CONTRADICTION, _TIMING, _HABIT_DOUBT = 0.6, 0.3, 3.0
 _HABIT, _HABIT_WALK, _GAIN, _GAIN_WALK = 1.0, 0.01, 0.1, 0.01
 # What else they usually contradict each other by [m/s^2], and for how long it lasts [s].
 _USUAL, _USUAL_TIME = 0.2, 0.05
-# The fastest that a foot rolls that carries much of the weight [rad/s], and how much that is.
-_ROLLING, _FIRM_SHARE = 0.4, 0.3
+# The fastest that a foot rolls that stands firmly [rad/s].
+_ROLLING = 0.4
 # A foot rolls over an edge of its sole, where its load is then: beyond this share of the way there
 # from the middle.
 _NEAR_EDGE = 0.9
@@ -289,7 +289,7 @@ def firm_foot_rate(
     for foot in range(len(stands)):
         if stands[foot] > 0 and (best < 0 or wrench[foot, 5] > wrench[best, 5]):
             best = foot
-    if best < 0 or wrench[best, 5] < _FIRM_SHARE * weight:
+    if best < 0 or wrench[best, 5] < FIRM_SHARE * weight:
         return False, (0.0, 0.0, 0.0)
     centre = centre_of_pressure(wrench[best], soles[best])
     for i in range(2):

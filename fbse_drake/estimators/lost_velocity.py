@@ -26,10 +26,9 @@ _AFTER = 0.25
 # When that happens again within this time [s], and still after this time [s], it is the IMU's
 # biases: a fault that lasts for a second is over by then.
 _AGAIN, _LONG = 3.0, 0.75
-# When all feet slide that carry more than this share of the weight, for how long they do so until
-# the velocity is as uncertain as they are fast [s]; and the tilt that makes such a velocity in half
-# a second [rad s/m].
-FIRM_SHARE, _SLIDING_TIME = 0.3, 0.1
+# When all feet that stand firmly slide, for how long they do so until the velocity is as uncertain
+# as they are fast [s]; and the tilt that makes such a velocity in half a second [rad s/m].
+_SLIDING_TIME = 0.1
 TILT_BY_VELOCITY = 1.0 / (9.81 * 0.5)
 # It is they that slip, and not the velocity that is wrong, unless they slide for more than this
 # share of about this time [s].

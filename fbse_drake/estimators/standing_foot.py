@@ -64,7 +64,9 @@ _HABIT_TIME = 0.4
 _LARGEST_HABIT = 36.0
 # A foot slides that is faster along its sole than so many times what it does in spite of all.
 SLIDES = 3.0
-# A foot that carries less than this share of the weight moves more easily the less it carries.
+# A foot that carries more than this share of the weight stands firmly ...
+FIRM_SHARE = 0.3
+# ... and one that carries less than this moves more easily the less it carries.
 _FIRM_LOAD = 0.5
 
 
