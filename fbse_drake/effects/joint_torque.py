@@ -222,6 +222,17 @@ class JointTorqueEffect(Effect):
         """
         return None
 
+    @staticmethod
+    def basis_at_once(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
+        """Torque per unit of each linear parameter in each of N steps that follow each other,
+        (p, ..., N, n), where that can be had faster than by the memory of each.
+
+        Args:
+            motion: arrays (N, n).
+            nonlinear: shape (m, ..., 1, n).
+        """
+        return None
+
     def resolve(
         self, names: RobotDescription, *, key: str = "", is_change: bool = False
     ) -> "ResolvedJointTorque":
@@ -285,6 +296,9 @@ def basis_over_time(
     """
     samples, n = motion.velocity.shape
     sets = nonlinear.shape[1:-1]
+    at_once = effect.basis_at_once(motion, nonlinear[..., None, :])
+    if at_once is not None:
+        return at_once
     memory = effect.memory_over_time(motion, nonlinear[..., None, :]) if effect.has_memory else ()
     if memory is not None:
         basis, _ = effect.basis(motion._replace(memory=memory), nonlinear[..., None, :])

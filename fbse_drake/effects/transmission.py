@@ -269,39 +269,56 @@ class Backlash(JointTorqueEffect):
 
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
-        at_start = motion._replace(command=motion.command[:1], velocity=motion.velocity[:1])
-        first = Backlash.start(at_start, nonlinear)
-        # Time first, all else in one axis.
-        command, *others = np.broadcast_arrays(*_of_steps(motion, nonlinear))
-        steps = [
-            np.array(np.moveaxis(array, -2, 0), order="C").reshape(array.shape[-2], -1)
-            for array in (command, *others)
-        ]
-        rows = len(first)
-        memory, _ = _crossings(first.reshape(rows, -1), *steps, motion.time_step)
-        of_joints = (*command.shape[:-2], command.shape[-1])
-        ends = np.moveaxis(memory[:, :-1].reshape(rows, -1, *of_joints), 1, -2)
-        return np.concatenate([first, ends], axis=-2)
+        first, command, steps = _columns_of_steps(motion, nonlinear)
+        memory = np.empty((len(command), *first.shape))
+        _cross_gaps(first.copy(), command, *steps, motion.time_step, memory, np.empty((0, 0)))
+        sets, joints = nonlinear.shape[1:-2], command.shape[1]
+        ends = memory[:-1].reshape(len(memory) - 1, len(first), *sets, joints)
+        starts = first.reshape(len(first), *sets, 1, joints)
+        return np.concatenate([starts, np.moveaxis(ends, 0, -2)], axis=-2)
+
+    @staticmethod
+    def basis_at_once(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray:
+        first, command, steps = _columns_of_steps(motion, nonlinear)
+        taken = np.empty((len(command), first.shape[1]))
+        _cross_gaps(first, command, *steps, motion.time_step, np.empty((0, 0, 0)), taken)
+        of_sets = taken.reshape(len(taken), *nonlinear.shape[1:-2], command.shape[1])
+        return np.moveaxis(of_sets, 0, -2)[None]
 
 
-def _of_steps(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray | float, ...]:
-    """What `_crossings` takes of steps."""
-    return motion.command, motion.velocity, motion.rotor_inertia, *nonlinear
+def _columns_of_steps(
+    motion: JointMotion, nonlinear: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """What `_cross_gaps` takes of N steps of n joints, for sets of values (m, ..., 1, n): what is
+    remembered at the start, the command, and the rest."""
+    n = motion.command.shape[1]
+    at_start = motion._replace(command=motion.command[:1], velocity=motion.velocity[:1])
+    first = Backlash.start(at_start, nonlinear)
+    columns = first.size // len(first)
+    command, velocity = (np.ascontiguousarray(a) for a in (motion.command, motion.velocity))
+    attached = np.ascontiguousarray(np.broadcast_to(motion.rotor_inertia, n), dtype=float)
+    values = np.broadcast_to(nonlinear, (len(nonlinear), *first.shape[1:]))
+    of_columns = values.reshape(len(nonlinear), columns)
+    return first.reshape(len(first), columns), command, (velocity, attached, *of_columns)
 
 
 def _cross(motion: JointMotion, nonlinear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Result of `_crossings` for one step, (rows, ...) and (...); the memory is what it begins
-    with."""
-    arrays = np.broadcast_arrays(*motion.memory, *_of_steps(motion, nonlinear))
+    """Memory at the end of a step, (rows, ...), and the torque that rotors take in it, (...)."""
+    arrays = np.broadcast_arrays(
+        *motion.memory, motion.command, motion.velocity, motion.rotor_inertia, *nonlinear
+    )
     rows, shape = len(motion.memory), arrays[0].shape
-    flat = [np.array(array, order="C").reshape(1, -1) for array in arrays]
-    memory, taken = _crossings(np.concatenate(flat[:rows]), *flat[rows:], motion.time_step)
+    flat = [np.array(array, dtype=float, order="C").reshape(-1) for array in arrays]
+    command, velocity, attached, *values = flat[rows:]
+    memory, taken = np.empty((1, rows, command.size)), np.empty((1, command.size))
+    steps = (command[None], velocity[None], attached, *values)
+    _cross_gaps(np.stack(flat[:rows]), *steps, motion.time_step, memory, taken)
     return memory.reshape(rows, *shape), taken.reshape(shape)
 
 
 @njit(cache=True)
-def _crossings(
-    start: np.ndarray,
+def _cross_gaps(
+    state: np.ndarray,
     command: np.ndarray,
     link_velocity: np.ndarray,
     attached: np.ndarray,
@@ -309,9 +326,10 @@ def _crossings(
     inertia: np.ndarray,
     contact_time: np.ndarray,
     time_step: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """What is remembered at the end of each step, (5, N, C), and the torque that rotors take in it
-    [Nm], (N, C).
+    memory: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Moves rotors through N steps of n joints, for C sets of values; column c is of joint c % n.
 
     Remembered are offset [rad] and velocity [rad/s] of a rotor against its link, the offset within
     half the gap to either side, or hardly beyond; the momentum of an impact that is still to reach
@@ -320,26 +338,35 @@ def _crossings(
     An impact lasts for a step from when the gap closes, so that all is smooth in the parameters.
 
     Args:
-        start: what is remembered at the start, (5, C).
-        command, link_velocity, attached, gap, inertia, contact_time: of each step, (N, C): the
-            command, the link's velocity at the end, the inertia of the rotor that the model has,
-            gap, inertia and contact time of the one that crosses it.
+        state: what is remembered at the start, (5, C); at the end, when it returns.
+        command, link_velocity: the command in each step, and the link's velocity at its end,
+            (N, n).
+        attached: inertia of the rotors that the model has, (n,).
+        gap, inertia, contact_time: of the rotors that cross their gaps, (C,) each.
+        memory: filled with what is remembered at the end of each step, (N, 5, C), if it has room.
+        torque: filled with what rotors take in each step [Nm], (N, C), if it has room.
     """
-    memory, torque = np.empty((len(start), *command.shape)), np.empty(command.shape)
-    for j in range(command.shape[1]):
-        x, v, coming, w, a = start[:, j]
-        for k in range(command.shape[0]):
-            R, side, contact = inertia[k, j], 0.5 * gap[k, j], contact_time[k, j]
-            last, w = w, link_velocity[k, j]
+    joints = command.shape[1]
+    for k in range(command.shape[0]):
+        for c in range(state.shape[1]):
+            j = c % joints
+            x, v, coming, last, a = (
+                state[0, c],
+                state[1, c],
+                state[2, c],
+                state[3, c],
+                state[4, c],
+            )
+            w, R, side, contact = link_velocity[k, j], inertia[c], 0.5 * gap[c], contact_time[c]
             if contact > time_step and side > 0.0:
                 a = (w - last) / time_step
-                before, drive, coming = v, command[k, j] - attached[k, j] * a, 0.0
+                before, drive, coming = v, command[k, j] - attached[j] * a, 0.0
                 x, v = _pushed_back(x, v, drive / R, side, contact, time_step)
                 taken = R * (v - before) / time_step
             else:
-                is_hit = coming != 0.0 and attached[k, j] > 0.0
+                is_hit = coming != 0.0 and attached[j] > 0.0
                 before, taken, coming = v, -coming / time_step, 0.0
-                drive = command[k, j] - attached[k, j] * a
+                drive = command[k, j] - attached[j] * a
                 v += time_step * drive / R
                 travel = time_step * v
                 room = side - np.sign(travel) * x
@@ -356,10 +383,12 @@ def _crossings(
                     taken += share * drive - (momentum - coming) / time_step
                     x, v = side * np.sign(travel), 0.0
                 a = (w - last) / time_step
-            for row, value in enumerate((x, v, coming, w, a)):
-                memory[row, k, j] = value
-            torque[k, j] = taken
-    return memory, torque
+            state[0, c], state[1, c], state[2, c], state[3, c], state[4, c] = x, v, coming, w, a
+            if memory.size:
+                for row in range(5):
+                    memory[k, row, c] = state[row, c]
+            if torque.size:
+                torque[k, c] = taken
 
 
 @njit(cache=True)
