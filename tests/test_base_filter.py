@@ -880,7 +880,10 @@ def test_biases_that_are_doubted_while_they_are_found_out_are_found_out_still(ru
     assert within.mean() > 0.97
     orientations = found["estimate/base/orientation"], log["truth/base/orientation"]
     ours, true = (Rotation.from_quat(q, scalar_first=True) for q in orientations)
-    assert np.rad2deg((ours * true.inv()).as_rotvec()[-1, 2]) == pytest.approx(0.0, abs=0.2)
+    turned = np.rad2deg((ours * true.inv()).as_rotvec())
+    assert turned[-1, 2] == pytest.approx(0.0, abs=0.2)
+    # Less where what always contradicts is let be while it is learned: 0.09 before.
+    assert np.sqrt(np.mean(turned[later, :2] ** 2, axis=0)).max() < 0.05
 
 
 @pytest.mark.parametrize("kind", ["reads too little", "is late"])

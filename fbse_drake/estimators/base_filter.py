@@ -73,6 +73,7 @@ from fbse_drake.estimators.records import Record, as_record, record, record_type
 from fbse_drake.estimators.recursive import LONGEST_COMPARED_TICK, Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.sensor_monitor import measurements_type
 from fbse_drake.estimators.spatial import (
+    GRAVITY,
     Vector,
     add,
     cross,
@@ -348,7 +349,7 @@ def _estimate_base(
     if lag > 0.0 and not first and trust.max() == 0 and last.status == 0:
         undo_lag(x.pad_force, x.pad_force_read, last.pad_force_read, lag, elapsed)
     mean_wrench = foot_wrenches(x.pad_force, known.pads.position, known.pads.foot, feet)
-    weight = known.mass * 9.81
+    weight = known.mass * GRAVITY
     w_now = subtract(w_raw, vector(x.gyro_bias_B))
     firm = x.foot_standing * known.is_flat
     rests, rolling = firm_foot_rate(firm, wrench, known.soles, weight, w_now, model)
@@ -559,7 +560,8 @@ class InvariantBaseFilter(RecursiveEstimator):
                                IMU and the feet that contradict the rest; `mean` (2, 3, 3) and
                                `load` (2, feet, 3) of the last 10 ms and 50 ms; `spread`; `rolling`
                                (3,); `habit` (3 + feet,), what always contradicts: an acceleration
-                               and a share of what each foot carries, and `habit_covariance`;
+                               and a share of what each foot carries, `habit_covariance`, and
+                               `habit_known`, 1 from when it has been learned;
                                `last_rate`, `last_rolling` (3,) and `was_firm` of the tick before;
                                `stepped`, `age` and `agreed`, for how long the gyro is doubted for
                                its step, all is watched, and nothing contradicts [s]

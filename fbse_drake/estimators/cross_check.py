@@ -56,6 +56,7 @@ def cross_check_type(feet: int, clock: Clock) -> np.dtype:
         rolling=(3,),
         habit=(3 + feet,),
         habit_covariance=(3 + feet, 3 + feet),
+        habit_known=(),
         last_rate=(3,),
         last_rolling=(3,),
         was_firm=(),
@@ -167,6 +168,8 @@ def cross_check(
         x.doubt[:], x.stepped = 0.0, 0.0
     # Neither who is doubted nor an impact or a spike is a habit.
     _learn_habit(x, x.doubt.max() == 0 and beyond_habit < _CONTRADICTION, elapsed)
+    if _HABIT_DOUBT * _habit_deviation(x) < _CONTRADICTION:
+        x.habit_known = 1.0
 
 
 @njit(cache=True)
@@ -234,7 +237,8 @@ def _learn_habit(x: np.ndarray, learns: bool, elapsed: float) -> None:
 def force_contradiction(x: np.ndarray, largest: Vector) -> float:
     """By how much foot forces and joints have contradicted the accelerometer of late [m/s^2].
 
-    What they always do does not count, and less than what the forces may be wrong by is none.
+    What they always do does not count, and less than what the forces may be wrong by is none, nor
+    is what may be a habit that is still being learned.
 
     Args:
         x: record of `cross_check_type`.
@@ -243,8 +247,9 @@ def force_contradiction(x: np.ndarray, largest: Vector) -> float:
     if x.age < _LONG:
         return 0.0
     z = _unusual(x, 1)
+    room = 0.0 if x.habit_known > 0 else _HABIT_DOUBT * _habit_deviation(x)
     for i in range(3):
-        if abs(z[i]) > largest[i]:
+        if abs(z[i]) > largest[i] + room:
             return norm(z)
     return 0.0
 

@@ -12,6 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
+# Acceleration of gravity, as Drake has it [m/s^2].
+GRAVITY = 9.81
+
 Vector = tuple[float, float, float]
 # [w, x, y, z].
 Quaternion = tuple[float, float, float, float]
