@@ -20,6 +20,7 @@ from fbse_drake.estimators.floating_base import ImuMount
 from fbse_drake.estimators.records import record, record_type
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator, Status
 from fbse_drake.estimators.spatial import (
+    GRAVITY,
     Quaternion,
     Vector,
     add,
@@ -122,7 +123,7 @@ def start_gravity(
         acceleration_variance, bias_variance, noise_variance: how large the robot's acceleration,
             the accelerometer's bias and its noise may be, per axis [m^2/s^4].
     """
-    g, a, b = 9.81**2, acceleration_variance, bias_variance
+    g, a, b = GRAVITY**2, acceleration_variance, bias_variance
     total = g + a + b + noise_variance
     # Covariance of one axis given the reading.
     covariance = (
@@ -165,7 +166,7 @@ def predict_gravity(
     gravity = add(x.gravity, scale(elapsed, cross(x.gravity, w)))
     acceleration = scale(fade, add(x.acceleration, scale(elapsed, cross(x.acceleration, w))))
     gg, ga, gb, aa, ab, bb = x.covariance
-    gg += (9.81 * elapsed) ** 2 * rate_variance
+    gg += (GRAVITY * elapsed) ** 2 * rate_variance
     aa = fade * fade * aa + (1 - fade * fade) * motion_acceleration**2
     return GravityEstimate(
         gravity,
@@ -356,7 +357,7 @@ def _estimate_attitude(
         # The base looks ahead, however the IMU sits on it.
         yaw = yaw_of(quaternion_product(q, q_IB))
         q = quaternion_product(rotation_vector_to_quaternion((0.0, 0.0, -yaw)), q)
-        tilt_variance = x.covariance[0] / 9.81**2
+        tilt_variance = x.covariance[0] / GRAVITY**2
         P = (tilt_variance, 0.0, config.angular_velocity_bias**2)
         y = QuaternionEstimate(q, (0.0, 0.0, 0.0), P, (0.0, 0.0, 0.0), 0.0)
     else:
@@ -365,7 +366,7 @@ def _estimate_attitude(
             # Nobody knows how the robot turns: hold, and let the next good readings have their way.
             drift = (_UNKNOWN_RATE * elapsed) ** 2
             gg, ga, gb, aa, ab, bb = x.covariance
-            P_gravity = (gg + 9.81**2 * drift, ga, gb, aa, ab, bb)
+            P_gravity = (gg + GRAVITY**2 * drift, ga, gb, aa, ab, bb)
             x = GravityEstimate(x.gravity, x.acceleration, x.bias, P_gravity, (0.0, 0.0, 0.0), 0.0)
             pp, pb, bb = y.covariance
             y = QuaternionEstimate(y.q, y.bias, (pp + drift, pb, bb), (0.0, 0.0, 0.0), 0.0)
@@ -378,7 +379,7 @@ def _estimate_attitude(
             w_free = subtract(w, y.bias)
             x = predict_gravity(x, w_free, rate_variance, motion, motion_time, elapsed)
             x = update_gravity(x, f, acceleration_noise**2)
-            tilt_variance = x.covariance[0] / 9.81**2
+            tilt_variance = x.covariance[0] / GRAVITY**2
             y = predict_quaternion(y, w, rate_noise**2, elapsed)
             by_gravity = quaternion_from_gravity(x.gravity, yaw_of(y.q))
             up_B, soles = level_direction(measured.support, model.foot_rotation)

@@ -19,6 +19,8 @@ _STILL_UNKNOWN = 0.25
 # estimate by a variance as large as what it takes from its own; and at least by so many random
 # walks.
 _LEASH, _LEASH_TIME, _LEAST_WALKS = 2.0, 1.0, 20.0
+# Where the biases of gyro and accelerometer begin in the error state.
+_BIASES = GYRO_BIAS, ACCELEROMETER_BIAS
 
 
 @njit(cache=True)
@@ -39,7 +41,7 @@ def leash_biases(x: Record, first: bool, elapsed: float, config: Record) -> None
     for sensor in range(2):
         bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
         for i in range(3):
-            at = (GYRO_BIAS if sensor == 0 else ACCELEROMETER_BIAS) + i
+            at = _BIASES[sensor] + i
             middle, learned = leash[0, sensor, i], max(0.0, leash[0, 2 + sensor, i] - P[at, at])
             reach = _LEASH * math.sqrt(learned)
             _set_bias(x, sensor, i, min(max(bias[i], middle - reach), middle + reach))
@@ -49,10 +51,10 @@ def leash_biases(x: Record, first: bool, elapsed: float, config: Record) -> None
 def unleash_biases(x: Record) -> None:
     """Of the IMU's biases nothing is known any more but by their covariance."""
     P, leash = x.error_covariance, x.leash
-    for i in range(3):
-        for known in range(2):
-            leash[known, 2, i] = P[GYRO_BIAS + i, GYRO_BIAS + i]
-            leash[known, 3, i] = P[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i]
+    for sensor in range(2):
+        for i in range(3):
+            at = _BIASES[sensor] + i
+            leash[0, 2 + sensor, i] = leash[1, 2 + sensor, i] = P[at, at]
 
 
 @njit(cache=True)
@@ -61,7 +63,7 @@ def _set_bias(x: Record, sensor: int, axis: int, value: float) -> None:
 
     What the filter took for a bias it also took for a tilt.
     """
-    at = (GYRO_BIAS if sensor == 0 else ACCELEROMETER_BIAS) + axis
+    at = _BIASES[sensor] + axis
     bias = x.gyro_bias_B if sensor == 0 else x.accelerometer_bias_B
     P, change = x.error_covariance, value - bias[axis]
     if change != 0.0 and P[at, at] > 0.0:
@@ -81,9 +83,10 @@ def _put_biases(to: np.ndarray, x: Record) -> None:
     """Fills (4, 3) with the biases of gyro and accelerometer in base axes, and their variances."""
     put(to[0], vector(x.gyro_bias_B))
     put(to[1], vector(x.accelerometer_bias_B))
-    for i in range(3):
-        to[2, i] = x.error_covariance[GYRO_BIAS + i, GYRO_BIAS + i]
-        to[3, i] = x.error_covariance[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i]
+    for sensor in range(2):
+        for i in range(3):
+            at = _BIASES[sensor] + i
+            to[2 + sensor, i] = x.error_covariance[at, at]
 
 
 @njit(cache=True)
@@ -100,7 +103,7 @@ def remember_biases(x: Record, is_doubtful: bool, first: bool, elapsed: float) -
         for sensor in range(2):
             for axis in range(3):
                 _set_bias(x, sensor, axis, kept[0, sensor, axis])
-                at = (GYRO_BIAS if sensor == 0 else ACCELEROMETER_BIAS) + axis
+                at = _BIASES[sensor] + axis
                 P[at, at] = max(P[at, at], _STILL_UNKNOWN * kept[0, 2 + sensor, axis])
         x.kept_for = 0.0
     else:

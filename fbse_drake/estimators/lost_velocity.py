@@ -18,7 +18,7 @@ from fbse_drake.estimators.invariant_error import (
     add_noise,
 )
 from fbse_drake.estimators.records import Record
-from fbse_drake.estimators.spatial import Vector, add, dot, put, scale, vector
+from fbse_drake.estimators.spatial import GRAVITY, Vector, add, dot, put, scale, vector
 from fbse_drake.estimators.standing_foot import SLIDES, land
 
 # When all feet that stand have contradicted the velocity for so long [s], it is not they that slip.
@@ -29,7 +29,7 @@ _AGAIN, _LONG = 3.0, 0.75
 # When all feet that stand firmly slide, for how long they do so until the velocity is as uncertain
 # as they are fast [s]; and the tilt that makes such a velocity in half a second [rad s/m].
 _SLIDING_TIME = 0.1
-TILT_BY_VELOCITY = 1.0 / (9.81 * 0.5)
+TILT_BY_VELOCITY = 1.0 / (GRAVITY * 0.5)
 # It is they that slip, and not the velocity that is wrong, unless they slide for more than this
 # share of about this time [s].
 _SLIDING_SHARE, _SLIDING_MEMORY = 0.25, 1.0

@@ -25,7 +25,7 @@ from fbse_drake.estimators.recursive import (
     Status,
     start_share,
 )
-from fbse_drake.estimators.spatial import vector
+from fbse_drake.estimators.spatial import GRAVITY, vector
 from fbse_drake.estimators.support import MeasuredSupport, SupportConfig, detect_support
 from fbse_drake.robot.plant import Robot
 from fbse_drake.sensors.foot_pads import FootPads, vertical_loads
@@ -395,7 +395,7 @@ def _watch_sensors(
         # What the feet must carry together: mass times specific force, or gravity where the IMU
         # says nothing.
         fx, fy, fz = vector(posterior.specific_force)
-        force = math.sqrt(fx * fx + fy * fy + fz * fz) if trust[1] == _OK else 9.81
+        force = math.sqrt(fx * fx + fy * fy + fz * fz) if trust[1] == _OK else GRAVITY
         weight = known.weighed_mass * max(5.0, force)
         if load.sum() < known.limits.smallest_load_share * weight:
             light = last.light + elapsed
@@ -497,7 +497,7 @@ class SensorMonitor(RecursiveEstimator):
         self._declare_posterior()
         checks_load = bool(legs) and robot.has_floating_base
         mass = robot.total_mass
-        measured, weight = support.trigger, 9.81 * mass
+        measured, weight = support.trigger, GRAVITY * mass
         self._known = record(
             limits=config,
             beliefs=beliefs,

@@ -63,7 +63,7 @@ from fbse_drake.estimators.recursive import (
     ticks_ago,
 )
 from fbse_drake.estimators.sensor_monitor import measurements_type
-from fbse_drake.estimators.spatial import dot, put, rotate, rotation, subtract, vector
+from fbse_drake.estimators.spatial import GRAVITY, dot, put, rotate, rotation, subtract, vector
 from fbse_drake.estimators.whole_body_updates import (
     DOUBT_TIME,
     GATE,
@@ -614,7 +614,7 @@ class WholeBodyFilter(RecursiveEstimator):
             weight_variance=self._weight_deviations() ** 2,
             weights=self._start()["weights"],
             variance=np.repeat([gyro**2, encoder**2], [3, n]),
-            weight=9.81 * robot.total_mass,
+            weight=GRAVITY * robot.total_mass,
             rotor_inertia=robot.rotor_inertias,
         )
         self._measurements = self._declare_record_input("measurements", measurements)
