@@ -133,3 +133,18 @@ def test_a_delay_between_two_samples_is_tentative(late: int, is_named: bool):
     if not is_named:
         text = diagnosis_outcome(diagnosis)
         assert "cannot tell whether something is missing: what the model leaves over looks" in text
+
+
+def test_a_motor_is_not_saturated_most_of_the_time():
+    """Friction that depends on the angle is in no library. Of a motor that gave hardly more than
+    the friction next to nothing would be left to explain: so it was said to be, by a limit that
+    torques exceeded for three quarters of the time."""
+    machine = replace(ARM, duration=20.0)
+    course = machine.course(16)
+    given = course.torque + coulomb(course) * (1.0 + 0.5 * np.sin(2.0 * course.position))
+    names = ("CoulombFriction", "TorqueSaturation", "ReflectedInertia")
+    tried = [library()[name] for name in names]
+    diagnosis = diagnose(machine.predictor(machine.log(course, given)), tried)
+    assert diagnosis.verdict == "unknown_effect"
+    assert {f.effect for f in (*diagnosis.chosen, *diagnosis.tentative)} == {"CoulombFriction"}
+    assert {structure.index for structure in diagnosis.unexplained} == set(range(6))

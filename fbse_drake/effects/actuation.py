@@ -1,7 +1,7 @@
 """Motors and drives: torques that are commanded and not given, or given and not commanded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -252,6 +252,18 @@ class TorqueSaturation(JointTorqueEffect):
     }
 
     limit: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def parameters_in(
+        cls, motion: JointMotion, parameters: dict[str, Parameter]
+    ) -> dict[str, Parameter]:
+        """A motor that most of the time gives less than is commanded moves nothing as it is
+        wished."""
+        limit = parameters["limit"]
+        least, (low, high) = float(np.median(np.abs(motion.command))), limit.plausible
+        plausible = (min(max(low, least), 0.5 * high), high)
+        bounds = (least, limit.bounds[1])
+        return parameters | {"limit": replace(limit, plausible=plausible, bounds=bounds)}
 
     @staticmethod
     def basis(

@@ -18,8 +18,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numba import njit
 
-from fbse_drake.effects.effect import Effect, ResolvedEffect
+from fbse_drake.effects.effect import Effect, Parameter, ResolvedEffect
 from fbse_drake.robot.description import RobotDescription
+
+# A law that rises as tanh(v / speed) has levelled off at so many of these speeds.
+_LEVEL = 3.0
 
 
 class JointMotion(NamedTuple):
@@ -211,6 +214,16 @@ class JointTorqueEffect(Effect):
         """Does what a joint did in N steps, (N, 1) each, show what the effect is?"""
         return True
 
+    @classmethod
+    def parameters_in(
+        cls,
+        motion: JointMotion,  # noqa: ARG003
+        parameters: dict[str, Parameter],
+    ) -> dict[str, Parameter]:
+        """Its parameters in a joint with what that joint did in N steps, (N, 1) each: some values
+        are not plausible then."""
+        return parameters
+
     @staticmethod
     def memory_over_time(motion: JointMotion, nonlinear: np.ndarray) -> np.ndarray | None:  # noqa: ARG004
         """Memory at the start of each of N steps that follow each other, (rows, ..., N, n), where
@@ -278,6 +291,27 @@ class ResolvedJointTorque(ResolvedEffect):
         for theta, b, db in zip(self.linear[1:], basis[1:], slopes[1:], strict=True):
             torque, slope = torque + theta * b, slope + theta * db
         return torque, slope
+
+    def held_at_rest(self, motion: JointMotion) -> np.ndarray:
+        """By how much it may hold joints that rest, to either side, (..., n) [Nm]: by all by which
+        it jumps when they begin to move. 0 of a law that does not jump.
+
+        Args:
+            motion: arrays (N, n).
+        """
+        rise = self.effect.rise(self.linear, self.nonlinear, motion)
+        if not rise.speeds:
+            return np.zeros(motion.velocity.shape)
+        with np.errstate(invalid="ignore"):
+            speed = np.broadcast_to(_LEVEL * np.max(rise.speeds, axis=0), motion.velocity.shape)
+            either = []
+            for velocity in (speed, -speed):
+                moving = motion._replace(velocity=velocity)
+                if self.effect.has_memory:
+                    moving = moving._replace(memory=self.effect.start(moving, self.nonlinear))
+                either.append(self.torque_and_slope(moving)[0])
+            jump = 0.5 * (either[0] - either[1]) - rise.damping * speed
+        return np.where(np.isfinite(jump), jump, 0.0)
 
 
 def basis_over_time(

@@ -133,10 +133,13 @@ class Dictionary:
         return max(abs(bound) for bound in first.plausible)
 
     def _parameters_on(self, effect: type[Effect], target: str) -> dict[str, Parameter]:
-        """See `Effect.parameters_on`."""
+        """See `Effect.parameters_on` and `JointTorqueEffect.parameters_in`."""
         key = effect, target
         if key not in self._on_target:
-            self._on_target[key] = effect.parameters_on(self.predictor.robot, target)
+            parameters = effect.parameters_on(self.predictor.robot, target)
+            if issubclass(effect, JointTorqueEffect):
+                parameters = effect.parameters_in(self._motion_of(target), parameters)
+            self._on_target[key] = parameters
         return self._on_target[key]
 
     @cached_property
@@ -175,9 +178,12 @@ class Dictionary:
         """Does what a joint did in the log show what an effect is?"""
         key = effect, joint
         if key not in self._shown:
-            place = np.array([self.joints.index(joint)])
-            self._shown[key] = effect.shows_in(self.predictor.joint_motion.of_joints(place))
+            self._shown[key] = effect.shows_in(self._motion_of(joint))
         return self._shown[key]
+
+    def _motion_of(self, joint: str) -> JointMotion:
+        """What one joint did, (N, 1) each."""
+        return self.predictor.joint_motion.of_joints(np.array([self.joints.index(joint)]))
 
     def serves(self, predictor: Predictor, effects: Collection[type[Effect]]) -> bool:
         """Is it of these effects, and of another predictor's model over the same log?"""
