@@ -47,6 +47,8 @@ from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 _LAW_DOUBT = 8.0
 # Of a row's variance; where no block has more it is not worth weighing the row anew.
 _NEGLIGIBLE_DOUBT = 0.25
+# A joint rests if its velocity is less than so many standard deviations of its error.
+_RESTS = 5.0
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
@@ -221,11 +223,14 @@ class Predictor:
         A law of the velocity does not say at which velocity within a step it holds: its torque is
         uncertain by its slope times what the velocity changes in the step. This counts where a
         sticking joint trembles. Of rows that are sampled at an instant it is uncertain by the error
-        of the velocity (effective variance, Orear 1982), which counts where a joint turns.
+        of the velocity (effective variance, Orear 1982), which counts where a joint turns; where
+        one rests, friction holds it by as much as is needed.
         """
         motion, joint_motion = self.motion, self.joint_motion
         if motion.recording.is_sampled:
-            return self._variance_by_velocity([law for law in laws if not law.effect.has_memory])
+            laws = list(laws)
+            of_velocity = [law for law in laws if not law.effect.has_memory]
+            return self._variance_by_velocity(of_velocity) + self._variance_at_rest(laws)
         slope = np.zeros(joint_motion.velocity.shape)
         for law in laws:
             if not law.effect.has_memory:
@@ -259,15 +264,31 @@ class Predictor:
 
         def change(velocity: np.ndarray) -> np.ndarray:
             """Of that torque, (B, n)."""
-            return block_means(
-                in_steps(motion.recording, torque(velocity) - torque_here), motion.length
-            )
+            return self._means_of_samples(torque(velocity) - torque_here)
 
         torque_here = torque(here.velocity)
         doubt = sum(np.square([change(v) for v in either_way]).mean(axis=0) for either_way in pairs)
         noise = motion.residual.variance[:, : doubt.shape[1]]
         matters = doubt.max(axis=0) > _NEGLIGIBLE_DOUBT * noise.mean(axis=0)
         return np.where(matters, doubt, 0.0)
+
+    def _means_of_samples(self, values: np.ndarray) -> np.ndarray:
+        """Averages over blocks, (B, n), of what was sampled, (N, n)."""
+        return block_means(in_steps(self.motion.recording, values), self.motion.length)
+
+    def _variance_at_rest(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
+        """Of the torque of laws that hold joints which rest, (B, n) [Nm^2]."""
+        if not laws or not self._rests.any():
+            return np.zeros(self._rests.shape)
+        held = sum(law.held_at_rest(self.joint_motion) for law in laws)
+        return np.where(self._rests, self._means_of_samples(np.square(held)), 0.0)
+
+    @cached_property
+    def _rests(self) -> np.ndarray:
+        """In which blocks joints rest, and did so before and do afterwards, (B, n) bool."""
+        velocity = self._means_of_samples(self.joint_motion.velocity)
+        moves = np.pad(np.abs(velocity) > _RESTS * self._velocity_error, ((1, 1), (0, 0)), "edge")
+        return ~(moves[:-2] | moves[1:-1] | moves[2:])
 
     @cached_property
     def _velocity_error(self) -> np.ndarray:
