@@ -180,6 +180,25 @@ def test_stuck_channels(run: Run) -> None:
     assert set(found.where) == set("xyz")
 
 
+def test_lost_samples(run: Run) -> None:
+    log, random = run(*GANTRY), np.random.default_rng(3)
+    torque = log["joint/torque_command"].copy()
+    assert "lost" not in {f.kind for f in findings(GANTRY, log)}
+    torque[random.random(len(torque)) < 0.03, KNEE] = 0.0
+    found = of_kind("lost", findings(GANTRY, changed(log, joint__torque_command=torque)))
+    assert found.where == ("left_knee_pitch",)
+    assert found.severity == "untrustworthy"
+    # Of torques near 0 nobody can say.
+    assert 1.0 < found.size < 3.5
+    # A drive that is switched off for a while, and one that chatters, lose nothing.
+    torque = log["joint/torque_command"].copy()
+    torque[100:200, KNEE] = 0.0
+    torque[:, HIP] *= np.arange(len(torque)) % 2
+    assert "lost" not in {
+        f.kind for f in findings(GANTRY, changed(log, joint__torque_command=torque))
+    }
+
+
 def test_clipped_torque_and_coarse_velocity_and_held_samples(run: Run) -> None:
     log = run(*GANTRY)
     torque = log["joint/torque_command"].copy()

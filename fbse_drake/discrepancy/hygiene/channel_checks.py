@@ -1,5 +1,5 @@
-"""Checks of a recording's channels by themselves: clock, stuck, clipped, held, coarse, filtered,
-ringing and noisy channels."""
+"""Checks of a recording's channels by themselves: clock, stuck, clipped, lost, held, coarse,
+filtered, ringing and noisy channels."""
 
 from collections.abc import Iterable
 
@@ -39,6 +39,9 @@ _SMALL_FORCE, _BRAKES = 0.5, 0.5
 # Shortest run at its largest value of a channel that is clipped [samples], and the share of the log
 # that such runs need.
 _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
+# Readings that are lost are 0 for so many samples at most, that much farther from those around them
+# than neighbours usually are; so many of them are no chance.
+_LOST_RUN, _FAR_FROM_USUAL, _FEWEST_LOST = 3, 10.0, 3
 # A channel whose neighbouring samples are equal this often is sampled more slowly than the log.
 _REPEATED = 0.2
 # Number of samples from which on spectra are looked at.
@@ -208,6 +211,33 @@ def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:
         )
         if name != "joint/position":
             yield from remarks("clipped", "warning", name, found, "%", text)
+
+
+def check_lost(evidence: Evidence) -> Iterable[HygieneFinding]:
+    """Samples that are exactly 0 amid others that are all but that: readings that were lost."""
+    for name, (values, parts) in evidence.channels.items():
+        found = {}
+        for k, part in enumerate(parts):
+            column = values[:, k]
+            usual = float(np.median(np.abs(np.diff(column))))
+            far = _FAR_FROM_USUAL * max(usual, evidence.quantum[name][k])
+            lost = [
+                stop - start
+                for start, stop in _runs(column == 0.0)
+                if 0 < start
+                and stop < len(column)
+                and stop - start <= _LOST_RUN
+                and min(column[start - 1] * np.sign(column[stop]), abs(column[stop])) > far
+            ]
+            if len(lost) >= _FEWEST_LOST:
+                found[part] = 100 * sum(lost) / len(column)
+        text = (
+            "{where} is exactly 0 in {size} of the samples, amid values that are far from it: "
+            "readings that were lost; leave these rows out"
+        )
+        # A foot in the air reads nothing, also between two touches.
+        if not name.startswith("foot/"):
+            yield from remarks("lost", "untrustworthy", name, found, "%", text)
 
 
 def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
@@ -401,6 +431,7 @@ CHECKS = (
     check_sampling,
     check_stuck,
     check_clipped,
+    check_lost,
     check_slow_channels,
     check_steps,
     check_filtered,
