@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from fbse_drake.discrepancy.diagnosis.reading import Reading, in_steps, is_read
 from fbse_drake.discrepancy.diagnosis.regressors import Regressors, noisier_signals
@@ -47,8 +48,9 @@ from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
 _LAW_DOUBT = 8.0
 # Of a row's variance; where no block has more it is not worth weighing the row anew.
 _NEGLIGIBLE_DOUBT = 0.25
-# A joint rests if its velocity is less than so many standard deviations of its error.
-_RESTS = 5.0
+# A joint rests if its velocity is less than so many standard deviations of its error for so long
+# [s], and it moves by less than this share of what it could so without being seen to.
+_RESTS, _WHILE, _STAYS = 5.0, 0.2, 0.1
 # A column that is smaller than this share of the others is rounding.
 _ROUNDING = 1e-9
 # A law without memory is evaluated at least so often in a block, if the log has that many samples.
@@ -285,10 +287,17 @@ class Predictor:
 
     @cached_property
     def _rests(self) -> np.ndarray:
-        """In which blocks joints rest, and did so before and do afterwards, (B, n) bool."""
+        """In which blocks joints rest, (B, n) bool: for a while they are not seen to move, and
+        their angles stay where they are."""
         velocity = self._means_of_samples(self.joint_motion.velocity)
-        moves = np.pad(np.abs(velocity) > _RESTS * self._velocity_error, ((1, 1), (0, 0)), "edge")
-        return ~(moves[:-2] | moves[1:-1] | moves[2:])
+        position = self._means_of_samples(self.motion.signals.joint_position)
+        unseen = _RESTS * self._velocity_error
+        size = max(3, round(_WHILE / (self.motion.length * self.motion.period)))
+        slow = minimum_filter1d(np.abs(velocity) <= unseen, size, axis=0, mode="constant")
+        path = maximum_filter1d(position, size, axis=0) - minimum_filter1d(position, size, axis=0)
+        stays = slow & (path <= _STAYS * unseen * _WHILE + _ROUNDING)
+        # Within the first and the last block it may have moved.
+        return maximum_filter1d(stays, size - 2, axis=0, mode="constant")
 
     @cached_property
     def _velocity_error(self) -> np.ndarray:

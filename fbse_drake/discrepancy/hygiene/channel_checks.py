@@ -214,30 +214,28 @@ def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 
 def check_lost(evidence: Evidence) -> Iterable[HygieneFinding]:
-    """Samples that are exactly 0 amid others that are all but that: readings that were lost."""
-    for name, (values, parts) in evidence.channels.items():
-        found = {}
-        for k, part in enumerate(parts):
-            column = values[:, k]
-            usual = float(np.median(np.abs(np.diff(column))))
-            far = _FAR_FROM_USUAL * max(usual, evidence.quantum[name][k])
-            lost = [
-                stop - start
-                for start, stop in _runs(column == 0.0)
-                if 0 < start
-                and stop < len(column)
-                and stop - start <= _LOST_RUN
-                and min(column[start - 1] * np.sign(column[stop]), abs(column[stop])) > far
-            ]
-            if len(lost) >= _FEWEST_LOST:
-                found[part] = 100 * sum(lost) / len(column)
-        text = (
-            "{where} is exactly 0 in {size} of the samples, amid values that are far from it: "
-            "readings that were lost; leave these rows out"
-        )
-        # A foot in the air reads nothing, also between two touches.
-        if not name.startswith("foot/"):
-            yield from remarks("lost", "untrustworthy", name, found, "%", text)
+    """Torques that are exactly 0 amid others that are all but that: readings that were lost."""
+    found = {}
+    values, parts = evidence.channels.get(_TORQUE, (np.zeros((0, 0)), []))
+    for k, part in enumerate(parts):
+        column = values[:, k]
+        usual = float(np.median(np.abs(np.diff(column))))
+        far = _FAR_FROM_USUAL * max(usual, evidence.quantum[_TORQUE][k])
+        lost = [
+            stop - start
+            for start, stop in _runs(column == 0.0)
+            if 0 < start
+            and stop < len(column)
+            and stop - start <= _LOST_RUN
+            and min(column[start - 1] * np.sign(column[stop]), abs(column[stop])) > far
+        ]
+        if len(lost) >= _FEWEST_LOST:
+            found[part] = 100 * sum(lost) / len(column)
+    text = (
+        "{where} is exactly 0 in {size} of the samples, amid values that are far from it: "
+        "readings that were lost; leave these rows out"
+    )
+    yield from remarks("lost", "untrustworthy", _TORQUE, found, "%", text)
 
 
 def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:
