@@ -134,7 +134,8 @@ class Fits:
         predictor = self.dictionary.predictor
         names = predictor.robot.description
         resolved = [effect.resolve(names, is_change=True) for effect in explanation.effects]
-        residual = predictor.doubted(predictor.residual, resolved)
+        left = self.white.coloured(self.leftover(explanation))
+        residual = predictor.doubted(predictor.residual, resolved, left)
         if np.array_equal(residual.variance, self.white.residual.variance):
             return self, explanation
         fits = Fits(self.dictionary, WhitenedResidual(residual))

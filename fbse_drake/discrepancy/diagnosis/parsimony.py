@@ -551,11 +551,7 @@ def _simpler(
 
     @cache
     def reduced(k: int) -> Explanation:
-        reduction = reductions[k]
-        shared = _shared(explanation, member, reduction)
-        alone = [explanation, *_apart(proposals, explanation, member, shared)]
-        found = (_with_laws(proposals, one, member, reduction.effects) for one in alone)
-        return min(found, key=lambda e: e.deviance)
+        return _with_reduction(proposals, explanation, member, reductions[k])
 
     if not reductions:
         return
@@ -592,7 +588,7 @@ def _at_least(
     for reduction in reversed(member.effect.reductions):
         if not tried.issuperset(reduction.effects):
             continue
-        smaller = _with_laws(proposals, explanation, member, reduction.effects)
+        smaller = _with_reduction(proposals, explanation, member, reduction)
         pay = judge.all_pay(smaller, reduction.effects, member.targets)
         if pay and smaller.deviance < without.deviance - MARGIN:
             yield smaller
@@ -624,6 +620,17 @@ def _with_another(
         stays = all(is_shown(fits, better.as_fitted(c)) for c in better.candidates)
         if stays and judge.after(better).pays(rest, better, added):
             yield better
+
+
+def _with_reduction(
+    proposals: Proposals, explanation: Explanation, member: Candidate, reduction: Reduction
+) -> Explanation:
+    """With the laws of a reduction in a member's place: those whose values its joints share with
+    others stay so, or they have values of their own, whichever is better."""
+    shared = _shared(explanation, member, reduction)
+    alone = [explanation, *_apart(proposals, explanation, member, shared)]
+    found = (_with_laws(proposals, one, member, reduction.effects) for one in alone)
+    return min(found, key=lambda e: e.deviance)
 
 
 def _shared(explanation: Explanation, member: Candidate, reduction: Reduction) -> list[Candidate]:

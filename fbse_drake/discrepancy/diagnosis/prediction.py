@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
+from scipy.ndimage import binary_propagation, maximum_filter1d, minimum_filter1d
 
 from fbse_drake.discrepancy.diagnosis.reading import Reading, in_steps, is_read
 from fbse_drake.discrepancy.diagnosis.regressors import Regressors, noisier_signals
@@ -197,17 +197,25 @@ class Predictor:
         known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
         return np.sum([self.scenario.ground.slope, *known], axis=0)
 
-    def doubted(self, residual: Residual, effects: Iterable[ResolvedEffect]) -> Residual:
+    def doubted(
+        self,
+        residual: Residual,
+        effects: Iterable[ResolvedEffect],
+        left: np.ndarray | None = None,
+    ) -> Residual:
         """A residual that is less certain because effects were taken off it.
 
         Friction laws are doubtful, see `law_variance`, and the sinking of soles is predicted from
         forces that are measured with noise.
+
+        Args:
+            left: what the effects leave of it, (B, R), if they may not be all; dry friction that is
+                in there holds joints at rest as well.
         """
         effects = list(effects)
+        laws = [e for e in effects if isinstance(e, ResolvedJointTorque)]
         doubt = np.zeros_like(residual.variance)
-        doubt[:, : len(self.robot.joint_names)] = self.law_variance(
-            e for e in effects if isinstance(e, ResolvedJointTorque)
-        )
+        doubt[:, : len(self.robot.joint_names)] = self.law_variance(laws, left)
         soles, contact = self._soles, self.pad_contact
         for effect in effects:
             if effect.effect is GroundCompliance:
@@ -219,7 +227,9 @@ class Predictor:
                 residual = soles.settled(residual, late)
         return replace(residual, variance=residual.variance + doubt, doubt=residual.doubt + doubt)
 
-    def law_variance(self, laws: Iterable[ResolvedJointTorque]) -> np.ndarray:
+    def law_variance(
+        self, laws: Sequence[ResolvedJointTorque], left: np.ndarray | None = None
+    ) -> np.ndarray:
         """What friction laws that are taken off add to the noise, (B, n) [Nm^2].
 
         A law of the velocity does not say at which velocity within a step it holds: its torque is
@@ -227,12 +237,14 @@ class Predictor:
         sticking joint trembles. Of rows that are sampled at an instant it is uncertain by the error
         of the velocity (effective variance, Orear 1982), which counts where a joint turns; where
         one rests, friction holds it by as much as is needed.
+
+        Args:
+            left: see `doubted`.
         """
         motion, joint_motion = self.motion, self.joint_motion
         if motion.recording.is_sampled:
-            laws = list(laws)
             of_velocity = [law for law in laws if not law.effect.has_memory]
-            return self._variance_by_velocity(of_velocity) + self._variance_at_rest(laws)
+            return self._variance_by_velocity(of_velocity) + self._variance_at_rest(laws, left)
         slope = np.zeros(joint_motion.velocity.shape)
         for law in laws:
             if not law.effect.has_memory:
@@ -278,26 +290,47 @@ class Predictor:
         """Averages over blocks, (B, n), of what was sampled, (N, n)."""
         return block_means(in_steps(self.motion.recording, values), self.motion.length)
 
-    def _variance_at_rest(self, laws: Sequence[ResolvedJointTorque]) -> np.ndarray:
+    def _variance_at_rest(
+        self, laws: Sequence[ResolvedJointTorque], left: np.ndarray | None
+    ) -> np.ndarray:
         """Of the torque of laws that hold joints which rest, (B, n) [Nm^2]."""
-        if not laws or not self._rests.any():
-            return np.zeros(self._rests.shape)
-        held = sum(law.held_at_rest(self.joint_motion) for law in laws)
-        return np.where(self._rests, self._means_of_samples(np.square(held)), 0.0)
+        rests, motion = self._rests, self.joint_motion
+        if not rests.any():
+            return np.zeros(rests.shape)
+        left_dry = 0.0 if left is None else self._dry_friction_in(left)
+        held = left_dry + sum(law.held_at_rest(motion) for law in laws)
+        held = np.broadcast_to(held, motion.velocity.shape)
+        return np.where(rests, self._means_of_samples(np.square(held)), 0.0)
+
+    def _dry_friction_in(self, left: np.ndarray) -> np.ndarray:
+        """What follows the sign of the velocity, beside a constant and what is proportional to it,
+        where joints move, (n,) [Nm]."""
+        velocity, known = self._mean_velocity, self.motion.residual.known
+        moves = known[:, : velocity.shape[1]] & (np.abs(velocity) > _RESTS * self._velocity_error)
+        dry = np.zeros(velocity.shape[1])
+        for joint, there in enumerate(moves.T):
+            v = velocity[there, joint]
+            regressor = np.stack([np.sign(v), v, np.ones(len(v))], axis=1)
+            dry[joint] = np.linalg.lstsq(regressor, left[there, joint], rcond=None)[0][0]
+        return dry
+
+    @cached_property
+    def _mean_velocity(self) -> np.ndarray:
+        """Of the joints in each block, (B, n) [rad/s]."""
+        return self._means_of_samples(self.joint_motion.velocity)
 
     @cached_property
     def _rests(self) -> np.ndarray:
-        """In which blocks joints rest, (B, n) bool: for a while they are not seen to move, and
+        """In which blocks joints rest, (B, n) bool: they are not seen to move, and for a while
         their angles stay where they are."""
-        velocity = self._means_of_samples(self.joint_motion.velocity)
         position = self._means_of_samples(self.motion.signals.joint_position)
         unseen = _RESTS * self._velocity_error
         size = max(3, round(_WHILE / (self.motion.length * self.motion.period)))
-        slow = minimum_filter1d(np.abs(velocity) <= unseen, size, axis=0, mode="constant")
+        slow = np.abs(self._mean_velocity) <= unseen
+        long = minimum_filter1d(slow, size, axis=0, mode="constant")
         path = maximum_filter1d(position, size, axis=0) - minimum_filter1d(position, size, axis=0)
-        stays = slow & (path <= _STAYS * unseen * _WHILE + _ROUNDING)
-        # Within the first and the last block it may have moved.
-        return maximum_filter1d(stays, size - 2, axis=0, mode="constant")
+        stays = long & (path <= _STAYS * unseen * _WHILE + _ROUNDING)
+        return binary_propagation(stays, structure=[[0, 1, 0]] * 3, mask=slow)
 
     @cached_property
     def _velocity_error(self) -> np.ndarray:

@@ -162,6 +162,31 @@ def with_slopes(fits: Fits, explanation: Explanation) -> Explanation:
     return explanation if members == [*explanation.candidates] else fits.explain(members)
 
 
+def _where_they_hold(fits: Fits, explanation: Explanation) -> Explanation:
+    """An explanation with each member about the nonlinear values that were found, one after the
+    other, where that is better when these are held."""
+
+    def deviance(members: Sequence[Candidate]) -> float:
+        return fits.explain([_held(c) for c in members]).deviance
+
+    members = explanation.candidates
+    for k, candidate in enumerate(_about_found(fits, members)):
+        moved = (*members[:k], candidate, *members[k + 1 :])
+        if candidate is not members[k] and deviance(moved) < deviance(members):
+            members = moved
+    return fits.explain(members)
+
+
+def _held(candidate: Candidate) -> Candidate:
+    """A joint's law whose nonlinear values stay as they are; itself if it is none."""
+    s, m = candidate.signature, len(candidate.nonlinear)
+    if m == 0 or not issubclass(candidate.effect, JointTorqueEffect):
+        return candidate
+    linear = np.arange(s.values.shape[2]) < s.values.shape[2] - m
+    lowest, highest = (np.where(linear, bound, 0.0) for bound in (s.lowest, s.highest))
+    return replace(candidate, signature=replace(s, lowest=lowest, highest=highest))
+
+
 def consistent(
     fits: Fits, explanation: Explanation
 ) -> tuple[Explanation, IdentifiedInertia | None]:
@@ -173,6 +198,7 @@ def consistent(
         return explanation, None
     for _ in range(_POLISHINGS):
         explanation = polished(fits, explanation)
+    explanation = _where_they_hold(fits, explanation)
     signatures = [
         *(c.signature for c in explanation.candidates),
         fits.white.whiten_signature(fits.dictionary.inertia.signature()),

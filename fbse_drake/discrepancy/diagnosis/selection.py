@@ -48,8 +48,8 @@ def select(
         After every addition, before and after what was there already is checked beside it: all
         explanations so far, and the proposals for the last.
     """
-    proposals = Proposals(fits, barred)
-    path = [fits.explain([])]
+    fits, nothing = fits.doubting(fits.explain([]))
+    proposals, path = Proposals(fits, barred), [nothing]
     yield [*path], proposals
     if fits.dictionary.inertia is not None:
         fits, explanation = fits.doubting(_pruned(fits, proposals.plain_friction()))
