@@ -16,6 +16,7 @@ from fbse_drake.discrepancy.residual.evidence import (
     remark,
     remarks,
 )
+from fbse_drake.discrepancy.residual.lost_readings import lost_readings
 from fbse_drake.discrepancy.residual.recorded_motion import RecordedMotion
 from fbse_drake.held_readings import rows_per_reading
 
@@ -39,9 +40,6 @@ _SMALL_FORCE, _BRAKES = 0.5, 0.5
 # Shortest run at its largest value of a channel that is clipped [samples], and the share of the log
 # that such runs need.
 _CLIPPED_RUN, CLIPPED_SHARE = 5, 0.005
-# Readings that are lost are 0 for so many samples at most, that much farther from those around them
-# than neighbours usually are; so many of them are no chance.
-_LOST_RUN, _FAR_FROM_USUAL, _FEWEST_LOST = 3, 10.0, 3
 # A channel whose neighbouring samples are equal this often is sampled more slowly than the log.
 _REPEATED = 0.2
 # Number of samples from which on spectra are looked at.
@@ -215,27 +213,20 @@ def check_clipped(evidence: Evidence) -> Iterable[HygieneFinding]:
 
 def check_lost(evidence: Evidence) -> Iterable[HygieneFinding]:
     """Torques that are exactly 0 amid others that are all but that: readings that were lost."""
-    found = {}
-    values, parts = evidence.channels.get(_TORQUE, (np.zeros((0, 0)), []))
-    for k, part in enumerate(parts):
-        column = values[:, k]
-        usual = float(np.median(np.abs(np.diff(column))))
-        far = _FAR_FROM_USUAL * max(usual, evidence.quantum[_TORQUE][k])
-        lost = [
-            stop - start
-            for start, stop in _runs(column == 0.0)
-            if 0 < start
-            and stop < len(column)
-            and stop - start <= _LOST_RUN
-            and min(column[start - 1] * np.sign(column[stop]), abs(column[stop])) > far
-        ]
-        if len(lost) >= _FEWEST_LOST:
-            found[part] = 100 * sum(lost) / len(column)
+    if _TORQUE not in evidence.channels:
+        return
+    values, parts = evidence.channels[_TORQUE]
+    shares = 100 * lost_readings(values).mean(axis=0)
+    found = {part: float(share) for part, share in zip(parts, shares, strict=True) if share > 0}
     text = (
         "{where} is exactly 0 in {size} of the samples, amid values that are far from it: "
-        "readings that were lost; leave these rows out"
+        "readings that were lost; "
     )
-    yield from remarks("lost", "untrustworthy", _TORQUE, found, "%", text)
+    if evidence.motion.recording.is_sampled:
+        text += "they are taken to lie between those around them"
+        yield from remarks("lost", "warning", _TORQUE, found, "%", text)
+    else:
+        yield from remarks("lost", "untrustworthy", _TORQUE, found, "%", text + "leave them out")
 
 
 def check_slow_channels(evidence: Evidence) -> Iterable[HygieneFinding]:

@@ -8,12 +8,11 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from fbse_drake.discrepancy.residual.blocks import block_means
+from fbse_drake.discrepancy.residual.lost_readings import between_lost
 from fbse_drake.discrepancy.residual.recorded_velocity import are_differences
 from fbse_drake.effects.sensor import SensorSignals
 from fbse_drake.errors import InputError
-from fbse_drake.held_readings import (
-    between_readings,
-)
+from fbse_drake.held_readings import between_readings
 from fbse_drake.log import Log
 from fbse_drake.robot.plant import Robot
 from fbse_drake.scenario import RecordingConfig
@@ -92,8 +91,8 @@ def read_signals(
 ) -> tuple[SensorSignals, np.ndarray]:
     """Sensor channels of a log on an even grid of its nominal period.
 
-    Late samples are interpolated, and what sensors hold between their readings; what lies in a gap
-    is marked. Without `joint/torque_command` torques are 0.
+    Late samples are interpolated, what sensors hold between their readings, and measured torques
+    that were lost; what lies in a gap is marked. Without `joint/torque_command` torques are 0.
 
     Args:
         differenced: see `differences_angles`.
@@ -174,7 +173,7 @@ def read_signals(
         specific_force=specific_force,
         angular_velocity=angular_velocity,
         pad_force=pad_force,
-        torque_command=on_grid(torque) if recording.is_sampled else held(torque),
+        torque_command=on_grid(between_lost(torque)) if recording.is_sampled else held(torque),
         motor_position=on_grid(log.get("joint/motor_position", np.zeros((len(log.time), 0)))),
     )
     return signals, known
