@@ -19,6 +19,12 @@ from fbse_drake.discrepancy.diagnosis.diagnose import (
     diagnose,
     diagnosis_json,
 )
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.fits import Fits
+from fbse_drake.discrepancy.diagnosis.naming import is_named
+from fbse_drake.discrepancy.diagnosis.proposals import Proposals
+from fbse_drake.discrepancy.diagnosis.refinement import converged
+from fbse_drake.discrepancy.identification.structure import leftover_structure
 from fbse_drake.effects.effect import library
 from fbse_drake.report.sentences import diagnosis_outcome
 
@@ -99,3 +105,23 @@ def test_what_takes_most_is_named(stranger: float, told: float):
     found = diagnosis_of(stranger=stranger, told=told)
     assert named(found.chosen) == FRICTION | {SPRING}
     assert not found.tentative
+
+
+@pytest.mark.parametrize("stranger", [1.0, 12.0])
+def test_a_hump_that_takes_less_than_is_left_is_not_named(stranger: float):
+    """Beside what nobody explains, a law with more parameters than Coulomb and viscous friction
+    takes some of it. Its hump is 4 times the noise here."""
+    course = MACHINE.course(2)
+    given, velocity = course.torque.copy(), course.velocity[:, 1]
+    hump = np.tanh(velocity / 0.02) * np.exp(-((velocity / 0.3) ** 2))
+    friction = 60.0 * np.tanh(velocity / 0.02) + 20.0 * velocity + 4.0 * hump / hump.std()
+    wave = stranger * np.sqrt(2) * np.sin(2 * np.pi * 3.7 * course.time)
+    given[:, 1] += NOISE[1] * (friction + wave)
+    law = library()["StribeckFriction"]
+    predictor = MACHINE.predictor(MACHINE.log(course, given))
+    proposals = Proposals(Fits(Dictionary(predictor, [*TRIED, law])))
+    fits, nothing = proposals.fits, proposals.fits.explain([])
+    final = converged(fits, proposals.beside(nothing, law, ("axis_2",)))
+    (member,) = final.candidates
+    left = leftover_structure(predictor.motion, fits.white, fits.leftover(final))
+    assert is_named(proposals, final, member, nothing, left) == (stranger == 1.0)

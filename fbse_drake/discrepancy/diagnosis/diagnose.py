@@ -14,6 +14,7 @@ from fbse_drake.discrepancy.diagnosis.disturbance import Disturbance
 from fbse_drake.discrepancy.diagnosis.experiment import Experiments
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import MARGIN, Fits
+from fbse_drake.discrepancy.diagnosis.naming import is_named, is_within_rows
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable, rival_name, rivals
 from fbse_drake.discrepancy.diagnosis.search import LateTorques, best_search, root_mean_square
@@ -22,7 +23,7 @@ from fbse_drake.discrepancy.diagnosis.spread import Spread, spreads, spreads_jso
 from fbse_drake.discrepancy.diagnosis.validation import Validation, validation_json
 from fbse_drake.discrepancy.identification.inertial import PARAMETERS, IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
-from fbse_drake.discrepancy.identification.structure import Structure, tolerated
+from fbse_drake.discrepancy.identification.structure import Structure
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
@@ -35,9 +36,6 @@ EffectVerdict = Literal["present", "absent", "not_visible", "confusable"]
 # there, and leaves no more than this many times the noise.
 _EXPLAINED = 0.97
 _LARGEST_REST = 5.0
-# A member that takes less than this share of what exceeds the noise in its rows without it is
-# tentative: it leaves more than it takes.
-_MOSTLY = 0.5
 
 
 @dataclass(frozen=True)
@@ -240,14 +238,8 @@ def diagnose(
         c: fits.explain([other for other in final.candidates if other is not c])
         for c in final.candidates
     }
-    within_rows = [c for c in matters if _is_within_rows(predictor, final, c)]
-    named = [
-        c
-        for c in matters
-        if c not in within_rows
-        and _takes_most(white, without[c], final, c)
-        and not _may_be_none(final, c)
-    ]
+    within_rows = [c for c in matters if is_within_rows(predictor, final, c)]
+    named = [c for c in matters if is_named(proposals, final, c, without[c], unexplained)]
     tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}
@@ -344,48 +336,6 @@ def _steps(
             ),
         )
         for explanation in path
-    )
-
-
-def _takes_most(
-    white: WhitenedResidual, without: Explanation, final: Explanation, member: Candidate
-) -> bool:
-    """Does a member take most of what exceeds the noise in its rows without it?
-
-    Rows count by what it takes there; in one with no more than what the noise may be wrong by
-    nothing is left.
-    """
-    rows = member.signature.rows[white.count[member.signature.rows] > 0]
-    before, after, count = without.held_out_sse[rows], final.held_out_sse[rows], white.count[rows]
-    most = np.array([tolerated(white, row) for row in rows])
-    left = np.where(after > most**2 * count, after - count, 0.0)
-    taken = np.maximum(before - after, 0.0)
-    if not left.any():
-        return True
-    share = taken / np.maximum(taken + left, 1e-30)
-    return bool(taken.any() and np.average(share, weights=taken) >= _MOSTLY)
-
-
-def _may_be_none(final: Explanation, member: Candidate) -> bool:
-    """Does the interval of a size without which there is no effect hold zero, as a gap's may, or
-    the mass of a payload?"""
-    _, intervals = final.values(member)
-    return any(
-        parameter.neutral == 0.0 and intervals[name][0] <= 0.0 <= intervals[name][1]
-        for name, parameter in member.parameters.items()
-    )
-
-
-def _is_within_rows(predictor: Predictor, final: Explanation, member: Candidate) -> bool:
-    """Does it say that torques come late by less than lies between samples of them?
-
-    Between two samples they are not known: where a joint turns, friction holds it, and that looks
-    so too.
-    """
-    return (
-        predictor.motion.recording.is_sampled
-        and member.effect in TorqueReadingLag.opposites
-        and max(final.values(member)[0].values()) < predictor.motion.period
     )
 
 
