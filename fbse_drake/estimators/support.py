@@ -10,6 +10,7 @@ from pydrake.systems.framework import System
 
 from fbse_drake.errors import InputError, require_not_negative
 from fbse_drake.estimators.chain import Chain
+from fbse_drake.estimators.records import Record
 from fbse_drake.sensors.errors import held_signal
 
 
@@ -80,7 +81,7 @@ def detect_support(
     elapsed: float,
     load: np.ndarray,
     trust: np.ndarray,
-    thresholds: np.ndarray,
+    thresholds: Record,
 ) -> None:
     """One tick of `MeasuredSupport`; all arrays have shape (feet,).
 

@@ -302,11 +302,12 @@ def diagnose(
         statuses,
         tuple(unexplained),
         _steps(path, found.error_before, [] if late is None else late.members),
-        found.error_before,
-        *(root_mean_square(white, sse) for sse in (final.held_out_sse, final.sse)),
-        inertia,
-        averaging,
-        partial,
+        held_out_before=found.error_before,
+        held_out_after=root_mean_square(white, final.held_out_sse),
+        train_after=root_mean_square(white, final.sse),
+        inertia=inertia,
+        averaging=averaging,
+        partial=partial,
         disturbances=found.disturbances,
         untested=search.untested,
         noisy=search.noisy,
@@ -476,9 +477,16 @@ def inertia_findings(
             )
             for name, value, width in zip(PARAMETERS, values, widths, strict=True)
         }
-        errors = (root_mean_square(white, sse) for sse in (before, alone.held_out_sse))
         findings.append(
-            Finding(InertialParameters.__name__, (body,), *errors, parameters, (), chosen=True)
+            Finding(
+                InertialParameters.__name__,
+                (body,),
+                root_mean_square(white, before),
+                root_mean_square(white, alone.held_out_sse),
+                parameters,
+                (),
+                chosen=True,
+            )
         )
     return findings
 

@@ -83,6 +83,7 @@ def identify(
     raw, alone = fits.white.sse, fits.explain([])
     progress("fitting plain friction")
     fitted, inertia = consistent(fits, Proposals(fits).plain_friction())
+    assert inertia is not None
     spread = spreads(fits, fitted)
     findings = [
         replace(

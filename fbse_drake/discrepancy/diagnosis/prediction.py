@@ -38,7 +38,7 @@ from fbse_drake.effects.joint_torque import (
     basis_over_time,
     deflection_over_time,
 )
-from fbse_drake.effects.sensor import SensorEffect
+from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
@@ -195,7 +195,7 @@ class Predictor:
     def _believed_slope(self) -> np.ndarray:
         """Of the model's ground, (2,) [rad], see `Ground.slope`."""
         known = [e.linear[:, 0] for e in self._known if issubclass(e.effect, GroundSlope)]
-        return np.sum([self.scenario.ground.slope, *known], axis=0)
+        return np.sum([np.array(self.scenario.ground.slope), *known], axis=0)
 
     def doubted(
         self,
@@ -380,7 +380,7 @@ class Predictor:
     @cached_property
     def is_driven(self) -> np.ndarray:
         """Which joints get any torque, (n,) bool: the others show nothing of a motor."""
-        return self.motion.signals.torque_command.any(axis=0)
+        return np.any(self.motion.signals.torque_command, axis=0)
 
     def rows_of(self, effect: type[JointTorqueEffect], joints: np.ndarray) -> np.ndarray:
         """Places of the rows in which a joint effect on some joints (T,) shows: their torques, and
@@ -678,7 +678,7 @@ class Predictor:
             )
         }
         changed = effect.from_values([target], values)
-        if issubclass(effect, InertiaEffect):
+        if isinstance(changed, InertiaEffect):
             return self._inertia_addition(changed, noisier=noisier)
         if issubclass(effect, GroundSlope):
             here = self._believed_slope
@@ -689,17 +689,16 @@ class Predictor:
                 regressors.impact_blocks
             )
         # By taking the effect off the signals.
+        assert isinstance(changed, SensorEffect)
         resolved, read = changed.resolve(self.robot.description), regressors.signals
-        memory = (
-            self.reading.remembered(resolved, read) if noisier else self._memory(effect, resolved)
-        )
+        memory = self.reading.remembered(resolved, read) if noisier else self._memory(resolved)
         signals = self.reading.undone(resolved, memory, read)
         return regressors.smooth_residual - Regressors(self.motion, signals).smooth_residual
 
-    def _memory(self, effect: type[SensorEffect], resolved: ResolvedEffect) -> np.ndarray:
+    def _memory(self, resolved: ResolvedSensorEffect) -> np.ndarray:
         """What an effect remembers over the log. It depends on the nonlinear parameters alone,
         where `undone` needs it."""
-        key = (effect, resolved.nonlinear.tobytes())
+        key = (resolved.effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
             self._memories[key] = self.reading.remembered(resolved)
         return self._memories[key]

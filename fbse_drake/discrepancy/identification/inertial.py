@@ -267,9 +267,12 @@ def untrusted_inertia(motion: RecordedMotion, bodies: Sequence[str]) -> Untruste
 
 def _of_body(robot: Robot, name: str) -> np.ndarray:
     """Inertial parameters of a body of the plant with what inertia effects added to it, (10,)."""
-    return sum(
-        inertial_parameters(body.default_spatial_inertia())
-        for body in [robot.body(name), *robot.added_to(name)]
+    return np.sum(
+        [
+            inertial_parameters(body.default_spatial_inertia())
+            for body in [robot.body(name), *robot.added_to(name)]
+        ],
+        axis=0,
     )
 
 
@@ -424,7 +427,7 @@ def base_columns(W: np.ndarray, sizes: np.ndarray) -> tuple[list[int], np.ndarra
         Indices of the D base columns in ascending order, and the factors with which all parameters
         enter each, (D, P); that of its own parameter is 1.
     """
-    R = np.linalg.qr(W, mode="r")
+    R = np.asarray(np.linalg.qr(W, mode="r"))
     kept: list[int] = []
     for p in range(W.shape[1]):
         own = R[:, p] - (R[:, kept] @ np.linalg.lstsq(R[:, kept], R[:, p])[0] if kept else 0.0)
