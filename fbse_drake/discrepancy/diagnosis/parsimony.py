@@ -626,10 +626,9 @@ def with_smaller_law(
     proposals: Proposals, explanation: Explanation, member: Candidate
 ) -> Explanation | None:
     """With the best of the smaller laws that a member contains in its place; None if it contains
-    none, or each joint is taken to have it."""
-    fits, tried = proposals.fits, set(proposals.fits.dictionary.effects)
-    is_given = fits.dictionary.inertia is not None and member.effect is CoulombViscousFriction
-    if is_given or not issubclass(member.effect, JointTorqueEffect):
+    none, or is but the sum of two."""
+    tried, is_sum = set(proposals.fits.dictionary.effects), member.effect is CoulombViscousFriction
+    if is_sum or not issubclass(member.effect, JointTorqueEffect):
         return None
     found = [
         _with_reduction(proposals, explanation, member, reduction)
