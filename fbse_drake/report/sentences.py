@@ -332,8 +332,8 @@ def _tentative(findings: Sequence[Finding]) -> str:
     )
     return (
         f" Tentative: {listed}. The completed model has {what}, but more is left there than {each} "
-        f"off, or {its} size may be none, or too small for how seldom the log is sampled, so "
-        "something else may be missing in its place."
+        f"off, alone or beyond a simpler law, or {its} size may be none, or too small for how "
+        "seldom the log is sampled, so something else may be missing in its place."
     )
 
 
