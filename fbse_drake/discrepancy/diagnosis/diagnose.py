@@ -239,7 +239,15 @@ def diagnose(
         for c in final.candidates
     }
     within_rows = [c for c in matters if is_within_rows(predictor, final, c)]
-    named = [c for c in matters if is_named(proposals, final, c, without[c], unexplained)]
+
+    def members_named() -> list[Candidate]:
+        return [c for c in matters if is_named(proposals, final, c, without[c], unexplained)]
+
+    try:
+        named = members_named()
+    except Interrupted as stop:
+        # Work is interrupted once.
+        partial, named = str(stop), members_named()
     tentative = [c for c in matters if c not in named]
     statuses: dict[str, EffectStatus] = {}
     equal: dict[int, list[Explanation]] = {}

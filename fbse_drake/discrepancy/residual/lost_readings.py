@@ -26,6 +26,8 @@ def _lost(column: np.ndarray) -> np.ndarray:
     before = np.maximum.accumulate(np.where(zero, -1, index))
     after = np.minimum.accumulate(np.where(zero, size, index)[::-1])[::-1]
     lost = zero & (before >= 0) & (after < size) & (after - before - 1 <= _LONGEST)
+    if not lost.any():
+        return lost
     left, right = column[before[lost]], column[after[lost]]
     usual = max(float(np.median(np.abs(np.diff(column)))), step_of(column))
     lost[lost] = np.minimum(left * np.sign(right), np.abs(right)) > _FAR_FROM_USUAL * usual
@@ -34,8 +36,9 @@ def _lost(column: np.ndarray) -> np.ndarray:
 
 def between_lost(torque: np.ndarray) -> np.ndarray:
     """Torques (N, n) with what was lost on straight lines between the samples around it."""
-    result, lost, index = torque.copy(), lost_readings(torque), np.arange(len(torque))
+    result, lost = torque.copy(), lost_readings(torque)
     for joint in np.flatnonzero(lost.any(axis=0)):
         there = lost[:, joint]
-        result[there, joint] = np.interp(index[there], index[~there], torque[~there, joint])
+        at, known = np.flatnonzero(there), np.flatnonzero(~there)
+        result[at, joint] = np.interp(at, known, torque[known, joint])
     return result
