@@ -166,7 +166,8 @@ def add_robot(
 
     Returns:
         With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
-        `torque_loss` of the effects in the step that ended (n,) [Nm] and what it is the sum of,
+        `torque_loss` of the effects in the step that ended (n,) [Nm] with the `friction` in it and
+        what it is the sum of,
         `net_actuation` and `explicit_force` (see `fbse_drake.effects.system.loss_over_time`),
         `deflection` of the motors against their links (n,) [rad],
         `plant_state`, `generalized_acceleration` and those of the plant that sensors need:
@@ -256,7 +257,7 @@ def add_joint_torques(
         trial: where every step is tried first, what it is tried with.
 
     Returns:
-        `torque_loss`, `deflection` and `explicit_force`.
+        `torque_loss`, `friction`, `deflection` and `explicit_force`.
     """
     plant, instance = robot.plant, robot.base.model_instance()
     effects = builder.AddNamedSystem("effects", JointTorqueEffects(law, robot, time_step, trial))
@@ -279,7 +280,7 @@ def add_joint_torques(
         builder.Connect(offset.get_output_port(), both.get_input_port(1))
         torque = both.get_output_port()
     builder.Connect(torque, plant.get_actuation_input_port())
-    given = ("torque_loss", "deflection", "explicit_force")
+    given = ("torque_loss", "friction", "deflection", "explicit_force")
     return {name: effects.GetOutputPort(name) for name in given}
 
 
@@ -319,7 +320,8 @@ def add_sensor_effects(
         motor_encoders="motor_position" in measured,
     )
     effects = builder.AddNamedSystem("sensor_effects", system)
-    connect_by_name(builder, {**measured, "torque_command": ports["torque_command"]}, effects)
+    torques = {name: ports[name] for name in ("torque_command", "friction")}
+    connect_by_name(builder, measured | torques, effects)
     split = builder.AddNamedSystem("distorted", Demultiplexer(list(system.sizes.values())))
     builder.Connect(effects.get_output_port(), split.get_input_port())
     return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(system.sizes)}

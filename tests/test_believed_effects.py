@@ -154,11 +154,16 @@ def test_corrections_undo_effects_tick_by_tick(effects_by_name: Mapping[str, Eff
         return system.get_output_port().Eval(context)
 
     sizes = np.concatenate([np.full(24, 0.5), np.full(6, 5.0), np.full(24, 200.0)])
+    friction = np.zeros(12)
     for _ in range(30):
         true, command = sizes * random.normal(size=len(sizes)), 50.0 * random.normal(size=12)
+        there.GetInputPort("friction").FixValue(contexts[there], friction)
         read = passed(there, true)
         assert np.abs(read - true).max() > 1.0
         np.testing.assert_allclose(passed(back, read), true, rtol=1e-12, atol=1e-9)
+        # What is estimated of the friction is known a tick later.
+        friction = 10.0 * random.normal(size=12)
+        back.GetInputPort("friction").FixValue(contexts[back], friction)
         for system, context in contexts.items():
             system.GetInputPort("torque_command").FixValue(context, command)
             system.ExecuteForcedEvents(context)
@@ -179,7 +184,8 @@ def test_what_has_no_opposite_is_undone_all_the_same(gain: float) -> None:
     values = WithoutOpposite({"left": gain}).resolve(robot.description)
     random, ticks = np.random.default_rng(2), 50
     joint, imu, force = (random.normal(size=(ticks, *size)) for size in ((12,), (3,), (8, 3)))
-    true = SensorSignals(joint, joint, imu, imu, 200.0 * force, joint, np.zeros((ticks, 0)))
+    joints = (joint, np.zeros((ticks, 0)), joint, joint)
+    true = SensorSignals(joint, joint, imu, imu, 200.0 * force, *joints)
     memory = np.zeros((0, ticks, 1))
     read = WithoutOpposite.reading(true, memory, values, robot)
     read.pad_force[7] = np.nan

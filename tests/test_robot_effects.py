@@ -285,7 +285,15 @@ def true_signals(log: Log) -> SensorSignals:
         np.concatenate([log[f"truth/foot/{side}/pad_force"] for side in log.sides], axis=1),
         log["joint/torque_command"],
         np.zeros((len(log.time), 0)),
+        load(log),
+        load(log),
     )
+
+
+def load(log: Log) -> np.ndarray:
+    """What passed the gears in the steps that ended, of a log of every step; nothing at first."""
+    left = log["joint/torque_command"] - log["truth/joint/friction_torque"]
+    return np.concatenate([np.zeros((1, left.shape[1])), left[:-1]])
 
 
 @pytest.mark.parametrize("name", ["paper_walk", "leg_swing_gantry"])
@@ -343,9 +351,8 @@ def test_misalignment_is_that_of_the_imu_configuration():
 def test_foot_force_errors(plain: Robot):
     force = np.random.default_rng(0).normal(size=(5, 8, 3))
     none = np.zeros((5, 12))
-    signals = SensorSignals(
-        none, none, np.zeros((5, 3)), np.zeros((5, 3)), force, none, np.zeros((5, 0))
-    )
+    still = np.zeros((5, 3))
+    signals = SensorSignals(none, none, still, still, force, none, np.zeros((5, 0)), none, none)
 
     def read(effect: SensorEffect) -> np.ndarray:
         return (
@@ -386,7 +393,7 @@ def test_foot_wrench_errors(description: str):
     first, second = robot.description.sides
     force = np.random.default_rng(0).normal(scale=50, size=(400, points, 3))
     none, still = np.zeros((400, n)), np.zeros((400, 3))
-    signals = SensorSignals(none, none, still, still, force, none, np.zeros((5, 0)))
+    signals = SensorSignals(none, none, still, still, force, none, np.zeros((5, 0)), none, none)
     true = wrenches(robot, force)
 
     def read(effect: SensorEffect) -> np.ndarray:
@@ -433,7 +440,7 @@ def test_foot_wrench_errors(description: str):
         )
 
 
-def test_elastic_transmission_follows_the_command_as_a_low_pass():
+def test_elastic_transmission_follows_as_a_low_pass_what_friction_leaves_of_the_command():
     compliance, time_constant = 5e-5, 0.008
     log = simulated(
         "leg_swing_gantry",
@@ -441,9 +448,10 @@ def test_elastic_transmission_follows_the_command_as_a_low_pass():
         effects=[TransmissionElasticity({"knee_pitch": compliance}, {"all": time_constant})],
     )
     knee, other = 3, 2
-    command = log["joint/torque_command"][:, knee]
+    behind, friction = (each[:, knee] for each in (load(log), log["truth/joint/friction_torque"]))
     keep = np.exp(-TICK / time_constant)
-    twist = lfilter([0.0, 1.0 - keep], [1.0, -keep], compliance * command)
+    twist = lfilter([1.0 - keep], [1.0, -keep], compliance * behind)
+    assert compliance * np.abs(friction).max() > 1e-5
     np.testing.assert_allclose(
         log["joint/position"][:, knee] - log["truth/joint/position"][:, knee], twist, atol=1e-13
     )
@@ -451,7 +459,7 @@ def test_elastic_transmission_follows_the_command_as_a_low_pass():
     # The exact velocity at the end of each step is the limit of the twist's slope.
     rate = (log["joint/velocity"] - log["truth/joint/velocity"])[1:, knee]
     np.testing.assert_allclose(
-        rate, (compliance * command[:-1] - twist[1:]) / time_constant, atol=1e-12
+        rate, (compliance * behind[1:] - twist[1:]) / time_constant, atol=1e-12
     )
     np.testing.assert_array_equal(
         log["joint/position"][:, other], log["truth/joint/position"][:, other]

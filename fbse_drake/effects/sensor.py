@@ -43,6 +43,10 @@ class SensorSignals:
     torque_command: np.ndarray
     # Of second encoders, on the motors' side, shape (..., n) [rad]; (..., 0) where there are none.
     motor_position: np.ndarray
+    # Torque that passed the gears as the step before began and as it ended, linear in between,
+    # shape (..., n) each [Nm]: the command less what friction and other effects took of it.
+    load_begin: np.ndarray
+    load_end: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -681,22 +685,24 @@ class MotorEncoderOffset(ShiftOrTurn):
 @in_library
 @dataclass(frozen=True)
 class TransmissionElasticity(ShiftOrTurn):
-    """A massless damped spring between motor and joint, with the encoder on the motor's side: it
+    """A massless damped spring between gear and link, with the encoder on the motor's side: it
     reads q + d, where
 
-    time_constant d_dot = compliance * command - d
+    time_constant d_dot = compliance * load - d
 
-    With encoders on both sides the second one reads this, and the first the link's angle. The
-    command is held from tick to tick, and the solution is exact. A loop of derivative gain kd
-    over such an encoder needs kd * compliance < time_constant.
+    The load is the torque that reaches the link: the command less friction and whatever else takes
+    of it, for these sit in motor and gear (Spong 1987, whose rotor is part of the link here). With
+    encoders on both sides the second one reads this, and the first the link's angle. The load is
+    linear in time within a step, and the solution is exact. A loop of derivative gain kd over such
+    an encoder needs kd * compliance < time_constant.
     """
 
     description: ClassVar[str] = (
         "The transmission twists under torque, and the encoder sits on the motor's side of it."
     )
     signature: ClassVar[str] = (
-        "Joint angles off in proportion to the torque command; a foot that stands seems to give "
-        "way under load."
+        "Joint angles off in proportion to the torque behind the friction; a foot that stands "
+        "seems to give way under load."
     )
     experiment: ClassVar[str] = (
         "Stand on one leg and shift the weight, or squat: large torques with little motion."
@@ -709,7 +715,8 @@ class TransmissionElasticity(ShiftOrTurn):
             "s", linear=False, plausible=(4e-3, 2e-2), bounds=(1e-6, np.inf)
         ),
     }
-    memory_size: ClassVar[int] = 2
+    # The load that the spring followed at the tick before, and what `_following` gives.
+    memory_size: ClassVar[int] = 3
 
     compliance: dict[str, float] = field(default_factory=dict)
     time_constant: dict[str, float] = field(default_factory=lambda: {"all": 5e-3})
@@ -722,15 +729,15 @@ class TransmissionElasticity(ShiftOrTurn):
         robot: Robot,  # noqa: ARG004
     ) -> SensorSignals:
         (compliance,), (time_constant,) = values.linear, values.nonlinear
-        followed, command = memory
+        followed = _followed(signals, memory)
         if signals.motor_position.shape[-1]:
             twisted = signals.motor_position + compliance * followed
             return replace(signals, motor_position=twisted)
+        rate = (signals.load_end - followed) / time_constant
         return replace(
             signals,
             joint_position=signals.joint_position + compliance * followed,
-            joint_velocity=signals.joint_velocity
-            + compliance * (command - followed) / time_constant,
+            joint_velocity=signals.joint_velocity + compliance * rate,
         )
 
     @staticmethod
@@ -741,12 +748,7 @@ class TransmissionElasticity(ShiftOrTurn):
         robot: Robot,  # noqa: ARG004
         period: float,
     ) -> np.ndarray:
-        """Torque that the spring has followed so far, and the command of the tick's step,
-        (2, n) [Nm]."""
-        command = signals.torque_command
-        return np.stack(
-            [command + (memory[0] - command) * np.exp(-period / values.nonlinear[0]), command]
-        )
+        return np.stack([_followed(signals, memory), *_following(values.nonlinear[0], period)])
 
     @classmethod
     def memory_over_time(
@@ -756,12 +758,31 @@ class TransmissionElasticity(ShiftOrTurn):
         robot: Robot,  # noqa: ARG003
         period: float,
     ) -> np.ndarray:
-        command, stays = signals.torque_command, np.exp(-period / values.nonlinear[0])
-        memory = np.zeros((cls.memory_size, *command.shape))
-        memory[1, 1:] = command[:-1]
+        begin, end = signals.load_begin, signals.load_end
+        stays, behind = _following(values.nonlinear[0], period)
+        memory = np.zeros((cls.memory_size, *end.shape))
+        memory[1, 1:], memory[2, 1:] = stays, behind
+        # Before the first tick it followed at once.
+        driven = (behind - stays) * begin + (1.0 - behind) * end
+        driven[0] = end[0]
         for joint, share in enumerate(stays):
-            memory[0, 1:, joint] = lfilter([1.0 - share], [1.0, -share], command[:-1, joint])
+            memory[0, 1:, joint] = lfilter([1.0], [1.0, -share], driven[:-1, joint])
         return memory
+
+
+def _followed(signals: SensorSignals, memory: np.ndarray) -> np.ndarray:
+    """Load that a spring has followed so far, (..., n) [Nm]."""
+    before, stays, behind = memory
+    begin, end = signals.load_begin, signals.load_end
+    return stays * before + (behind - stays) * begin + (1.0 - behind) * end
+
+
+def _following(time_constant: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """How a low-pass of first order follows what is linear in time over a period: share of where
+    it was that stays, and by what share of the change it is behind in the end, had it begun where
+    that began."""
+    stays = np.exp(-period / time_constant)
+    return stays, (1.0 - stays) * time_constant / period
 
 
 def _differs(difference: np.ndarray, measured: np.ndarray) -> bool:

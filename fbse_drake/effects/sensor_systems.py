@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, State
 
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorSignals
 from fbse_drake.robot.plant import Robot
@@ -19,8 +19,11 @@ class _Readings(LeafSystem):
     Inputs are `joint_state` [positions, velocities], shape (2n,) [rad, rad/s]; `imu` [specific
     force, angular velocity], shape (6,) [m/s^2, rad/s]; `pad_force` three components pad by pad
     [N]; `motor_position` (n,) [rad] of second encoders; each where the robot has it; and
-    `torque_command` (n,) [Nm]. The output, all of the former in this order, does not depend on the
-    command of its own tick, which is computed from it. Discrete state: each effect's memory.
+    `torque_command` of the step that begins and `friction`, what the joints' effects took of it in
+    the step that ended, (n,) [Nm]; none where that port is left open. The output, all of the
+    readings in this order, does not depend on the command of its own tick, which is computed from
+    it. Discrete state: the torque that passes the gears as far as it is known before the next
+    tick, and each effect's memory.
     """
 
     # Name of the output port.
@@ -60,17 +63,38 @@ class _Readings(LeafSystem):
             name: self.DeclareVectorInputPort(name, size) for name, size in self.sizes.items()
         }
         self._torque_command = self.DeclareVectorInputPort("torque_command", n)
+        self._friction = self.DeclareVectorInputPort("friction", n)
+        # Before the first tick nothing passed the gears.
+        self._load = self.DeclareDiscreteState(n)
         self._memories = [
             self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets))
             for effect in effects
         ]
-        sources = {self.input_port_ticket(p.get_index()) for p in self._readings.values()}
+        sources = {self.input_port_ticket(p.get_index()) for p in self._sources()}
         sources |= {self.xd_ticket()}
         size = sum(self.sizes.values())
         self.DeclareVectorOutputPort(self._gives, size, weakly(self._calc), sources)
         if any(effect.effect.memory_size for effect in effects):
             self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
             self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
+
+    def _sources(self) -> list[InputPort]:
+        """What the output depends on at once."""
+        return [*self._readings.values()]
+
+    def _friction_in(self, context: Context) -> np.ndarray:
+        """Friction, as far as it is known, (n,) [Nm]."""
+        if not self._friction.HasValue(context):
+            return np.zeros(self._friction.size())
+        return np.nan_to_num(self._friction.Eval(context))
+
+    @abstractmethod
+    def _load_now(self, context: Context) -> np.ndarray:
+        """Torque that passed the gears in the step that ended, (n,) [Nm]."""
+
+    @abstractmethod
+    def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:
+        """What is known to pass the gears of a command in the step that begins, (n,) [Nm]."""
 
     @abstractmethod
     def _passed(
@@ -88,7 +112,10 @@ class _Readings(LeafSystem):
         imu = read.get("imu", np.zeros(6))
         pads = read.get("pad_force", np.zeros(0)).reshape(-1, 3)
         motors = read.get("motor_position", np.zeros(0))
-        return SensorSignals(position, velocity, imu[:3], imu[3:], pads, torque_command, motors)
+        load = self._load_now(context)
+        return SensorSignals(
+            position, velocity, imu[:3], imu[3:], pads, torque_command, motors, load, load
+        )
 
     def _memory(self, context: Context) -> list[np.ndarray]:
         return [
@@ -109,7 +136,11 @@ class _Readings(LeafSystem):
 
     def _remember(self, context: Context, state: State) -> None:
         memories = self._memory(context)
-        signals = self._signals(context, self._torque_command.Eval(context))
+        command = self._torque_command.Eval(context)
+        signals = self._signals(context, command)
+        if np.isfinite(command).all():
+            load = self._load_of(context, command)
+            state.get_mutable_discrete_state(self._load).set_value(load)
         _, found = self._passed(signals, memories)
         for i, effect in enumerate(self._effects):
             if effect.effect.memory_size:
@@ -140,6 +171,7 @@ class SensorEffects(_Readings):
         - pad_force
         - motor_position
         - torque_command
+        - friction (optional)
         output_ports:
         - measured
 
@@ -147,6 +179,16 @@ class SensorEffects(_Readings):
     """
 
     _gives = "measured"
+
+    def _sources(self) -> list[InputPort]:
+        return [*super()._sources(), self._friction]
+
+    def _load_now(self, context: Context) -> np.ndarray:
+        command = context.get_discrete_state(self._load).value()
+        return command - self._friction_in(context)
+
+    def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:  # noqa: ARG002
+        return command
 
     def _passed(
         self, signals: SensorSignals, memories: Sequence[np.ndarray]
@@ -169,6 +211,7 @@ class SensorCorrections(_Readings):
         - imu
         - pad_force
         - torque_command
+        - friction (optional)
         output_ports:
         - corrected
 
@@ -176,6 +219,13 @@ class SensorCorrections(_Readings):
     """
 
     _gives = "corrected"
+
+    # What is known of the friction may come from what is corrected: it is that of the step before.
+    def _load_now(self, context: Context) -> np.ndarray:
+        return context.get_discrete_state(self._load).value()
+
+    def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:
+        return command - self._friction_in(context)
 
     def _passed(
         self, signals: SensorSignals, memories: Sequence[np.ndarray]

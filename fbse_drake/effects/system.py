@@ -29,10 +29,10 @@ from fbse_drake.wiring import weakly
 _CARRIED_ON = 0.5
 # A law that the solver takes but for this share of it is solved exactly.
 _ROUNDING = 1e-12
-# Rows of (n,) of what a tick remembers: explicit torque; velocity when the step begins, and its
-# change in the last step; position and command when it begins; then offsets of clamps and memories
-# of effects.
-_EXPLICIT, _VELOCITY, _CHANGE, _POSITION, _COMMAND, _ROWS = range(6)
+# Rows of (n,) of what a tick remembers: explicit torque, and that of it which lets motors be ahead
+# of their links; velocity when the step begins, and its change in the last step; position and
+# command when it begins; then offsets of clamps and memories of effects.
+_EXPLICIT, _AHEAD, _VELOCITY, _CHANGE, _POSITION, _COMMAND, _ROWS = range(7)
 
 
 class Tick(NamedTuple):
@@ -113,7 +113,7 @@ def _begin(tick: Tick, last: Tick, joint_state: np.ndarray) -> np.ndarray:
     """
     n, now, before = len(joint_state) // 2, tick.memory, last.memory
     now[_POSITION], now[_VELOCITY] = joint_state[:n], joint_state[n:]
-    now[_CHANGE] = 0.0
+    now[_CHANGE] = now[_AHEAD] = 0.0
     expected = joint_state[n:].copy()
     if not math.isnan(before[_VELOCITY, 0]):
         for j in range(n):
@@ -189,6 +189,7 @@ class ExplicitTorque(LeafSystem):
         - plant_state (optional)
         output_ports:
         - torque_loss
+        - friction
         - tick
         - deflection
 
@@ -200,7 +201,8 @@ class ExplicitTorque(LeafSystem):
     `joint_state` is [positions, velocities], (2n,) [rad, rad/s]; `net_actuation` is the plant's
     [Nm], of the step that ended; `torque_command` (n,) [Nm] is of the step that begins;
     `plant_state` is there where steps are tried. `torque_loss` (n,) [Nm] is that of the step that
-    ended (zero before the first); `tick` has the parts of `Tick`; `deflection` (n,) [rad] is by how
+    ended (zero before the first), and `friction` what is left of it without what lets the motors be
+    ahead of their links; `tick` has the parts of `Tick`; `deflection` (n,) [rad] is by how
     much effects let the motors be ahead of their links now. Discrete state: the last tick.
     """
 
@@ -256,8 +258,8 @@ class ExplicitTorque(LeafSystem):
         self._torque_loss = self.DeclareVectorOutputPort(
             "torque_loss", n, weakly(self._calc_loss), sources
         )
+        self.DeclareVectorOutputPort("friction", n, weakly(self._calc_friction), sources)
         # Nor does the deflection: encoders read it before there is one.
-        sources = {self.input_port_ticket(self._joint_state.get_index()), self.xd_ticket()}
         self.DeclareVectorOutputPort(
             "deflection", n, weakly(self._calc_deflection), {*sources, self.time_ticket()}
         )
@@ -271,6 +273,11 @@ class ExplicitTorque(LeafSystem):
         # As a whole the solver's part would take longer to hand over than the sum takes.
         solver = (self._solver.damping, self._solver.clamp)
         output.SetFromVector(_loss(last, *ended, *solver, self._velocities))
+
+    def _calc_friction(self, context: Context, output: BasicVector) -> None:
+        last = _parts(context.get_discrete_state().value(0), self._joints, self._velocities)
+        ahead = last.memory[_AHEAD]
+        output.SetFromVector(self._torque_loss.Eval(context) - np.nan_to_num(ahead))
 
     def _calc_deflection(self, context: Context, output: BasicVector) -> None:
         last = _parts(context.get_discrete_state().value(0), self._joints, self._velocities)
@@ -316,9 +323,13 @@ class ExplicitTorque(LeafSystem):
 
     def _put_force(self, tick: Tick, motion: JointMotion) -> None:
         """Fills the force of a step that ends as is expected."""
-        torque = look_up(self._table, motion.velocity)
+        torque, ahead = look_up(self._table, motion.velocity), tick.memory[_AHEAD]
+        ahead[:] = 0.0
         for _, effect, rows in self._others:
-            torque += effect.torque_and_slope(motion._replace(memory=tick.memory[rows]))[0]
+            more = effect.torque_and_slope(motion._replace(memory=tick.memory[rows]))[0]
+            torque += more
+            if effect.effect.deflects:
+                ahead += more
         _finish(tick, motion.velocity, torque, tick.memory[self._offsets], self._solver)
 
     def _motion(
@@ -364,13 +375,14 @@ class JointTorqueEffects(Diagram):
         - torque_command
         output_ports:
         - torque_loss
+        - friction
         - deflection
         - explicit_force
         - clamp_offset
 
     Inputs are those of `ExplicitTorque`. `torque_loss` (n,) [Nm] is that of the plant step that
-    ended (zero before the first), `deflection` that of `ExplicitTorque`. `explicit_force` goes to
-    the plant's applied generalized force;
+    ended (zero before the first), `friction` and `deflection` those of `ExplicitTorque`.
+    `explicit_force` goes to the plant's applied generalized force;
     `clamp_offset` are offsets of the clamps, row by row (m n,) [Nm], where any has one.
     """
 
@@ -394,7 +406,7 @@ class JointTorqueEffects(Diagram):
         for i in range(explicit.num_input_ports()):
             port = explicit.get_input_port(i)
             builder.ExportInput(port, port.get_name())
-        for name in ("torque_loss", "deflection"):
+        for name in ("torque_loss", "friction", "deflection"):
             builder.ExportOutput(explicit.GetOutputPort(name), name)
         builder.ExportOutput(split.get_output_port(0), "explicit_force")
         if law.moves_clamps:

@@ -12,6 +12,8 @@ from fbse_drake.effects.sensor import ResolvedSensorEffect
 from fbse_drake.effects.sensor_systems import SensorCorrections
 from fbse_drake.errors import InputError
 from fbse_drake.estimators.beliefs import SensorBeliefs
+from fbse_drake.estimators.believed_friction import BelievedFriction
+from fbse_drake.estimators.friction_regressor import FrictionRegressor
 from fbse_drake.estimators.records import parts, size_of
 from fbse_drake.estimators.recursive import Clock, RecursiveEstimator
 from fbse_drake.robot.plant import Robot
@@ -31,6 +33,8 @@ class Workshop:
         self.inputs: dict[str, InputPort] = {}
         # Readings that something is taken off first, by signal.
         self.corrected: dict[str, OutputPort] = {}
+        # Takes the friction, where what is taken off may depend on it.
+        self.friction: InputPort | None = None
         # What chains have in common: of what it was made, and its systems by name.
         self.parts: list[tuple[object, dict[str, RecursiveEstimator]]] = []
 
@@ -52,6 +56,8 @@ class Workshop:
         has_imu = robot.description.imu is not None or robot.has_floating_base
         system = SensorCorrections(effects, robot, clock.period, imu=has_imu)
         self.builder.AddNamedSystem("sensor_corrections", system)
+        if any(effect.effect.memory_size for effect in effects):
+            self.friction = system.GetInputPort("friction")
         split = self.builder.AddNamedSystem(
             "corrected_sensors", Demultiplexer(list(system.sizes.values()))
         )
@@ -65,6 +71,32 @@ class Workshop:
         for i, name in enumerate(system.sizes):
             self.feed(f"measured_{name}", system.GetInputPort(name))
             self.corrected[f"measured_{name}"] = split.get_output_port(i)
+
+    def tell_friction(
+        self,
+        effects: Sequence[ResolvedJointTorque],
+        robot: Robot,
+        clock: Clock,
+        law: FrictionRegressor | None,
+        parameters: OutputPort | None,
+    ) -> None:
+        """Has the friction known where effects are taken off readings; that of the first chain.
+
+        Args:
+            effects: see `BelievedFriction`.
+            law: that the chain finds, if it does, with these parameters.
+        """
+        if self.friction is None or self.builder.IsConnectedOrExported(self.friction):
+            return
+        system = BelievedFriction(effects, robot, clock.period, law)
+        self.builder.AddNamedSystem("believed_friction", system)
+        # As they are read: friction sits on the motor's side, and so does the encoder.
+        read = {"joint_state": "measured_joint_state", "torque_command": "torque_command"}
+        for port, signal in read.items():
+            self.builder.ConnectToSame(self.inputs[signal], system.GetInputPort(port))
+        if parameters is not None:
+            self.builder.Connect(parameters, system.GetInputPort("parameters"))
+        self.builder.Connect(system.get_output_port(), self.friction)
 
     def feed(self, signal: str, port: InputPort) -> None:
         """Connects an input port to a signal, an input of the whole diagram."""
@@ -108,6 +140,8 @@ class Chain:
         self.knows_torque = knows_torque
         # What the model says of the joints' torques.
         self.torque_effects = torque_effects
+        # The law whose parameters a system estimates that is called `friction`, if one does.
+        self.friction_law: FrictionRegressor | None = None
         self.builder = workshop.builder
         self._workshop = workshop
         # Sets names of this chain's systems and ports apart from those of others.
@@ -237,6 +271,10 @@ class Chain:
                     f"estimator: friction: expected a posterior with a field friction ({n},)"
                 )
             self.builder.ExportOutput(friction, self.friction_port)
+        if self.knows_torque:
+            law, found = self.friction_law, fields.get("friction", {}).get("parameters")
+            found = None if law is None else found
+            self._workshop.tell_friction(self.torque_effects, self.robot, self.clock, law, found)
         for row in estimates():
             field = fields.get(row.estimator, {}).get(row.field)
             if field is not None:

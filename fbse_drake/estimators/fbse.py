@@ -14,6 +14,7 @@ from fbse_drake.estimators.beliefs import SensorBeliefs
 from fbse_drake.estimators.chain import Chain
 from fbse_drake.estimators.estimator import Estimator, in_library
 from fbse_drake.estimators.floating_base import FloatingBaseModel
+from fbse_drake.estimators.friction_regressor import FrictionRegressor
 from fbse_drake.estimators.joint_acceleration import (
     JointAccelerationConfig,
     JointAccelerationEstimator,
@@ -97,6 +98,7 @@ class Fbse(Estimator):
         if friction.allows_for_effects and chain.torque_effects:
             make = partial(make, torque_effects=chain.torque_effects)
         chain.add("friction", make, **friction.sources)
+        chain.friction_law = FrictionRegressor.of(friction.model, chain.robot)
         for stage in friction.stands_for:
             chain.alias("friction", stage)
 

@@ -240,7 +240,7 @@ class Dictionary:
 
     def is_measured(self, effect: type[Effect]) -> bool:
         """Is the noise that is in the columns of an effect in the residual as well?"""
-        is_noisy = follows_torque(effect) and self._is_torque_noisy
+        is_noisy = _follows_load(effect) and self._is_torque_noisy
         return issubclass(effect, InertiaEffect | GeometryEffect) or is_noisy
 
     @cached_property
@@ -401,6 +401,11 @@ class Dictionary:
         """Sizes of effects as shares of what the log's rows are made of."""
         return Significance(self.predictor)
 
+    def follows_torque(self, effect: type[Effect]) -> bool:
+        """Does a joint's reading follow its torque as it was recorded? What makes that step, as
+        friction does, is in the reading then."""
+        return _follows_load(effect) and not self.predictor.reading.knows_load_by_motion
+
     def takes_torque(self, effect: type[Effect]) -> bool:
         """Does what an effect takes depend on the measured torque?"""
         # The load of inertia that is not trusted is taken from it.
@@ -440,9 +445,8 @@ def _turning(motion: RecordedMotion) -> np.ndarray:
     return 0.5 * usual * (2 * motion.length * motion.period) ** 2
 
 
-def follows_torque(effect: type[Effect]) -> bool:
-    """Does a joint's reading follow its torque? The torque's noise is in it, and so is what makes
-    the torque step, as friction does."""
+def _follows_load(effect: type[Effect]) -> bool:
+    """Does a joint's reading follow what passes its gear? The noise of that is in it."""
     return issubclass(effect, SensorEffect) and effect.memory_size > 0 and effect.acts_on == "joint"
 
 

@@ -8,7 +8,12 @@ from functools import cache, cached_property, partial
 import numpy as np
 from scipy.ndimage import binary_propagation, maximum_filter1d, minimum_filter1d
 
-from fbse_drake.discrepancy.diagnosis.reading import Reading, in_steps, is_read
+from fbse_drake.discrepancy.diagnosis.reading import (
+    Reading,
+    friction_laws,
+    in_steps,
+    is_read,
+)
 from fbse_drake.discrepancy.diagnosis.regressors import Regressors, noisier_signals
 from fbse_drake.discrepancy.diagnosis.standing_soles import StandingSoles
 from fbse_drake.discrepancy.identification.inertial import inertia_addition
@@ -38,7 +43,7 @@ from fbse_drake.effects.joint_torque import (
     basis_over_time,
     deflection_over_time,
 )
-from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect
+from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
 from fbse_drake.errors import InputError
 from fbse_drake.log import Log
 from fbse_drake.scenario import RecordingConfig, Scenario, build_robot
@@ -359,7 +364,7 @@ class Predictor:
     @cached_property
     def joint_motion(self) -> JointMotion:
         """What joint torque effects depend on, see `Reading.joint_motion`."""
-        return self._loaded(self.reading.joint_motion)
+        return self.reading.joint_motion
 
     @cached_property
     def _joint_motions(self) -> Callable[[int], JointMotion]:
@@ -367,15 +372,26 @@ class Predictor:
         return cache(partial(_joined, self.motion.recording, self.joint_motion))
 
     @cached_property
-    def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
+    def _noisier_joint_motion(self) -> JointMotion:
         """The same if the sensors' noise were in it once more."""
-        noisier = self.reading.joint_motion_of(self._noisier_regressors.signals)
-        return cache(partial(_joined, self.motion.recording, self._loaded(noisier)))
+        return self.reading.joint_motion_of(self._noisier_regressors.signals)
 
-    def _loaded(self, motion: JointMotion) -> JointMotion:
-        """With the load as far as it is known: a model whose inertia is not trusted does not know
-        it."""
-        return motion._replace(load=motion.command) if self.scenario.identify.inertia else motion
+    @cached_property
+    def _loaded(self) -> SensorSignals:
+        """The log's signals with what passes the gears, see `Reading.loaded`."""
+        laws, signals = friction_laws(self._known), self._regressors.signals
+        return self.reading.loaded(signals, self.joint_motion, laws)
+
+    @cached_property
+    def _noisier_loaded(self) -> SensorSignals:
+        """The same if the sensors' noise were in them once more."""
+        laws, signals = friction_laws(self._known), self._noisier_regressors.signals
+        return self.reading.loaded(signals, self._noisier_joint_motion, laws)
+
+    @cached_property
+    def _noisier_joint_motions(self) -> Callable[[int], JointMotion]:
+        """That averaged over so many steps."""
+        return cache(partial(_joined, self.motion.recording, self._noisier_joint_motion))
 
     @cached_property
     def is_driven(self) -> np.ndarray:
@@ -690,7 +706,8 @@ class Predictor:
             )
         # By taking the effect off the signals.
         assert isinstance(changed, SensorEffect)
-        resolved, read = changed.resolve(self.robot.description), regressors.signals
+        resolved = changed.resolve(self.robot.description)
+        read = self._noisier_loaded if noisier else self._loaded
         memory = self.reading.remembered(resolved, read) if noisier else self._memory(resolved)
         signals = self.reading.undone(resolved, memory, read)
         return regressors.smooth_residual - Regressors(self.motion, signals).smooth_residual
@@ -700,7 +717,7 @@ class Predictor:
         where `undone` needs it."""
         key = (resolved.effect, resolved.nonlinear.tobytes())
         if key not in self._memories:
-            self._memories[key] = self.reading.remembered(resolved)
+            self._memories[key] = self.reading.remembered(resolved, self._loaded)
         return self._memories[key]
 
 

@@ -1,10 +1,11 @@
 """A log as the bodies and sensors of a model read it: what models have in common that differ in
 effects which are taken off the residual."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -18,8 +19,13 @@ from fbse_drake.discrepancy.residual.time_stamps import sampled_evenly
 from fbse_drake.discrepancy.residual.white_noise import noise_corners
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.contact import GroundEffect
-from fbse_drake.effects.effect import Effect
-from fbse_drake.effects.joint_torque import JointMotion, JointTorqueEffect
+from fbse_drake.effects.effect import Effect, ResolvedEffect
+from fbse_drake.effects.joint_torque import (
+    JointMotion,
+    JointTorqueEffect,
+    ResolvedJointTorque,
+    law_over_time,
+)
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
 from fbse_drake.errors import located
 from fbse_drake.log import Log
@@ -31,6 +37,9 @@ _SMOOTHING = 9
 # Friction changes its sign within so many deviations of the velocity's noise, and any mixture of
 # these widths [rad/s].
 _MOVES, _TURNS = 4.0, (1e-3, 5e-2)
+# It is friction that explains this share of what command and acceleration leave over in a joint;
+# play in a gear, which takes the command while the motor crosses it, looks like friction to less.
+_IS_FRICTION = 0.9
 # For so long a log that we did not simulate is taken to have been as it begins [s]; sources of
 # those that we did.
 _EARLIER, _FORGETFUL = 0.2, ("fbse_drake simulation", "planned motion")
@@ -49,6 +58,8 @@ class Reading:
             InputError: a log that does not fit the model.
         """
         self.log, self.left_out, self._read_by = log, tuple(left_out), _reader(scenario)
+        # A model whose inertia is not trusted does not know what passes the gears.
+        self._knows_load = not scenario.identify.inertia
         with located("model: "):
             self.robot = build_robot(scenario.believed)
         log = with_command(scenario, log, self.robot.description)
@@ -59,11 +70,14 @@ class Reading:
         )
         # By how much torques are read earlier than the log has them, (n,) [s].
         self.late_torques = np.zeros(len(self.robot.joint_names))
+        laws = friction_laws(
+            scenario.believed.effects_of(JointTorqueEffect, self.robot.description, key="model")
+        )
         # What came last into the readings goes first.
         for key, effect in reversed(scenario.believed.effects.items()):
             if isinstance(effect, SensorEffect):
                 known = effect.resolve(self.robot.description, key=f"model.effects.{key}")
-                self.motion.signals = self.undone(known, self.remembered(known))
+                self.motion.signals = self._undone_here(known, laws)
             elif isinstance(effect, TorqueReadingLag) and is_read(effect, scenario.recording):
                 lag = effect.resolve(self.robot.description, key=f"model.effects.{key}").linear[0]
                 signals = self.motion.signals
@@ -76,42 +90,129 @@ class Reading:
         return self._read_by == _reader(scenario)
 
     def undone(
-        self,
-        effect: ResolvedSensorEffect,
-        memory: np.ndarray,
-        signals: SensorSignals | None = None,
+        self, effect: ResolvedSensorEffect, memory: np.ndarray, signals: SensorSignals
     ) -> SensorSignals:
-        """Signals that a sensor effect turns into those of the log, or into others.
+        """Signals that a sensor effect turns into others, see `loaded`.
 
         Args:
             memory: see `remembered`.
         """
-        read = self.motion.signals if signals is None else signals
-        return effect.effect.undone(read, memory, effect, self.robot, self.motion.period)
+        return effect.effect.undone(signals, memory, effect, self.robot, self.motion.period)
 
-    def remembered(
-        self, effect: ResolvedSensorEffect, signals: SensorSignals | None = None
-    ) -> np.ndarray:
-        """What a sensor effect remembers over the log, or over others, of torques without their
-        white noise: it would become an acceleration.
+    def _undone_here(
+        self, effect: ResolvedSensorEffect, laws: Sequence[ResolvedJointTorque]
+    ) -> SensorSignals:
+        """Signals that a sensor effect turns into those of the log as they are until now."""
+        # What is found of them is not kept: they change.
+        now = copy(self)
+        now.motion = copy(self.motion)
+        signals = now.loaded(now.motion.signals, now.joint_motion, laws)
+        return now.undone(effect, now.remembered(effect, signals), signals)
+
+    def remembered(self, effect: ResolvedSensorEffect, signals: SensorSignals) -> np.ndarray:
+        """What a sensor effect remembers over the log with other signals, see `loaded`.
 
         A simulation of ours begins with no memory; any other log begins as if it had always been as
         it is then.
         """
-        motion, signals = self.motion, signals or self.motion.signals
-        torque = signals.torque_command
-        corners = noise_corners(torque, motion.torque_variance(torque).mean(axis=0), motion.period)
-        smooth = [motion.low_passed(t, c) for t, c in zip(torque.T, corners, strict=True)]
-        signals = replace(signals, torque_command=np.stack(smooth, axis=1))
-        ours = self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
-        earlier = 0 if ours else round(_EARLIER / motion.period)
+        earlier = 0 if self._begins_anew else round(_EARLIER / self.motion.period)
         longer = {
             name: np.concatenate([np.repeat(values[:1], earlier, axis=0), values])
             for name, values in vars(signals).items()
         }
         signals = SensorSignals(**longer)
-        memory = effect.effect.memory_over_time(signals, effect, self.robot, motion.period)
+        memory = effect.effect.memory_over_time(signals, effect, self.robot, self.motion.period)
         return memory[:, earlier:]
+
+    @property
+    def _begins_anew(self) -> bool:
+        """Was nothing before the log?"""
+        return self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
+
+    @property
+    def knows_load_by_motion(self) -> bool:
+        """Is what passes the gears taken from the motion, see `loaded`?"""
+        return self._knows_load and self.motion.recording.is_sampled
+
+    def loaded(
+        self,
+        signals: SensorSignals,
+        joint_motion: JointMotion,
+        laws: Sequence[ResolvedJointTorque],
+    ) -> SensorSignals:
+        """Signals with the torque that passes the gears, without white noise: it would become an
+        acceleration.
+
+        Of rows that are sampled at an instant it is what the links need by the rigid model: so it
+        is not the friction, which jumps, that must be known. Of others, whose forces are noisier
+        than their commands, it is the command less friction, as the model's laws say and as what
+        they leave over looks like.
+
+        Args:
+            joint_motion: of these signals, see `joint_motion_of`.
+            laws: of the model, see `friction_laws`.
+        """
+        if self.knows_load_by_motion:
+            end = self._needed_load(signals)
+            begin = np.concatenate([end[:1], end[:-1]])
+        else:
+            of_steps = np.asarray(joint_motion.command)
+            if self._knows_load:
+                of_steps = of_steps - self._friction_in(joint_motion, laws)
+            first = np.zeros_like(of_steps[:1]) if self._begins_anew else of_steps[:1]
+            begin = end = np.concatenate([first, of_steps])[: len(signals.joint_position)]
+        return replace(signals, load_begin=begin, load_end=end)
+
+    def _friction_in(
+        self, joint_motion: JointMotion, laws: Sequence[ResolvedJointTorque]
+    ) -> np.ndarray:
+        """What friction takes in every step, (N - 1, n) [Nm]: the model's laws, and in joints where
+        what they leave looks like friction, that."""
+        of_laws, blocks = law_over_time(laws, joint_motion), self.motion.blocks
+        velocity, n = joint_motion.velocity, len(self.robot.joint_names)
+        left = self.motion.residual.value[:, :n] - self.motion.averages(of_laws)
+        friction = self._friction(left, velocity, np.asarray(joint_motion.command))
+        more = friction.dry + friction.viscous * velocity
+        of_blocks = friction.dry_of_blocks + friction.viscous * blocks.joint_velocity
+        for k, known in enumerate(self.motion.known[:, :n].T > 0):
+            other = [blocks.torque_command[:, k], blocks.joint_acceleration[:, k]]
+            basis = np.column_stack([*other, np.ones(len(left)), of_blocks[:, k]])[known]
+            without, all_ = (
+                np.sum((left[known, k] - part @ np.linalg.lstsq(part, left[known, k])[0]) ** 2)
+                for part in (basis[:, :-1], basis)
+            )
+            if all_ > (1.0 - _IS_FRICTION) * without:
+                more[:, k] = 0.0
+        return of_laws + more
+
+    def _needed_load(self, signals: SensorSignals) -> np.ndarray:
+        """What the links need at every sample by the rigid model, without noise, (N, n) [Nm]."""
+        needed = self._link_torque(signals)
+        at_samples = np.concatenate([needed[:1], within_steps(needed, 0.5), needed[-1:]])
+        smooth = [
+            self.motion.low_passed(column, corner)
+            for column, corner in zip(at_samples.T, self._load_corners, strict=True)
+        ]
+        return self.motion.without_noise(np.stack(smooth, axis=1))
+
+    def _link_torque(self, signals: SensorSignals) -> np.ndarray:
+        """What the links need in every step by the rigid model, (N - 1, n) [Nm]."""
+        steps, n = self.motion.steps_of(signals), len(self.robot.joint_names)
+        return steps.torque_command - self.motion.equation.residual(steps)[:, :n]
+
+    @cached_property
+    def _load_corners(self) -> list[float]:
+        """Frequency above which what each link needs is little but noise of the velocities that
+        are believed to have any [Hz]; 0 for none."""
+        motion, signals = self.motion, self.motion.signals
+        velocity, period = signals.joint_velocity, motion.period
+        noise = joint_velocity_noise(motion.sensors)
+        noise = noise * np.random.default_rng(0).standard_normal(velocity.shape)
+        needed = self._link_torque(signals)
+        change = self._link_torque(replace(signals, joint_velocity=velocity + noise)) - needed
+        # An acceleration is a difference of velocities.
+        variance = 0.5 * period**2 * change.var(axis=0)
+        return noise_corners(needed, variance, period, of_rates=True)
 
     @cached_property
     def joint_motion(self) -> JointMotion:
@@ -135,13 +236,16 @@ class Reading:
                 within_steps(velocity, motion.timing.law_share),
             )
             time, middle = time[:-1], time[:-1] + 0.5 * motion.period
+        load = at.torque_command
+        if self._knows_load:
+            load = load - self._loss_at(middle, velocity, load)
         return JointMotion(
             velocity=velocity,
             position=at.joint_position,
             command=at.torque_command,
             time=time[:, None],
             time_step=motion.period,
-            load=at.torque_command - self._loss_at(middle, velocity, at.torque_command),
+            load=load,
             rotor_inertia=self.robot.rotor_inertias,
         )
 
@@ -175,30 +279,51 @@ class Reading:
     def _loss_at(self, time: np.ndarray, velocity: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """What the links do not get of the command by the rigid model at times (M,), smoothed over
         three blocks, (M, n); without frequencies in which velocities are noise, which is that of
-        the residual.
-
-        Friction jumps where a joint turns, by an amount that may grow with the torque: what jumps
-        so, by least squares, is not smoothed.
+        the residual. What jumps as dry friction does is not smoothed.
 
         Args:
             velocity, torque: of the joints then, (M, n) [rad/s], [Nm].
         """
-        motion, n = self.motion, len(self.robot.joint_names)
-        blocks, loss = motion.blocks, motion.residual.value[:, :n]
+        motion, loss = self.motion, self.motion.residual.value[:, : velocity.shape[1]]
+        friction = self._friction(loss, velocity, torque)
+        rest = smoothed(loss - friction.dry_of_blocks)
+        at = np.stack([np.interp(time, motion.time, column) for column in rest.T], axis=1)
+        return motion.without_noise(at) + friction.dry
+
+    def _friction(self, loss: np.ndarray, velocity: np.ndarray, torque: np.ndarray) -> "_Friction":
+        """What looks like friction in a loss, by least squares. Dry friction jumps where a joint
+        turns, by an amount that may grow with the torque.
+
+        Args:
+            loss: averages over blocks, (B, n) [Nm].
+            velocity, torque: of the joints at times or in steps, (M, n) [rad/s], [Nm].
+        """
+        motion, n, blocks = self.motion, len(self.robot.joint_names), self.motion.blocks
         noise = _MOVES * joint_velocity_noise(motion.sensors)
         signs = [np.tanh(velocity / (noise + width)) for width in _TURNS]
         jumps = np.stack([s * size for s in signs for size in (1.0, np.abs(torque))])
         of_blocks = np.stack([motion.averages(in_steps(motion.recording, jump)) for jump in jumps])
-        jump, of_block = np.empty(velocity.shape), np.empty(loss.shape)
+        found = _Friction(np.empty(velocity.shape), np.empty(loss.shape), np.empty(n))
         for k in range(n):
             smooth = [blocks.joint_velocity[:, k], blocks.joint_acceleration[:, k]]
             basis = np.column_stack([*of_blocks[..., k], *smooth, np.ones(len(loss))])
             known = motion.known[:, k] > 0
-            size = np.linalg.lstsq(basis[known], loss[known, k])[0][: len(jumps)]
-            jump[:, k], of_block[:, k] = size @ jumps[..., k], size @ of_blocks[..., k]
-        rest = smoothed(loss - of_block)
-        at = np.stack([np.interp(time, motion.time, column) for column in rest.T], axis=1)
-        return motion.without_noise(at) + jump
+            sizes = np.linalg.lstsq(basis[known], loss[known, k])[0]
+            *dry, viscous = sizes[: len(jumps) + 1]
+            found.dry[:, k] = dry @ jumps[..., k]
+            found.dry_of_blocks[:, k] = dry @ of_blocks[..., k]
+            found.viscous[k] = viscous
+        return found
+
+
+class _Friction(NamedTuple):
+    """What looks like friction in joints."""
+
+    # Dry friction, (M, n), and its averages over blocks, (B, n) [Nm].
+    dry: np.ndarray
+    dry_of_blocks: np.ndarray
+    # Viscous friction, (n,) [Nm s/rad].
+    viscous: np.ndarray
 
 
 def in_steps(recording: RecordingConfig, values: np.ndarray) -> np.ndarray:
@@ -213,18 +338,26 @@ def is_read(effect: Effect | type[Effect], recording: RecordingConfig) -> bool:
     return effect.needs_sampled_torque and recording.is_sampled
 
 
+def friction_laws(effects: Iterable[ResolvedEffect]) -> list[ResolvedJointTorque]:
+    """Those of some effects that take of the joints' torques before these pass the gears."""
+    return [e for e in effects if isinstance(e, ResolvedJointTorque) and not e.effect.deflects]
+
+
 def _reader(scenario: Scenario) -> tuple[Any, ...]:
     """What a reading depends on in a scenario."""
     model = scenario.believed
+    # What passes a gear, which an encoder may follow, depends on the friction.
+    follows = any(isinstance(e, SensorEffect) and e.memory_size for e in model.effects.values())
+    other = GroundEffect if follows else JointTorqueEffect | GroundEffect
     bodies = {
         name: effect
         for name, effect in model.effects.items()
-        if is_read(effect, scenario.recording)
-        or not isinstance(effect, JointTorqueEffect | GroundEffect)
+        if is_read(effect, scenario.recording) or not isinstance(effect, other)
     }
     recording = scenario.recording
     model = replace(model, effects=bodies)
-    return model, scenario.sensors, recording, scenario.reference, scenario.control
+    trusted = not scenario.identify.inertia
+    return model, scenario.sensors, recording, scenario.reference, scenario.control, trusted
 
 
 def smoothed(values: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 
-from fbse_drake.discrepancy.diagnosis.dictionary import follows_torque
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation, Name
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
 from fbse_drake.discrepancy.diagnosis.proposals import LOOKING, Proposals
@@ -331,7 +330,8 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
 
 def _may_be_misfit(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
     """May a candidate explain what laws of fitted shapes are wrong by?"""
-    if not (fits.dictionary.per_step or follows_torque(added.effect)):
+    dictionary = fits.dictionary
+    if not (dictionary.per_step or dictionary.follows_torque(added.effect)):
         return False
     rows = added.signature.rows
     exact = fits.explain(

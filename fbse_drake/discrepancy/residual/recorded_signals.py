@@ -167,14 +167,17 @@ def read_signals(
         known = inside
     torque = log.get("joint/torque_command", np.zeros_like(log["joint/position"]))
     torque = np.where(robot.description.has_motor, torque, 0.0)
+    command = on_grid(between_lost(torque)) if recording.is_sampled else held(torque)
     signals = SensorSignals(
         joint_position=q,
         joint_velocity=rate(q) if differenced else on_grid(log["joint/velocity"]),
         specific_force=specific_force,
         angular_velocity=angular_velocity,
         pad_force=pad_force,
-        torque_command=on_grid(between_lost(torque)) if recording.is_sampled else held(torque),
+        torque_command=command,
         motor_position=on_grid(log.get("joint/motor_position", np.zeros((len(log.time), 0)))),
+        load_begin=command,
+        load_end=command,
     )
     return signals, known
 

@@ -349,6 +349,7 @@ def _first_state(
         np.zeros((1, points, 3)),
         np.zeros_like(q)[None],
         log.get("joint/motor_position", np.zeros((1, 0)))[:1],
+        *np.zeros((2, 1, len(q))),
     )
     for effect in reversed(effects):
         memory = np.zeros((effect.effect.memory_size, 1, len(effect.targets)))
