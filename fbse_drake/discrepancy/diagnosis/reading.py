@@ -106,7 +106,9 @@ class Reading:
         # What is found of them is not kept: they change.
         now = copy(self)
         now.motion = copy(self.motion)
-        signals = now.loaded(now.motion.signals, now.joint_motion, laws)
+        signals = now.motion.signals
+        if effect.effect.memory_size:
+            signals = now.loaded(signals, now.joint_motion, laws)
         return now.undone(effect, now.remembered(effect, signals), signals)
 
     def remembered(self, effect: ResolvedSensorEffect, signals: SensorSignals) -> np.ndarray:
@@ -177,11 +179,11 @@ class Reading:
         for k, known in enumerate(self.motion.known[:, :n].T > 0):
             other = [blocks.torque_command[:, k], blocks.joint_acceleration[:, k]]
             basis = np.column_stack([*other, np.ones(len(left)), of_blocks[:, k]])[known]
-            without, all_ = (
+            without, beside = (
                 np.sum((left[known, k] - part @ np.linalg.lstsq(part, left[known, k])[0]) ** 2)
                 for part in (basis[:, :-1], basis)
             )
-            if all_ > (1.0 - _IS_FRICTION) * without:
+            if beside > (1.0 - _IS_FRICTION) * without:
                 more[:, k] = 0.0
         return of_laws + more
 
