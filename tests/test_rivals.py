@@ -85,11 +85,14 @@ def elastic(arm: Course, joint: int, stiffness: float) -> tuple[Course, np.ndarr
 
 
 def test_an_elastic_elbow_is_no_encoder_offset_and_no_lag(arm: Course) -> None:
+    """What the rotor needs to twist the spring, a tenth of the torque, counts as its load."""
     diagnosis = diagnosis_of(*elastic(arm, ELBOW, 4000.0))
     first = diagnosis.ranking[0]
     assert (first.effect, first.targets) == ("TransmissionElasticity", ("axis_3",))
     assert len(diagnosis.chosen) == 1
-    assert first.parameters["compliance"].value == pytest.approx(1 / 4000, rel=0.1)
+    compliance = first.parameters["compliance"]
+    assert compliance.value == pytest.approx(1 / 4000, rel=0.15)
+    assert compliance.interval[0] < 1 / 4000 < compliance.interval[1]
 
 
 def test_noise_of_the_torque_is_no_motion_of_an_elastic_joint(arm: Course) -> None:

@@ -401,10 +401,13 @@ class Dictionary:
         """Sizes of effects as shares of what the log's rows are made of."""
         return Significance(self.predictor)
 
-    def follows_torque(self, effect: type[Effect]) -> bool:
-        """Does a joint's reading follow its torque as it was recorded? What makes that step, as
-        friction does, is in the reading then."""
-        return _follows_load(effect) and not self.predictor.reading.knows_load_by_motion
+    def follows_torque(self, effect: type[Effect], joints: Sequence[str]) -> bool:
+        """Does the reading of joints follow their torques as they were recorded? What makes those
+        step, as friction does, is in the readings then."""
+        if not _follows_load(effect):
+            return False
+        places = [self.joints.index(joint) for joint in joints]
+        return not self.predictor.reading.has_load_of_motion[places].all()
 
     def takes_torque(self, effect: type[Effect]) -> bool:
         """Does what an effect takes depend on the measured torque?"""

@@ -131,10 +131,15 @@ class Reading:
         """Was nothing before the log?"""
         return self.log.meta.get("source") in _FORGETFUL and self.log.time[0] == 0.0
 
-    @property
-    def knows_load_by_motion(self) -> bool:
-        """Is what passes the gears taken from the motion, see `loaded`?"""
-        return self._knows_load and self.motion.recording.is_sampled
+    @cached_property
+    def has_load_of_motion(self) -> np.ndarray:
+        """Of which joints what passes the gear is taken from the motion, see `loaded`, (n,)."""
+        n = len(self.robot.joint_names)
+        if not (self._knows_load and self.motion.recording.is_sampled):
+            return np.zeros(n, dtype=bool)
+        loss, moved = self.motion.residual.value[:, :n], self.joint_motion
+        friction = self._friction(loss, moved.velocity, np.asarray(moved.command))
+        return self._is_friction(loss, friction)
 
     def loaded(
         self,
@@ -145,24 +150,26 @@ class Reading:
         """Signals with the torque that passes the gears, without white noise: it would become an
         acceleration.
 
-        Of rows that are sampled at an instant it is what the links need by the rigid model: so it
-        is not the friction, which jumps, that must be known. Of others, whose forces are noisier
-        than their commands, it is the command less friction, as the model's laws say and as what
-        they leave over looks like.
+        In steps it is the command less friction, as the model's laws say and as what they leave
+        over looks like. Of rows that are sampled at an instant, in joints with friction, it is what
+        the links need by the rigid model: so it is not the friction, which jumps, that must be
+        known. (A link on a spring so soft that they swing together needs another torque than a
+        rigid one; without friction that is what is commanded.)
 
         Args:
             joint_motion: of these signals, see `joint_motion_of`.
             laws: of the model, see `friction_laws`.
         """
-        if self.knows_load_by_motion:
-            end = self._needed_load(signals)
-            begin = np.concatenate([end[:1], end[:-1]])
+        load = np.asarray(joint_motion.command)
+        if self.motion.recording.is_sampled:
+            if self.has_load_of_motion.any():
+                load = np.where(self.has_load_of_motion, self._needed_load(signals), load)
+            begin, end = np.concatenate([load[:1], load[:-1]]), load
         else:
-            of_steps = np.asarray(joint_motion.command)
             if self._knows_load:
-                of_steps = of_steps - self._friction_in(joint_motion, laws)
-            first = np.zeros_like(of_steps[:1]) if self._begins_anew else of_steps[:1]
-            begin = end = np.concatenate([first, of_steps])[: len(signals.joint_position)]
+                load = load - self._friction_in(joint_motion, laws)
+            first = np.zeros_like(load[:1]) if self._begins_anew else load[:1]
+            begin = end = np.concatenate([first, load])[: len(signals.joint_position)]
         return replace(signals, load_begin=begin, load_end=end)
 
     def _friction_in(
@@ -170,22 +177,29 @@ class Reading:
     ) -> np.ndarray:
         """What friction takes in every step, (N - 1, n) [Nm]: the model's laws, and in joints where
         what they leave looks like friction, that."""
-        of_laws, blocks = law_over_time(laws, joint_motion), self.motion.blocks
-        velocity, n = joint_motion.velocity, len(self.robot.joint_names)
-        left = self.motion.residual.value[:, :n] - self.motion.averages(of_laws)
+        of_laws, velocity = law_over_time(laws, joint_motion), joint_motion.velocity
+        left = self.motion.residual.value[:, : velocity.shape[1]] - self.motion.averages(of_laws)
         friction = self._friction(left, velocity, np.asarray(joint_motion.command))
         more = friction.dry + friction.viscous * velocity
+        return of_laws + np.where(self._is_friction(left, friction), more, 0.0)
+
+    def _is_friction(self, loss: np.ndarray, friction: "_Friction") -> np.ndarray:
+        """Is a loss in joints what in it looks like friction, (n,)?
+
+        Args:
+            loss: averages over blocks, (B, n) [Nm].
+        """
+        blocks, result = self.motion.blocks, np.zeros(loss.shape[1], dtype=bool)
         of_blocks = friction.dry_of_blocks + friction.viscous * blocks.joint_velocity
-        for k, known in enumerate(self.motion.known[:, :n].T > 0):
+        for k, known in enumerate(self.motion.known[:, : len(result)].T > 0):
             other = [blocks.torque_command[:, k], blocks.joint_acceleration[:, k]]
-            basis = np.column_stack([*other, np.ones(len(left)), of_blocks[:, k]])[known]
+            basis = np.column_stack([*other, np.ones(len(loss)), of_blocks[:, k]])[known]
             without, beside = (
-                np.sum((left[known, k] - part @ np.linalg.lstsq(part, left[known, k])[0]) ** 2)
+                np.sum((loss[known, k] - part @ np.linalg.lstsq(part, loss[known, k])[0]) ** 2)
                 for part in (basis[:, :-1], basis)
             )
-            if beside > (1.0 - _IS_FRICTION) * without:
-                more[:, k] = 0.0
-        return of_laws + more
+            result[k] = beside <= (1.0 - _IS_FRICTION) * without
+        return result
 
     def _needed_load(self, signals: SensorSignals) -> np.ndarray:
         """What the links need at every sample by the rigid model, without noise, (N, n) [Nm]."""

@@ -331,7 +331,7 @@ def is_significant(fits: Fits, base: Explanation, wider: Explanation, added: Can
 def _may_be_misfit(fits: Fits, base: Explanation, wider: Explanation, added: Candidate) -> bool:
     """May a candidate explain what laws of fitted shapes are wrong by?"""
     dictionary = fits.dictionary
-    if not (dictionary.per_step or dictionary.follows_torque(added.effect)):
+    if not (dictionary.per_step or dictionary.follows_torque(added.effect, added.targets)):
         return False
     rows = added.signature.rows
     exact = fits.explain(
