@@ -166,9 +166,9 @@ def add_robot(
 
     Returns:
         With ports `joint_state` [q, v] (2n,) [rad, rad/s], `torque_command` as given and
-        `torque_loss` of the effects in the step that ended (n,) [Nm] with the `friction` in it and
-        what it is the sum of,
-        `net_actuation` and `explicit_force` (see `fbse_drake.effects.system.loss_over_time`),
+        `torque_loss` of the effects in the step that ended (n,) [Nm] with the `friction` in it, and
+        what it is the sum of, `net_actuation` and `explicit_force` (see
+        `fbse_drake.effects.system.loss_over_time`),
         `deflection` of the motors against their links (n,) [rad],
         `plant_state`, `generalized_acceleration` and those of the plant that sensors need:
         `body_poses`, `body_spatial_velocities`, `body_spatial_accelerations`, `reaction_forces`.

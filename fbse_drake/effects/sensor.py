@@ -60,6 +60,11 @@ class SensorEffect(Effect):
     # Numbers that it remembers for each target.
     memory_size: ClassVar[int] = 0
 
+    @classmethod
+    def follows_load(cls) -> bool:
+        """Does a joint's reading follow what passes its gear? The noise of that is in it then."""
+        return cls.memory_size > 0 and cls.acts_on == "joint"
+
     @staticmethod
     @abstractmethod
     def reading(

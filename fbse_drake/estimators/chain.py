@@ -56,7 +56,7 @@ class Workshop:
         has_imu = robot.description.imu is not None or robot.has_floating_base
         system = SensorCorrections(effects, robot, clock.period, imu=has_imu)
         self.builder.AddNamedSystem("sensor_corrections", system)
-        if any(effect.effect.memory_size for effect in effects):
+        if any(effect.effect.follows_load() for effect in effects):
             self.friction = system.GetInputPort("friction")
         split = self.builder.AddNamedSystem(
             "corrected_sensors", Demultiplexer(list(system.sizes.values()))
@@ -272,8 +272,8 @@ class Chain:
                 )
             self.builder.ExportOutput(friction, self.friction_port)
         if self.knows_torque:
-            law, found = self.friction_law, fields.get("friction", {}).get("parameters")
-            found = None if law is None else found
+            law = self.friction_law
+            found = None if law is None else fields["friction"]["parameters"]
             self._workshop.tell_friction(self.torque_effects, self.robot, self.clock, law, found)
         for row in estimates():
             field = fields.get(row.estimator, {}).get(row.field)

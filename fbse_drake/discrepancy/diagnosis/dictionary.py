@@ -240,7 +240,8 @@ class Dictionary:
 
     def is_measured(self, effect: type[Effect]) -> bool:
         """Is the noise that is in the columns of an effect in the residual as well?"""
-        is_noisy = _follows_load(effect) and self._is_torque_noisy
+        follows = issubclass(effect, SensorEffect) and effect.follows_load()
+        is_noisy = follows and self._is_torque_noisy
         return issubclass(effect, InertiaEffect | GeometryEffect) or is_noisy
 
     @cached_property
@@ -404,7 +405,7 @@ class Dictionary:
     def follows_torque(self, effect: type[Effect], joints: Sequence[str]) -> bool:
         """Does the reading of joints follow their torques as they were recorded? What makes those
         step, as friction does, is in the readings then."""
-        if not _follows_load(effect):
+        if not (issubclass(effect, SensorEffect) and effect.follows_load()):
             return False
         places = [self.joints.index(joint) for joint in joints]
         return not self.predictor.reading.has_load_of_motion[places].all()
@@ -446,11 +447,6 @@ def _turning(motion: RecordedMotion) -> np.ndarray:
         [np.nanmedian(a) if of.any() else 0.0 for a, of in zip(at_turns.T, turned.T, strict=True)]
     )
     return 0.5 * usual * (2 * motion.length * motion.period) ** 2
-
-
-def _follows_load(effect: type[Effect]) -> bool:
-    """Does a joint's reading follow what passes its gear? The noise of that is in it."""
-    return issubclass(effect, SensorEffect) and effect.memory_size > 0 and effect.acts_on == "joint"
 
 
 def usual_values(effect: type[Effect]) -> np.ndarray:

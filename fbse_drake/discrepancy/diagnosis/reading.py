@@ -107,7 +107,7 @@ class Reading:
         now = copy(self)
         now.motion = copy(self.motion)
         signals = now.motion.signals
-        if effect.effect.memory_size:
+        if effect.effect.follows_load():
             signals = now.loaded(signals, now.joint_motion, laws)
         return now.undone(effect, now.remembered(effect, signals), signals)
 
@@ -363,7 +363,7 @@ def _reader(scenario: Scenario) -> tuple[Any, ...]:
     """What a reading depends on in a scenario."""
     model = scenario.believed
     # What passes a gear, which an encoder may follow, depends on the friction.
-    follows = any(isinstance(e, SensorEffect) and e.memory_size for e in model.effects.values())
+    follows = any(isinstance(e, SensorEffect) and e.follows_load() for e in model.effects.values())
     other = GroundEffect if follows else JointTorqueEffect | GroundEffect
     bodies = {
         name: effect
