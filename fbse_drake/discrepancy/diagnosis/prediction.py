@@ -662,7 +662,7 @@ class Predictor:
         def addition(values: np.ndarray) -> np.ndarray:
             return self._addition(effect, target, values, nonlinear, noisier=noisier)
 
-        probes = np.array([_probe(effect, n) for n, p in effect.parameters.items() if p.linear])
+        probes = probes_of(effect)
         linear = np.zeros(len(probes)) if about is None else about
         here = np.zeros_like(self.residual.value) if about is None else addition(linear)
         if issubclass(effect, GeometryEffect) and effect.linear_nearby:
@@ -739,6 +739,7 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
     return np.where(largest > _ROUNDING * largest.max(), values, 0.0)
 
 
-def _probe(effect: type[Effect], name: str) -> float:
-    """A small value of a parameter, to take derivatives with."""
-    return 0.01 * max(abs(bound) for bound in effect.parameters[name].plausible)
+def probes_of(effect: type[Effect]) -> np.ndarray:
+    """Small values of an effect's linear parameters, to take derivatives with, (p,)."""
+    linear = [parameter for parameter in effect.parameters.values() if parameter.linear]
+    return np.array([0.01 * max(abs(bound) for bound in p.plausible) for p in linear])

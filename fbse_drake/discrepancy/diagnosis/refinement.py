@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary, depends_on
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.fits import COMPLEXITY, MARGIN, Fits
-from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.prediction import Predictor, probes_of
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.identification.inertial import (
     IdentifiedInertia,
@@ -35,6 +35,12 @@ _MOST_POLISHINGS, _NEGLIGIBLE = 10, 1.0
 # Nonlinear values of what shows in a transmission are looked for within such a factor, and with
 # such a relative tolerance.
 _NEAR, _TOLERANCE = 1.6, 0.01
+# Slopes are taken anew only where values have moved by more than this share of the steps that they
+# are taken with.
+_SAME = 0.5
+# The same of a joint's law, where they have changed the whitened residual by more than this sum of
+# squares.
+_UNSEEN = 0.1
 # How often untrusted bodies are measured anew, at most.
 _REMEASUREMENTS = 3
 # How often effects are fitted beside what they add together.
@@ -93,13 +99,14 @@ def _about_found(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate,
         if not issubclass(candidate.effect, JointTorqueEffect):
             values = explanation.solved.parameters[start - size : start]
             try:
-                about = fits.about(candidate, values)
+                about = candidate if _is_about(candidate, values) else fits.about(candidate, values)
             except InputError:
                 return members
             others = [c for c in members if c is not candidate]
             moved.append(_narrowed(fits, others, about, values))
             continue
-        if m == 0:
+        change = candidate.signature.values[:, :, size - m :] @ shift
+        if (change**2).sum() <= _UNSEEN:
             moved.append(candidate)
             continue
         rest = fits.explain([c for c in members if c is not candidate])
@@ -108,6 +115,12 @@ def _about_found(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate,
             fits.candidate(candidate.effect, candidate.targets, nonlinear, fits.remainder(rest))
         )
     return tuple(moved)
+
+
+def _is_about(candidate: Candidate, values: np.ndarray) -> bool:
+    """Are these the values that a candidate is linear about, as far as differences tell slopes?"""
+    moved = np.abs(values - candidate.raw.about)
+    return bool(np.all(moved <= _SAME * probes_of(candidate.effect)))
 
 
 def _narrowed(

@@ -203,24 +203,13 @@ class Remainder:
 
     def _fit_of(self, group: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         size = len(self._parameters)
-        gram, left = np.zeros((size, size)), np.zeros(size)
-        for row in range(len(self.scale)):
-            there = [k for k in group if row in self._signatures[k].rows]
-            if not there:
-                continue
-            moments, right, fitted = self._row_moments(
-                row, tuple(self._signatures[k] for k in there)
-            )
-            at = np.concatenate([np.arange(size)[self._slices[k]] for k in there])
-            amounts = np.ones(len(right))
-            amounts[fitted] = self._parameters[at]
-            gram[np.ix_(at, at)] += moments[np.ix_(fitted, fitted)] / self.scale[row]
-            left[at] += (right[fitted] - moments[fitted] @ amounts) / self.scale[row]
         own = np.concatenate([np.arange(size)[self._slices[k]] for k in group])
+        signatures = [self._signatures[k] for k in group]
+        gram, right = self._regression.normal_equations(signatures, self.scale)
+        left = right - gram @ self._parameters[own]
         inverse, change = np.zeros((size, size)), np.zeros(size)
-        root = _inverse_root(gram[np.ix_(own, own)])
-        inverse[np.ix_(own, own)] = root @ root.T
-        change[own] = root @ (root.T @ left[own])
+        root = _inverse_root(gram)
+        inverse[np.ix_(own, own)], change[own] = root @ root.T, root @ (root.T @ left)
         return inverse, change
 
 

@@ -345,6 +345,8 @@ class _Assembled:
     # (F, r, Q, Q) and (F, r, Q).
     gram: np.ndarray
     target: np.ndarray
+    # Which columns have a parameter, (Q,); offsets have none.
+    fitted: np.ndarray
 
     @cached_property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
@@ -354,6 +356,16 @@ class _Assembled:
     def of(self, fold: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Of one fold, or of all."""
         return self.whole if fold is None else (self.gram[fold], self.target[fold])
+
+    def weighted(self, scale: np.ndarray, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of one fold, or of all, each row weighted by the inverse of its scale
+        (r,): (P, P) and (P,) of the P columns that have a parameter."""
+        gram, target = self.of(fold)
+        gram, right = np.tensordot(1.0 / scale, gram, axes=1), (1.0 / scale) @ target
+        if self.fitted.all():
+            return gram, right
+        right = (right - gram[:, ~self.fitted].sum(axis=1))[self.fitted]
+        return gram[np.ix_(self.fitted, self.fitted)], right
 
 
 class Regression:
@@ -506,7 +518,26 @@ class Regression:
                 at = np.searchsorted(rows, other.rows[of_other])
                 gram[:, at, place, part] = products
                 gram[:, at, part, place] = np.swapaxes(products, 2, 3)
-        return _Assembled(rows, gram, target)
+        fitted = [np.arange(self.target(s).shape[2]) < s.values.shape[2] for s in signatures]
+        return _Assembled(rows, gram, target, np.concatenate(fitted))
+
+    def normal_equations(
+        self, signatures: Sequence[Signature], scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of several signatures that were fitted together, in all their rows, each weighted by the
+        inverse of its scale (R,).
+
+        Returns:
+            Inner products of the columns that have a parameter with each other, (P, P), and with
+            the residual less the offsets, (P,).
+        """
+        order = sorted(range(len(signatures)), key=lambda k: self._age[signatures[k]])
+        together = self._together(tuple(signatures[k] for k in order))
+        sizes = [s.values.shape[2] for s in signatures]
+        places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        at = np.argsort(np.concatenate([places[k] for k in order]))
+        gram, right = together.weighted(scale[together.rows])
+        return gram[np.ix_(at, at)], right[at]
 
     def _part(self, signatures: tuple[Signature, ...]) -> PartialFit:
         return self._parts.or_made(signatures, lambda: self._fit_together(signatures))
@@ -514,10 +545,7 @@ class Regression:
     def _fit_together(self, signatures: tuple[Signature, ...]) -> PartialFit:
         together, white = self._together(signatures), self.white
         rows, count = together.rows, np.maximum(white.count[together.rows], 1)
-        # Which of the columns have a parameter; offsets have none.
-        fitted = np.concatenate(
-            [np.arange(self.target(s).shape[2]) < s.values.shape[2] for s in signatures]
-        )
+        fitted = together.fitted
         amounts = np.where(fitted, 0.0, 1.0)
         prior, expected, steadying, lowest, highest = (
             np.concatenate(
@@ -532,11 +560,7 @@ class Regression:
         held, believed = np.diag((prior + steadying) / norm**2), prior * expected / norm
 
         def weighted(fold: int | None) -> tuple[np.ndarray, np.ndarray]:
-            gram, target = together.of(fold)
-            gram, right = np.tensordot(1.0 / scale, gram, axes=1), (1.0 / scale) @ target
-            if not fitted.all():
-                right = (right - gram[:, ~fitted].sum(axis=1))[fitted]
-                gram = gram[np.ix_(fitted, fitted)]
+            gram, right = together.weighted(scale, fold)
             return gram / np.outer(norm, norm), right / norm
 
         def solved(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
