@@ -3,7 +3,7 @@ leave."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from weakref import WeakKeyDictionary
 
@@ -123,6 +123,10 @@ class Fits:
             _MOST_NUMBERS, lambda sets: sets.signature.values.size
         )
         self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
+        # Candidates that are no joint torque effects, made linear about values.
+        self._about: Memory[Candidate] = Memory(
+            _MOST_NUMBERS, lambda candidate: candidate.signature.values.size
+        )
         # Candidates that were fitted together, made linear about the values that were found.
         self.polished: Memory[tuple[Candidate, ...]] = Memory(
             _MOST_POLISHED, lambda members: sum(c.signature.values.size for c in members)
@@ -431,6 +435,10 @@ class Fits:
         if issubclass(candidate.effect, InertiaEffect):
             about = np.broadcast_to(candidate.raw.about, values.shape)
             values = candidate.effect.nearby(about, values)
+        key = (*candidate.key, candidate.nonlinear.tobytes(), values.tobytes())
+        return self._about.or_made(key, partial(self._made_about, candidate, values))
+
+    def _made_about(self, candidate: Candidate, values: np.ndarray) -> Candidate:
         effect, target, nonlinear = candidate.effect, candidate.targets[0], candidate.nonlinear
         raw = self.dictionary.predictor.signature_near(
             effect, target, values, nonlinear, candidate.raw

@@ -103,7 +103,7 @@ def _about_found(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate,
             except InputError:
                 return members
             others = [c for c in members if c is not candidate]
-            moved.append(_narrowed(fits, others, about, values))
+            moved.append(_narrowed(fits, others, about))
             continue
         change = candidate.signature.values[:, :, size - m :] @ shift
         if (change**2).sum() <= _UNSEEN:
@@ -123,15 +123,13 @@ def _is_about(candidate: Candidate, values: np.ndarray) -> bool:
     return bool(np.all(moved <= _SAME * probes_of(candidate.effect)))
 
 
-def _narrowed(
-    fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray
-) -> Candidate:
+def _narrowed(fits: Fits, others: list[Candidate], candidate: Candidate) -> Candidate:
     """A candidate that is no joint torque effect with its nonlinear values where they fit best
     beside others, if the log tells them at all: what shows in motion alone, or far better
     with another value."""
     needed = 0.0 if fits.dictionary.is_of_motion(candidate.signature) else MARGIN
     for k in range(len(candidate.nonlinear)):
-        narrower = _with_fitting_value(fits, others, candidate, linear, k)
+        narrower = _with_fitting_value(fits, others, candidate, k)
         there, here = (fits.explain([*others, c]).deviance for c in (narrower, candidate))
         if here - there >= needed:
             candidate = narrower
@@ -139,17 +137,22 @@ def _narrowed(
 
 
 def _with_fitting_value(
-    fits: Fits, others: list[Candidate], candidate: Candidate, linear: np.ndarray, k: int
+    fits: Fits, others: list[Candidate], candidate: Candidate, k: int
 ) -> Candidate:
-    """A candidate with one of its nonlinear values where it fits best nearby, beside others."""
+    """A candidate with one of its nonlinear values where it fits best nearby, beside others.
+
+    Values are rounded to what they are looked for with: what is tried again beside others is then
+    known.
+    """
+    here = candidate.nonlinear[k]
+    low, high = candidate.parameters[candidate.nonlinear_names[k]].plausible
+    linear = np.broadcast_to(candidate.raw.about, len(candidate.linear_names)).copy()
 
     def with_value(logarithm: float) -> Candidate:
         nonlinear = candidate.nonlinear.copy()
-        nonlinear[k] = np.exp(logarithm)
+        nonlinear[k] = np.clip(np.exp(_TOLERANCE * round(logarithm / _TOLERANCE)), low, high)
         return fits.about(replace(candidate, nonlinear=nonlinear), linear)
 
-    here = candidate.nonlinear[k]
-    low, high = candidate.parameters[candidate.nonlinear_names[k]].plausible
     found = minimize_scalar(
         lambda logarithm: fits.explain([*others, with_value(logarithm)]).deviance,
         bounds=np.log(np.clip([here / _NEAR, here * _NEAR], low, high)),
