@@ -7,7 +7,7 @@ from mypy.plugin import AnalyzeTypeContext, MethodContext, Plugin
 from mypy.types import AnyType, Type, TypeOfAny, UnboundType
 
 _ARRAY = "numpy.ndarray"
-_FRAMEWORK = "pydrake.systems.framework."
+_FRAMEWORK, _VALUE = "pydrake.systems.framework.", "pydrake.common.value."
 
 
 class DrakeStubs(Plugin):
@@ -19,9 +19,8 @@ class DrakeStubs(Plugin):
 
     def get_method_hook(self, fullname: str) -> Callable[[MethodContext], Type] | None:
         """Hook that mypy calls for what a method gives back, by the class of its object."""
-        return _METHODS.get(fullname.removeprefix(_FRAMEWORK)) or _DECLARED.get(
-            fullname.rpartition(".")[2]
-        )
+        name = fullname.removeprefix(_FRAMEWORK).removeprefix(_VALUE)
+        return _METHODS.get(name) or _DECLARED.get(fullname.rpartition(".")[2])
 
 
 def _array(context: AnalyzeTypeContext) -> Type:
@@ -50,6 +49,7 @@ def _index(context: MethodContext) -> Type:
 
 
 _METHODS = {
+    "AbstractValue.get_mutable_value": _value,
     "InputPort.Eval": _value,
     "OutputPort.Eval": _value,
     "DiagramBuilder.AddNamedSystem": _system,

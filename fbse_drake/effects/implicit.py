@@ -71,7 +71,7 @@ class LeaningClamps(MovingClamps):
     """Those of an effect with a memory: at velocity zero its torque has a part of its size."""
 
     def offset(self, effect: ResolvedJointTorque, motion: JointMotion) -> np.ndarray:
-        return effect.effect.lean(motion.memory, effect.nonlinear) * self.limit
+        return effect.effect.lean(np.asarray(motion.memory), effect.nonlinear) * self.limit
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def implicit_law(effects: Sequence[ResolvedJointTorque], planned: JointMotion) -
     speed = np.sqrt(np.mean(planned.velocity**2, axis=0))
     typical = JointMotion(speed, time_step=planned.time_step)
     rises = [effect.effect.rise(effect.linear, effect.nonlinear, typical) for effect in effects]
-    damping = sum((rise.damping for rise in rises), np.zeros(n))
+    damping = np.asarray(sum((rise.damping for rise in rises), np.zeros(n)))
     steady = [k for k, effect in enumerate(effects) if effect.effect.of_velocity_alone]
 
     def law(velocity: np.ndarray) -> np.ndarray:

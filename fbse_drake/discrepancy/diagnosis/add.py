@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding
-from fbse_drake.discrepancy.diagnosis.written import written_diagnosis
+from fbse_drake.discrepancy.diagnosis.written import WrittenParameter, written_diagnosis
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.surplus import without_surplus
@@ -35,10 +35,7 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
             tuple(entry.joints),
             np.nan if entry.held_out_before is None else entry.held_out_before,
             np.nan if entry.held_out_after is None else entry.held_out_after,
-            {
-                name: Estimate(p.value, (p.interval[0], p.interval[1]), p.unit)
-                for name, p in entry.parameters.items()
-            },
+            {name: Estimate(p.value, _between(p), p.unit) for name, p in entry.parameters.items()},
             tuple(entry.confusable_with),
             entry.chosen,
             entry.tentative,
@@ -86,6 +83,11 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
     return replace(scenario, model=replace(model, effects=effects))
 
 
+def _between(parameter: WrittenParameter) -> tuple[float, float]:
+    low, high = (np.nan if bound is None else bound for bound in parameter.interval)
+    return low, high
+
+
 def settled(findings: Sequence[Finding]) -> list[Finding]:
     """Findings with the values that a model gets. A velocity of transition of which the data do not
     say that the default is wrong keeps it: friction must hold a joint at rest also where nobody saw
@@ -97,7 +99,7 @@ def settled(findings: Sequence[Finding]) -> list[Finding]:
     for finding in findings:
         kind, estimate = library().get(finding.effect), finding.parameters.get("transition")
         if kind is not None and estimate is not None:
-            default = kind().transition["all"]
+            default = vars(kind())["transition"]["all"]
             if estimate.interval[0] <= default <= estimate.interval[1]:
                 kept = {"transition": replace(estimate, value=default)}
                 finding = replace(finding, parameters={**finding.parameters, **kept})

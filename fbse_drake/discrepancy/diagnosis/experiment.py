@@ -16,7 +16,7 @@ from fbse_drake.discrepancy.residual.equation_of_motion import EquationOfMotion
 from fbse_drake.discrepancy.residual.recorded_signals import Instants
 from fbse_drake.discrepancy.residual.residual import Residual
 from fbse_drake.effects.effect import Effect
-from fbse_drake.errors import InputError, located
+from fbse_drake.errors import InputError, located, required
 from fbse_drake.log import Log
 from fbse_drake.processes import Processes
 from fbse_drake.progress import Progress
@@ -40,7 +40,7 @@ def planned_log(scenario: Scenario) -> Log:
     Raises:
         InputError: a motion that the model cannot make.
     """
-    robot, period = build_robot(scenario.believed), scenario.log.period
+    robot, period = build_robot(scenario.believed), required(scenario.log.period, "log.period")
     coarse = np.arange(int(scenario.duration / _PERIOD) + 1) * _PERIOD
     with located("reference: "):
         reference = make_reference(scenario.reference, robot, coarse)
@@ -184,7 +184,8 @@ class Experiments:
 
     def _made_by_us(self, shipped: Scenario) -> Scenario:
         """A shipped scenario with our model and sensors, to which its estimator need not fit."""
-        period = max(shipped.log.period, shipped.recording.block / _SAMPLES)
+        period = required(shipped.log.period, "log.period")
+        period = max(period, shipped.recording.block / _SAMPLES)
         gantry_height = shipped.robot.gantry_height
         return replace(
             shipped,

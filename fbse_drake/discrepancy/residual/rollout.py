@@ -1,6 +1,6 @@
 """The model simulated against a log: the error that a user of the model would see."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -9,9 +9,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from fbse_drake.discrepancy.residual.servo import scaled_gains, stretches
-from fbse_drake.effects.effect import ResolvedEffect
-from fbse_drake.effects.sensor import SensorEffect, SensorSignals
-from fbse_drake.errors import InputError, located
+from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorEffect, SensorSignals
+from fbse_drake.errors import InputError, located, required
 from fbse_drake.estimators.estimator import NoEstimator
 from fbse_drake.log import Log
 from fbse_drake.processes import Processes, Task
@@ -161,7 +160,8 @@ class Rollout:
         errors = self.processes.results(list(self.draws), progress, _SIMULATING)
         if self.further is None:
             return errors[0]
-        if not _agree(*errors, 0.0 if beside is None else beside.mean_position):
+        first, second = errors
+        if not _agree(first, second, 0.0 if beside is None else beside.mean_position):
             third = self.processes.begin(self.further)
             errors += self.processes.results([third], progress, _SIMULATING)
         # Of two that agree, the worse.
@@ -201,7 +201,9 @@ def _simulated_error(
         if run.end.interrupted:
             raise Interrupted("it was interrupted")
         robot, time_step = run.station.robot, scenario.plant.time_step
-        rows = np.arange(0, run.steps, round(scenario.log.period / time_step))
+        rows = np.arange(
+            0, run.steps, round(required(scenario.log.period, "log.period") / time_step)
+        )
         time = rows * time_step
         place = np.searchsorted(time, log.time - 1e-9)
         shared = (place < len(time)) & (
@@ -249,8 +251,17 @@ def _rollout_error(
     q = error["joint/position"]
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.linalg.norm(q, axis=0) / np.linalg.norm(log["joint/position"][rows], axis=0)
+    position, velocity, torque_command = rms
     return RolloutError(
-        *rms, time, failure, by_joint(np.abs(q).mean(axis=0)), by_joint(relative), log.time[rows], q
+        position,
+        velocity,
+        torque_command,
+        time,
+        failure,
+        by_joint(np.abs(q).mean(axis=0)),
+        by_joint(relative),
+        log.time[rows],
+        q,
     )
 
 
@@ -297,8 +308,10 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
-    effects = scenario.robot.effects_of(SensorEffect, robot.description, key="model")
-    state = _first_state(robot, effects, log, scenario.control.period)
+    resolved = scenario.robot.effects_of(SensorEffect, robot.description, key="model")
+    effects = [effect for effect in resolved if isinstance(effect, ResolvedSensorEffect)]
+    period = required(scenario.control.period, "control.period")
+    state = _first_state(robot, effects, log, period)
     robot.set_state(robot.plant.GetMyMutableContextFromRoot(context), *state)
 
     failure = None
@@ -327,7 +340,7 @@ def _simulate_stretch(scenario: Scenario, log: Log) -> tuple[dict[str, np.ndarra
 
 def _first_state(
     robot: Robot,
-    effects: list[ResolvedEffect],
+    effects: Sequence[ResolvedSensorEffect],
     log: Log,
     period: float,
 ) -> tuple[np.ndarray, np.ndarray]:
