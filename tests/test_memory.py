@@ -67,9 +67,6 @@ def test_a_released_station_and_all_systems_in_it_are_freed(
     assert [type(kept()).__name__ for kept in references if kept() is not None] == []
 
 
-@pytest.mark.skipif(
-    not _STATISTICS.exists(), reason="the memory of a process is read as Linux has it"
-)
 def memory_of_walks() -> list[float]:
     """What is used after each of some walks that are simulated and estimated [MiB]."""
     walk = scenario("paper_walk_fbse", "duration=0.3")
@@ -80,6 +77,9 @@ def memory_of_walks() -> list[float]:
     return used
 
 
+@pytest.mark.skipif(
+    not _STATISTICS.exists(), reason="the memory of a process is read as Linux has it"
+)
 def test_memory_levels_off_over_simulations_and_estimates() -> None:
     """What is not freed of a run is 10 MiB of its station and 2 MiB of its estimators.
 

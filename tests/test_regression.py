@@ -70,6 +70,26 @@ def test_a_belief_in_what_does_not_show_leaves_the_rest_as_it_is() -> None:
     assert found == pytest.approx(expected, rel=1e-9)
 
 
+def test_normal_equations_are_those_of_the_columns_in_the_order_that_is_asked_for() -> None:
+    """Of rows with weights of their own, less the offset; whatever was fitted first."""
+    rng = np.random.default_rng(11)
+    white, signatures = white_of(rng.normal(size=(200, ROWS))), some_signatures(rng, 200)
+    fits, scale = Regression(white), np.array([1.0, 4.0, 0.25])
+    fits.fit([signatures[k] for k in (3, 0, 2, 1)])
+    asked = [signatures[k] for k in (2, 1, 3, 0)]
+    X, y, start = np.zeros((200, ROWS, 6)), white.y.copy(), 0
+    for s in asked:
+        stop = start + s.values.shape[2]
+        X[:, s.rows, start:stop] = s.values
+        y[:, s.rows] -= s.offset
+        start = stop
+    gram, right = fits.normal_equations(asked, scale)
+    size = np.sqrt(np.einsum("brp,brp->p", X, X))
+    unit = np.outer(size, size)
+    assert gram / unit == pytest.approx(np.einsum("brp,brq,r->pq", X, X, 1 / scale) / unit)
+    assert right / size == pytest.approx(np.einsum("brp,br,r->p", X, y, 1 / scale) / size)
+
+
 def test_what_is_believed_needs_no_stretches_to_be_known() -> None:
     """Two columns that are one, of which the log shows the sum, in two of many stretches of time;
     one parameter is known beforehand. How sure the other is follows from that alone, and its

@@ -3,12 +3,12 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.diagnose import Estimate, Finding
-from fbse_drake.discrepancy.diagnosis.written import WrittenParameter, written_diagnosis
+from fbse_drake.discrepancy.diagnosis.written import written_diagnosis
 from fbse_drake.effects.effect import Effect, library
 from fbse_drake.effects.inertia import InertialParameters
 from fbse_drake.effects.surplus import without_surplus
@@ -35,7 +35,11 @@ def read_findings(diagnosis: Mapping[str, Any], effect: str | None = None) -> li
             tuple(entry.joints),
             np.nan if entry.held_out_before is None else entry.held_out_before,
             np.nan if entry.held_out_after is None else entry.held_out_after,
-            {name: Estimate(p.value, _between(p), p.unit) for name, p in entry.parameters.items()},
+            # Bounds that were null are infinite by now.
+            {
+                name: Estimate(p.value, cast(tuple[float, float], tuple(p.interval)), p.unit)
+                for name, p in entry.parameters.items()
+            },
             tuple(entry.confusable_with),
             entry.chosen,
             entry.tentative,
@@ -81,11 +85,6 @@ def add(scenario: Scenario, findings: Sequence[Finding]) -> Scenario:
         if beside is not None:
             effects[_free_key(name, effects)] = beside
     return replace(scenario, model=replace(model, effects=effects))
-
-
-def _between(parameter: WrittenParameter) -> tuple[float, float]:
-    low, high = (np.nan if bound is None else bound for bound in parameter.interval)
-    return low, high
 
 
 def settled(findings: Sequence[Finding]) -> list[Finding]:

@@ -125,7 +125,7 @@ class Fits:
         self._remainders: WeakKeyDictionary[Explanation, Remainder] = WeakKeyDictionary()
         # Candidates that are no joint torque effects, made linear about values.
         self._about: Memory[Candidate] = Memory(
-            _MOST_NUMBERS, lambda candidate: candidate.signature.values.size
+            _MOST_NUMBERS, lambda c: c.signature.values.size + c.raw.values.size
         )
         # Candidates that were fitted together, made linear about the values that were found.
         self.polished: Memory[tuple[Candidate, ...]] = Memory(
