@@ -402,19 +402,22 @@ class Regression:
         """
         sizes = [s.values.shape[2] for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        for signature in signatures:
-            self._age.setdefault(signature, len(self._age))
+        age = self._ages(signatures)
         parameters, parts = np.zeros(sum(sizes)), []
         sse, held_out_sse = self.white.sse.copy(), self.white.sse.copy()
         # Those that share no row have nothing to do with each other.
         for group in connected(signatures):
-            members = sorted(group, key=lambda k: self._age[signatures[k]])
+            members = sorted(group, key=lambda k: age[k])
             part = self._part(tuple(signatures[k] for k in members))
             at = np.concatenate([places[k] for k in members])
             parameters[at] = part.parameters
             sse[part.rows], held_out_sse[part.rows] = part.sse, part.held_out_sse
             parts.append((at, part))
         return Fit(parameters, sse, held_out_sse, tuple(parts))
+
+    def _ages(self, signatures: Sequence[Signature]) -> list[int]:
+        """Places of signatures in the order in which all were first seen."""
+        return [self._age.setdefault(signature, len(self._age)) for signature in signatures]
 
     def gram(self, a: Signature, b: Signature) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Inner products of the columns of two whitened signatures in the rows that they share.
@@ -524,14 +527,13 @@ class Regression:
     def normal_equations(
         self, signatures: Sequence[Signature], scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of several signatures that were fitted together, in all their rows, each weighted by the
-        inverse of its scale (R,).
+        """Of several signatures in all their rows, each weighted by the inverse of its scale (R,).
 
         Returns:
             Inner products of the columns that have a parameter with each other, (P, P), and with
             the residual less the offsets, (P,).
         """
-        order = sorted(range(len(signatures)), key=lambda k: self._age[signatures[k]])
+        order = np.argsort(self._ages(signatures))
         together = self._together(tuple(signatures[k] for k in order))
         sizes = [s.values.shape[2] for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
