@@ -321,7 +321,8 @@ def add_sensor_effects(
     )
     effects = builder.AddNamedSystem("sensor_effects", system)
     torques = {name: ports[name] for name in ("torque_command", "friction")}
-    connect_by_name(builder, measured | torques, effects)
+    truth = {"true_joint_state": ports["joint_state"]}
+    connect_by_name(builder, measured | torques | truth, effects)
     split = builder.AddNamedSystem("distorted", Demultiplexer(list(system.sizes.values())))
     builder.Connect(effects.get_output_port(), split.get_input_port())
     return {f"measured_{name}": split.get_output_port(i) for i, name in enumerate(system.sizes)}

@@ -44,7 +44,8 @@ class SensorSignals:
     # Of second encoders, on the motors' side, shape (..., n) [rad]; (..., 0) where there are none.
     motor_position: np.ndarray
     # Torque that passed the gears as the step before began and as it ended, linear in between,
-    # shape (..., n) each [Nm]: the command less what friction and other effects took of it.
+    # shape (..., n) each [Nm]: the command less what friction, other effects and the rotors'
+    # acceleration took of it.
     load_begin: np.ndarray
     load_end: np.ndarray
 
@@ -695,11 +696,11 @@ class TransmissionElasticity(ShiftOrTurn):
 
     time_constant d_dot = compliance * load - d
 
-    The load is the torque that reaches the link: the command less friction and whatever else takes
-    of it, for these sit in motor and gear (Spong 1987, whose rotor is part of the link here). With
-    encoders on both sides the second one reads this, and the first the link's angle. The load is
-    linear in time within a step, and the solution is exact. A loop of derivative gain kd over such
-    an encoder needs kd * compliance < time_constant.
+    The load is the torque that reaches the link: the command less what motor and gear take of it,
+    friction and the rotor's acceleration (Spong 1987; the link moves as if the joint were rigid).
+    With encoders on both sides the second one reads this, and the first the link's angle. The load
+    is linear in time within a step, and the solution is exact. A loop of derivative gain kd over
+    such an encoder needs kd * compliance < time_constant.
     """
 
     description: ClassVar[str] = (

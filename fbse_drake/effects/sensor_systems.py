@@ -23,7 +23,7 @@ class _Readings(LeafSystem):
     the step that ended, (n,) [Nm]; none where that port is left open. The output, all of the
     readings in this order, does not depend on the command of its own tick, which is computed from
     it. Discrete state: the torque that passes the gears as far as it is known before the next
-    tick, and each effect's memory.
+    tick, the velocity of the rotors, and each effect's memory.
     """
 
     # Name of the output port.
@@ -51,6 +51,7 @@ class _Readings(LeafSystem):
         n = len(robot.joint_names)
         pads = sum(leg.points for leg in robot.description.legs.values())
         self._effects, self._robot, self._period = list(effects), robot, period
+        self._rotor_inertia = robot.rotor_inertias
         sizes = {
             "joint_state": 2 * n,
             "imu": 6 if imu else 0,
@@ -59,18 +60,15 @@ class _Readings(LeafSystem):
         }
         # Those that the robot has.
         self.sizes = {name: size for name, size in sizes.items() if size > 0}
-        self._readings = {
-            name: self.DeclareVectorInputPort(name, size) for name, size in self.sizes.items()
-        }
-        self._torque_command = self.DeclareVectorInputPort("torque_command", n)
-        self._friction = self.DeclareVectorInputPort("friction", n)
+        at_once = self._declare_inputs(n)
         # Before the first tick nothing passed the gears.
         self._load = self.DeclareDiscreteState(n)
+        self._rotor_velocity = self.DeclareDiscreteState(np.full(n, np.nan))
         self._memories = [
             self.DeclareDiscreteState(effect.effect.memory_size * len(effect.targets))
             for effect in effects
         ]
-        sources = {self.input_port_ticket(p.get_index()) for p in self._sources()}
+        sources = {self.input_port_ticket(port.get_index()) for port in at_once}
         sources |= {self.xd_ticket()}
         size = sum(self.sizes.values())
         self.DeclareVectorOutputPort(self._gives, size, weakly(self._calc), sources)
@@ -78,8 +76,13 @@ class _Readings(LeafSystem):
             self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._remember))
             self.DeclareForcedUnrestrictedUpdateEvent(weakly(self._remember))
 
-    def _sources(self) -> list[InputPort]:
-        """What the output depends on at once."""
+    def _declare_inputs(self, joints: int) -> list[InputPort]:
+        """Declares the input ports; returns those that the output depends on at once."""
+        self._readings = {
+            name: self.DeclareVectorInputPort(name, size) for name, size in self.sizes.items()
+        }
+        self._torque_command = self.DeclareVectorInputPort("torque_command", joints)
+        self._friction = self.DeclareVectorInputPort("friction", joints)
         return [*self._readings.values()]
 
     def _friction_in(self, context: Context) -> np.ndarray:
@@ -89,8 +92,21 @@ class _Readings(LeafSystem):
         return np.nan_to_num(self._friction.Eval(context))
 
     @abstractmethod
-    def _load_now(self, context: Context) -> np.ndarray:
-        """Torque that passed the gears in the step that ended, (n,) [Nm]."""
+    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+        """Torque that passed the gears in the step that ended, (n,) [Nm], and the velocity of the
+        rotors at its end, (n,) [rad/s].
+
+        Args:
+            signals: the readings; their load is not known yet.
+        """
+
+    def _less_rotors(
+        self, context: Context, torque: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """A torque less what rotors took to get to this velocity in the step that ended, (n,)
+        [Nm]."""
+        change = velocity - context.get_discrete_state(self._rotor_velocity).value()
+        return torque - self._rotor_inertia * np.nan_to_num(change) / self._period
 
     @abstractmethod
     def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:
@@ -106,16 +122,21 @@ class _Readings(LeafSystem):
             memories: of each effect, (memory_size, targets).
         """
 
-    def _signals(self, context: Context, torque_command: np.ndarray) -> SensorSignals:
+    def _signals(
+        self, context: Context, torque_command: np.ndarray
+    ) -> tuple[SensorSignals, np.ndarray]:
+        """What effects are given, and the velocity of the rotors (n,) [rad/s]."""
         read = {name: port.Eval(context) for name, port in self._readings.items()}
         position, velocity = np.split(read["joint_state"], 2)
         imu = read.get("imu", np.zeros(6))
         pads = read.get("pad_force", np.zeros(0)).reshape(-1, 3)
         motors = read.get("motor_position", np.zeros(0))
-        load = self._load_now(context)
-        return SensorSignals(
-            position, velocity, imu[:3], imu[3:], pads, torque_command, motors, load, load
+        unknown = np.zeros_like(position)
+        signals = SensorSignals(
+            position, velocity, imu[:3], imu[3:], pads, torque_command, motors, unknown, unknown
         )
+        load, rotor_velocity = self._load_now(context, signals)
+        return replace(signals, load_begin=load, load_end=load), rotor_velocity
 
     def _memory(self, context: Context) -> list[np.ndarray]:
         return [
@@ -125,7 +146,8 @@ class _Readings(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         unknown = np.full(self._torque_command.size(), np.nan)
-        signals, _ = self._passed(self._signals(context, unknown), self._memory(context))
+        signals, _ = self._signals(context, unknown)
+        signals, _ = self._passed(signals, self._memory(context))
         given = {
             "joint_state": np.concatenate([signals.joint_position, signals.joint_velocity]),
             "imu": np.concatenate([signals.specific_force, signals.angular_velocity]),
@@ -137,7 +159,8 @@ class _Readings(LeafSystem):
     def _remember(self, context: Context, state: State) -> None:
         memories = self._memory(context)
         command = self._torque_command.Eval(context)
-        signals = self._signals(context, command)
+        signals, rotor_velocity = self._signals(context, command)
+        state.get_mutable_discrete_state(self._rotor_velocity).set_value(rotor_velocity)
         if np.isfinite(command).all():
             load = self._load_of(context, command)
             state.get_mutable_discrete_state(self._load).set_value(load)
@@ -172,20 +195,40 @@ class SensorEffects(_Readings):
         - motor_position
         - torque_command
         - friction (optional)
+        - true_joint_state (optional)
         output_ports:
         - measured
 
-    See `_Readings`; `measured` is what is read then.
+    See `_Readings`; `measured` is what is read then. `true_joint_state` [positions, velocities] is
+    of the links, (2n,) [rad, rad/s]; where that port is left open rotors take no torque.
     """
 
     _gives = "measured"
 
-    def _sources(self) -> list[InputPort]:
-        return [*super()._sources(), self._friction]
+    def _declare_inputs(self, joints: int) -> list[InputPort]:
+        at_once = super()._declare_inputs(joints)
+        self._links = self.DeclareVectorInputPort("true_joint_state", 2 * joints)
+        return [*at_once, self._friction, self._links]
 
-    def _load_now(self, context: Context) -> np.ndarray:
-        command = context.get_discrete_state(self._load).value()
-        return command - self._friction_in(context)
+    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+        load = context.get_discrete_state(self._load).value() - self._friction_in(context)
+        if not self._links.HasValue(context):
+            return load, np.full(len(load), np.nan)
+        _, link_velocity = np.split(self._links.Eval(context), 2)
+        if not any(effect.effect.follows_load() for effect in self._effects):
+            return self._less_rotors(context, load, link_velocity), link_velocity
+        exact, memories = replace(signals, joint_velocity=link_velocity), self._memory(context)
+
+        def rotor_velocity(load: np.ndarray) -> np.ndarray:
+            passed, _ = self._passed(replace(exact, load_begin=load, load_end=load), memories)
+            return passed.joint_velocity
+
+        # How fast a rotor is ahead of its link depends on the load, and the load on that.
+        velocity = rotor_velocity(load)
+        rise = rotor_velocity(load + 1.0) - velocity
+        change = self._less_rotors(context, load, velocity) - load
+        load = load + change / (1.0 + self._rotor_inertia * rise / self._period)
+        return load, rotor_velocity(load)
 
     def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:  # noqa: ARG002
         return command
@@ -221,8 +264,9 @@ class SensorCorrections(_Readings):
     _gives = "corrected"
 
     # What is known of the friction may come from what is corrected: it is that of the step before.
-    def _load_now(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._load).value()
+    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+        load = context.get_discrete_state(self._load).value()
+        return self._less_rotors(context, load, signals.joint_velocity), signals.joint_velocity
 
     def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:
         return command - self._friction_in(context)

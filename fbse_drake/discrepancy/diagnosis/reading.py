@@ -150,17 +150,20 @@ class Reading:
         """Signals with the torque that passes the gears, without white noise: it would become an
         acceleration.
 
-        In steps it is the command less friction, as the model's laws say and as what they leave
-        over looks like. Of rows that are sampled at an instant, in joints with friction, it is what
-        the links need by the rigid model: so it is not the friction, which jumps, that must be
-        known. (A link on a spring so soft that they swing together needs another torque than a
-        rigid one; without friction that is what is commanded.)
+        In steps it is the command less what rotors need to accelerate and less friction, as the
+        model's laws say and as what they leave over looks like. Of rows that are sampled at an
+        instant, in joints with friction, it is what the links need by the rigid model: so it is not
+        the friction, which jumps, that must be known. (A link on a spring so soft that they swing
+        together needs another torque than a rigid one; without friction that is what is commanded,
+        less the rotor's.)
 
         Args:
             joint_motion: of these signals, see `joint_motion_of`.
             laws: of the model, see `friction_laws`.
         """
         load = np.asarray(joint_motion.command)
+        if self._knows_load:
+            load = load - self._rotor_torque(signals)
         if self.motion.recording.is_sampled:
             if self.has_load_of_motion.any():
                 load = np.where(self.has_load_of_motion, self._needed_load(signals), load)
@@ -212,9 +215,31 @@ class Reading:
         return self.motion.without_noise(np.stack(smooth, axis=1))
 
     def _link_torque(self, signals: SensorSignals) -> np.ndarray:
-        """What the links need in every step by the rigid model, (N - 1, n) [Nm]."""
+        """What the links need in every step by the rigid model, without rotors, (N - 1, n) [Nm]."""
         steps, n = self.motion.steps_of(signals), len(self.robot.joint_names)
-        return steps.torque_command - self.motion.equation.residual(steps)[:, :n]
+        needed = steps.torque_command - self.motion.equation.residual(steps)[:, :n]
+        return needed - self.robot.rotor_inertias * steps.joint_acceleration
+
+    def _rotor_torque(self, signals: SensorSignals) -> np.ndarray:
+        """What rotors need to accelerate with their joints, without noise, in every step (N - 1, n)
+        or, of rows that are sampled at an instant, at every sample (N, n) [Nm]."""
+        corners = zip(self._accelerations(signals).T, self._acceleration_corners, strict=True)
+        smooth = [self.motion.low_passed(column, corner) for column, corner in corners]
+        return self.robot.rotor_inertias * np.stack(smooth, axis=1)
+
+    def _accelerations(self, signals: SensorSignals) -> np.ndarray:
+        """Of the joints, as differences of their velocities; see `_rotor_torque` [rad/s^2]."""
+        velocity, period = signals.joint_velocity, self.motion.period
+        is_sampled = self.motion.recording.is_sampled
+        return (np.gradient if is_sampled else np.diff)(velocity, axis=0) / period
+
+    @cached_property
+    def _acceleration_corners(self) -> list[float]:
+        """Frequency above which each joint's acceleration is little but noise of its velocity [Hz];
+        0 for none."""
+        accelerations = self._accelerations(self.motion.signals)
+        variance = np.full(accelerations.shape[1], joint_velocity_noise(self.motion.sensors) ** 2)
+        return noise_corners(accelerations, variance, self.motion.period, of_rates=True)
 
     @cached_property
     def _load_corners(self) -> list[float]:
