@@ -4,9 +4,18 @@ an estimator gets."""
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, State
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    InputPort,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
 
 from fbse_drake.effects.sensor import ResolvedSensorEffect, SensorSignals
 from fbse_drake.robot.plant import Robot
@@ -70,6 +79,10 @@ class _Readings(LeafSystem):
         ]
         sources = {self.input_port_ticket(port.get_index()) for port in at_once}
         sources |= {self.xd_ticket()}
+        # What `_gear_now` finds, once a tick.
+        nothing = AbstractValue.Make((np.zeros(n), np.zeros(n)))
+        producer = ValueProducer(nothing.Clone, weakly(self._calc_gear))
+        self._gear = self.DeclareCacheEntry("gear", producer, sources)
         size = sum(self.sizes.values())
         self.DeclareVectorOutputPort(self._gives, size, weakly(self._calc), sources)
         if any(effect.effect.memory_size for effect in effects):
@@ -92,13 +105,16 @@ class _Readings(LeafSystem):
         return np.nan_to_num(self._friction.Eval(context))
 
     @abstractmethod
-    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+    def _gear_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
         """Torque that passed the gears in the step that ended, (n,) [Nm], and the velocity of the
         rotors at its end, (n,) [rad/s].
 
         Args:
-            signals: the readings; their load is not known yet.
+            signals: the readings; neither their load nor the command is known yet.
         """
+
+    def _calc_gear(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._gear_now(context, self._read(context)))
 
     def _less_rotors(
         self, context: Context, torque: np.ndarray, velocity: np.ndarray
@@ -122,21 +138,23 @@ class _Readings(LeafSystem):
             memories: of each effect, (memory_size, targets).
         """
 
-    def _signals(
-        self, context: Context, torque_command: np.ndarray
-    ) -> tuple[SensorSignals, np.ndarray]:
-        """What effects are given, and the velocity of the rotors (n,) [rad/s]."""
+    def _read(self, context: Context) -> SensorSignals:
+        """The readings; their load and the command are not known."""
         read = {name: port.Eval(context) for name, port in self._readings.items()}
         position, velocity = np.split(read["joint_state"], 2)
         imu = read.get("imu", np.zeros(6))
         pads = read.get("pad_force", np.zeros(0)).reshape(-1, 3)
         motors = read.get("motor_position", np.zeros(0))
-        unknown = np.zeros_like(position)
-        signals = SensorSignals(
-            position, velocity, imu[:3], imu[3:], pads, torque_command, motors, unknown, unknown
+        unknown = np.full(len(position), np.nan)
+        return SensorSignals(
+            position, velocity, imu[:3], imu[3:], pads, unknown, motors, unknown, unknown
         )
-        load, rotor_velocity = self._load_now(context, signals)
-        return replace(signals, load_begin=load, load_end=load), rotor_velocity
+
+    def _signals(self, context: Context) -> SensorSignals:
+        """What effects are given; the command is not known yet."""
+        gear: Any = self._gear.Eval(context)
+        load, _ = gear
+        return replace(self._read(context), load_begin=load, load_end=load)
 
     def _memory(self, context: Context) -> list[np.ndarray]:
         return [
@@ -145,9 +163,7 @@ class _Readings(LeafSystem):
         ]
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        unknown = np.full(self._torque_command.size(), np.nan)
-        signals, _ = self._signals(context, unknown)
-        signals, _ = self._passed(signals, self._memory(context))
+        signals, _ = self._passed(self._signals(context), self._memory(context))
         given = {
             "joint_state": np.concatenate([signals.joint_position, signals.joint_velocity]),
             "imu": np.concatenate([signals.specific_force, signals.angular_velocity]),
@@ -159,7 +175,9 @@ class _Readings(LeafSystem):
     def _remember(self, context: Context, state: State) -> None:
         memories = self._memory(context)
         command = self._torque_command.Eval(context)
-        signals, rotor_velocity = self._signals(context, command)
+        signals = replace(self._signals(context), torque_command=command)
+        gear: Any = self._gear.Eval(context)
+        _, rotor_velocity = gear
         state.get_mutable_discrete_state(self._rotor_velocity).set_value(rotor_velocity)
         if np.isfinite(command).all():
             load = self._load_of(context, command)
@@ -210,7 +228,7 @@ class SensorEffects(_Readings):
         self._links = self.DeclareVectorInputPort("true_joint_state", 2 * joints)
         return [*at_once, self._friction, self._links]
 
-    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+    def _gear_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
         load = context.get_discrete_state(self._load).value() - self._friction_in(context)
         if not self._links.HasValue(context):
             return load, np.full(len(load), np.nan)
@@ -227,8 +245,8 @@ class SensorEffects(_Readings):
         velocity = rotor_velocity(load)
         rise = rotor_velocity(load + 1.0) - velocity
         change = self._less_rotors(context, load, velocity) - load
-        load = load + change / (1.0 + self._rotor_inertia * rise / self._period)
-        return load, rotor_velocity(load)
+        change /= 1.0 + self._rotor_inertia * rise / self._period
+        return load + change, velocity + rise * change
 
     def _load_of(self, context: Context, command: np.ndarray) -> np.ndarray:  # noqa: ARG002
         return command
@@ -264,7 +282,7 @@ class SensorCorrections(_Readings):
     _gives = "corrected"
 
     # What is known of the friction may come from what is corrected: it is that of the step before.
-    def _load_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
+    def _gear_now(self, context: Context, signals: SensorSignals) -> tuple[np.ndarray, np.ndarray]:
         load = context.get_discrete_state(self._load).value()
         return self._less_rotors(context, load, signals.joint_velocity), signals.joint_velocity
 
