@@ -79,10 +79,9 @@ class _Readings(LeafSystem):
         ]
         sources = {self.input_port_ticket(port.get_index()) for port in at_once}
         sources |= {self.xd_ticket()}
-        # What `_gear_now` finds, once a tick.
-        nothing = AbstractValue.Make((np.zeros(n), np.zeros(n)))
-        producer = ValueProducer(nothing.Clone, weakly(self._calc_gear))
-        self._gear = self.DeclareCacheEntry("gear", producer, sources)
+        # What effects are given, and the velocity of the rotors (n,), found once a tick.
+        producer = ValueProducer(AbstractValue.Make(()).Clone, weakly(self._calc_given))
+        self._given = self.DeclareCacheEntry("given", producer, sources)
         size = sum(self.sizes.values())
         self.DeclareVectorOutputPort(self._gives, size, weakly(self._calc), sources)
         if any(effect.effect.memory_size for effect in effects):
@@ -113,8 +112,10 @@ class _Readings(LeafSystem):
             signals: the readings; neither their load nor the command is known yet.
         """
 
-    def _calc_gear(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._gear_now(context, self._read(context)))
+    def _calc_given(self, context: Context, output: AbstractValue) -> None:
+        signals = self._read(context)
+        load, rotor_velocity = self._gear_now(context, signals)
+        output.set_value((replace(signals, load_begin=load, load_end=load), rotor_velocity))
 
     def _less_rotors(
         self, context: Context, torque: np.ndarray, velocity: np.ndarray
@@ -150,12 +151,6 @@ class _Readings(LeafSystem):
             position, velocity, imu[:3], imu[3:], pads, unknown, motors, unknown, unknown
         )
 
-    def _signals(self, context: Context) -> SensorSignals:
-        """What effects are given; the command is not known yet."""
-        gear: Any = self._gear.Eval(context)
-        load, _ = gear
-        return replace(self._read(context), load_begin=load, load_end=load)
-
     def _memory(self, context: Context) -> list[np.ndarray]:
         return [
             context.get_discrete_state(place).value().reshape(-1, len(effect.targets))
@@ -163,21 +158,22 @@ class _Readings(LeafSystem):
         ]
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        signals, _ = self._passed(self._signals(context), self._memory(context))
-        given = {
+        given: Any = self._given.Eval(context)
+        signals, _ = self._passed(given[0], self._memory(context))
+        read = {
             "joint_state": np.concatenate([signals.joint_position, signals.joint_velocity]),
             "imu": np.concatenate([signals.specific_force, signals.angular_velocity]),
             "pad_force": signals.pad_force.ravel(),
             "motor_position": signals.motor_position,
         }
-        output.SetFromVector(np.concatenate([given[name] for name in self.sizes]))
+        output.SetFromVector(np.concatenate([read[name] for name in self.sizes]))
 
     def _remember(self, context: Context, state: State) -> None:
         memories = self._memory(context)
         command = self._torque_command.Eval(context)
-        signals = replace(self._signals(context), torque_command=command)
-        gear: Any = self._gear.Eval(context)
-        _, rotor_velocity = gear
+        given: Any = self._given.Eval(context)
+        signals, rotor_velocity = given
+        signals = replace(signals, torque_command=command)
         state.get_mutable_discrete_state(self._rotor_velocity).set_value(rotor_velocity)
         if np.isfinite(command).all():
             load = self._load_of(context, command)

@@ -225,13 +225,17 @@ class Reading:
         or, of rows that are sampled at an instant, at every sample (N, n) [Nm]."""
         corners = zip(self._accelerations(signals).T, self._acceleration_corners, strict=True)
         smooth = [self.motion.low_passed(column, corner) for column, corner in corners]
-        return self.robot.rotor_inertias * np.stack(smooth, axis=1)
+        torque = self.robot.rotor_inertias * np.stack(smooth, axis=1)
+        return torque if self.motion.recording.is_sampled else torque[:-1]
 
     def _accelerations(self, signals: SensorSignals) -> np.ndarray:
-        """Of the joints, as differences of their velocities; see `_rotor_torque` [rad/s^2]."""
-        velocity, period = signals.joint_velocity, self.motion.period
-        is_sampled = self.motion.recording.is_sampled
-        return (np.gradient if is_sampled else np.diff)(velocity, axis=0) / period
+        """Of the joints at every sample or, where rows are steps, in the step that begins there,
+        after the last as in it, (N, n) [rad/s^2]."""
+        velocity = signals.joint_velocity
+        if self.motion.recording.is_sampled:
+            return np.gradient(velocity, axis=0) / self.motion.period
+        steps = np.diff(velocity, axis=0)
+        return np.concatenate([steps, steps[-1:]]) / self.motion.period
 
     @cached_property
     def _acceleration_corners(self) -> list[float]:
