@@ -9,7 +9,7 @@ import numpy as np
 from fbse_drake.discrepancy.diagnosis.explanation import Explanation
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.grid_sets import grid_gain
-from fbse_drake.discrepancy.identification.regression import bounded_least_squares
+from fbse_drake.discrepancy.identification.normal_equations import bounded_least_squares
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.joint_torque import JointTorqueEffect
 
@@ -107,7 +107,7 @@ def least_power(gram: np.ndarray, lowest: np.ndarray) -> float:
         gram: inner products of the column and the others, (p, p).
         lowest: amounts of the others, (p - 1,).
     """
-    others = bounded_least_squares(gram[1:, 1:], -gram[1:, 0], lowest)
+    others = bounded_least_squares(gram[1:, 1:], -gram[1:, 0], lowest, np.full(len(lowest), np.inf))
     return float(gram[0, 0] + 2 * gram[0, 1:] @ others + others @ gram[1:, 1:] @ others)
 
 

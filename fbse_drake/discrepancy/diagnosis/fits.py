@@ -14,11 +14,11 @@ from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary, FixedColumns
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
 from fbse_drake.discrepancy.diagnosis.grid_sets import GridSets, grid_gain
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
+from fbse_drake.discrepancy.identification.normal_equations import bounded_least_squares
 from fbse_drake.discrepancy.identification.regression import (
     Regression,
     Signature,
     WhitenedResidual,
-    bounded_least_squares,
     connected,
     leftover,
 )
@@ -387,7 +387,7 @@ class Fits:
             moments = [beside.moments_of_sets(s.signature, 0, s.gram) for s in sets]
             gram, right = (sum(part[0] for part in parts) for parts in zip(*moments, strict=True))
             # A slope for an amount that cannot be would mimic just that.
-            amounts = bounded_least_squares(gram, right, smallest)
+            amounts = bounded_least_squares(gram, right, smallest, np.full_like(smallest, np.inf))
 
         def linearised(columns: np.ndarray) -> np.ndarray:
             """Columns (r, B, G, p) of the stencil: those of the amounts, then slopes for amounts

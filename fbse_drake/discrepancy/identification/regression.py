@@ -9,9 +9,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numba import njit
 from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import stdtrit
 
+from fbse_drake.discrepancy.identification.normal_equations import (
+    bounded_least_squares,
+    squares_left,
+    weighted_equations,
+)
 from fbse_drake.discrepancy.residual.memory import Memory
 from fbse_drake.discrepancy.residual.residual import Residual
 
@@ -25,12 +29,6 @@ FOLDS = 5
 _LONG = 4
 # How often the rows are weighted anew by what is left in them.
 _REWEIGHTINGS = 3
-# Columns, scaled to the same length, of which one keeps less than this share of its length beside
-# the others are collinear.
-_COLLINEAR = 1e-4
-# Rounding of a sum of products as a share of its terms, and the share of the sum that may be
-# rounding.
-_ROUNDING, _NEGLIGIBLE = 1e-15, 1e-7
 # Of a variance; what is less counts as this much.
 _LEAST_SHARE = 1e-3
 # So many numbers are kept of columns by fold, and of inner products; and so many fits.
@@ -60,6 +58,22 @@ class Signature:
     highest: np.ndarray | float = np.inf
     # Values about which it is linear, shape (p,), or 0.
     about: np.ndarray | float = 0.0
+
+    @property
+    def parameters(self) -> int:
+        """How many."""
+        return self.values.shape[2]
+
+    @property
+    def columns(self) -> int:
+        """How many, an offset among them."""
+        return self.parameters + isinstance(self.offset, np.ndarray)
+
+    @cached_property
+    def beliefs(self) -> np.ndarray:
+        """Prior, what is expected, steadying, lowest and highest of each parameter, (5, p)."""
+        believed = self.prior, self.expected, self.steadying, self.lowest, self.highest
+        return np.stack([np.broadcast_to(values, self.parameters) for values in believed])
 
 
 # Places of the rows that two signatures share in each of them, and inner products of their columns.
@@ -189,7 +203,7 @@ class WhitenedResidual:
 
     def whiten_signature(self, signature: Signature) -> Signature:
         """A signature, whitened."""
-        values = np.empty((len(signature.rows), len(self.y), signature.values.shape[2]))
+        values = np.empty((len(signature.rows), len(self.y), signature.parameters))
         for k, row in enumerate(signature.rows):
             values[k] = self.whiten(row, signature.values[:, k])
         offset = signature.offset
@@ -294,7 +308,7 @@ class PartialFit:
         by_block, information = np.empty((len(left), size)), np.empty((len(left), size))
         start = 0
         for s in self._signatures:
-            stop, places = start + s.values.shape[2], np.searchsorted(self.rows, s.rows)
+            stop, places = start + s.parameters, np.searchsorted(self.rows, s.rows)
             by_block[:, start:stop] = np.einsum("brp,br->bp", s.values, left[:, places])
             information[:, start:stop] = np.einsum(
                 "brp,r->bp", s.values**2, 1.0 / self._scale[places]
@@ -306,9 +320,7 @@ class PartialFit:
         bread = np.linalg.pinv(self._gram / np.outer(norm, norm), hermitian=True)
         bread /= np.outer(norm, norm)
         least = np.sqrt(np.diag(bread))
-        prior = np.concatenate(
-            [np.broadcast_to(s.prior, s.values.shape[2]) for s in self._signatures]
-        )
+        prior = np.concatenate([s.beliefs[0] for s in self._signatures])
         believed = np.minimum(((bread**2) * prior).sum(axis=1), least**2)
         deviation, freedom = least, np.full(size, np.inf)
         for stretch in (white.stretch, white.stretch // _LONG):
@@ -345,7 +357,7 @@ class _Assembled:
     # (F, r, Q, Q) and (F, r, Q).
     gram: np.ndarray
     target: np.ndarray
-    # Which columns have a parameter, (Q,); offsets have none.
+    # Places of the columns that have a parameter, (P,); offsets have none.
     fitted: np.ndarray
 
     @cached_property
@@ -360,12 +372,7 @@ class _Assembled:
     def weighted(self, scale: np.ndarray, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of one fold, or of all, each row weighted by the inverse of its scale
         (r,): (P, P) and (P,) of the P columns that have a parameter."""
-        gram, target = self.of(fold)
-        gram, right = np.tensordot(1.0 / scale, gram, axes=1), (1.0 / scale) @ target
-        if self.fitted.all():
-            return gram, right
-        right = (right - gram[:, ~self.fitted].sum(axis=1))[self.fitted]
-        return gram[np.ix_(self.fitted, self.fitted)], right
+        return weighted_equations(*self.of(fold), 1.0 / scale, self.fitted)
 
 
 class Regression:
@@ -400,7 +407,7 @@ class Regression:
         Args:
             signatures: whitened.
         """
-        sizes = [s.values.shape[2] for s in signatures]
+        sizes = [s.parameters for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         age = self._ages(signatures)
         parameters, parts = np.zeros(sum(sizes)), []
@@ -502,17 +509,14 @@ class Regression:
         """Signatures put to others that are together already."""
         signatures = known + added
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
-        stops = np.cumsum([self.target(s).shape[2] for s in signatures])
+        stops = np.cumsum([s.columns for s in signatures])
         gram = np.zeros((FOLDS, len(rows), stops[-1], stops[-1]))
         target = np.zeros((FOLDS, len(rows), stops[-1]))
         if before is not None:
             start = stops[len(known) - 1]
             at = np.searchsorted(rows, before.rows)
             gram[:, at, :start, :start], target[:, at, :start] = before.gram, before.target
-        parts = [
-            slice(stop - self.target(s).shape[2], stop)
-            for s, stop in zip(signatures, stops, strict=True)
-        ]
+        parts = [slice(stop - s.columns, stop) for s, stop in zip(signatures, stops, strict=True)]
         for k in range(len(known), len(signatures)):
             new, part = signatures[k], parts[k]
             target[:, np.searchsorted(rows, new.rows), part] = self.target(new)
@@ -521,7 +525,9 @@ class Regression:
                 at = np.searchsorted(rows, other.rows[of_other])
                 gram[:, at, place, part] = products
                 gram[:, at, part, place] = np.swapaxes(products, 2, 3)
-        fitted = [np.arange(self.target(s).shape[2]) < s.values.shape[2] for s in signatures]
+        fitted = [
+            part.start + np.arange(s.parameters) for s, part in zip(signatures, parts, strict=True)
+        ]
         return _Assembled(rows, gram, target, np.concatenate(fitted))
 
     def normal_equations(
@@ -535,7 +541,7 @@ class Regression:
         """
         order = np.argsort(self._ages(signatures))
         together = self._together(tuple(signatures[k] for k in order))
-        sizes = [s.values.shape[2] for s in signatures]
+        sizes = [s.parameters for s in signatures]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         at = np.argsort(np.concatenate([places[k] for k in order]))
         gram, right = together.weighted(scale[together.rows])
@@ -548,25 +554,21 @@ class Regression:
         together, white = self._together(signatures), self.white
         rows, count = together.rows, np.maximum(white.count[together.rows], 1)
         fitted = together.fitted
-        amounts = np.where(fitted, 0.0, 1.0)
-        prior, expected, steadying, lowest, highest = (
-            np.concatenate(
-                [np.broadcast_to(getattr(s, name), s.values.shape[2]) for s in signatures]
-            )
-            for name in ("prior", "expected", "steadying", "lowest", "highest")
-        )
+        amounts = np.ones(together.target.shape[2])
+        prior, expected, steadying, lowest, highest = np.hstack([s.beliefs for s in signatures])
         # Units must not decide what counts as singular, nor a column that is next to nothing beside
         # what is believed of it.
         norm = np.sqrt(np.einsum("rqq->q", together.whole[0])[fitted] + prior + steadying)
         norm[norm == 0] = 1.0
         held, believed = np.diag((prior + steadying) / norm**2), prior * expected / norm
+        norms, bounds = np.outer(norm, norm), (lowest * norm, highest * norm)
 
         def weighted(fold: int | None) -> tuple[np.ndarray, np.ndarray]:
             gram, right = together.weighted(scale, fold)
-            return gram / np.outer(norm, norm), right / norm
+            return gram / norms, right / norm
 
         def solved(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
-            found = bounded_least_squares(gram, right, lowest * norm, highest * norm) / norm
+            found = bounded_least_squares(gram, right, *bounds) / norm
             # What is rounded beyond a bound would be impossible.
             return np.minimum(np.maximum(found, lowest), highest)
 
@@ -591,7 +593,7 @@ class Regression:
             white,
             signatures,
             rows,
-            gram * np.outer(norm, norm) - np.diag(steadying),
+            gram * norms - np.diag(steadying),
             scale,
             parameters,
             sse,
@@ -612,16 +614,13 @@ class Regression:
         """
         part = slice(None) if fold is None else slice(fold, fold + 1)
         square = self._square[part, together.rows].sum(axis=0)
-        gram, target = together.of(fold)
-        result = square - 2 * target @ amounts + (gram @ amounts) @ amounts
-        sizes = np.sqrt(np.einsum("rqq->rq", gram)) @ np.abs(amounts) + np.sqrt(square)
-        rounding = _ROUNDING * sizes**2
-        if np.any(rounding > _NEGLIGIBLE * np.maximum(result, 0.0)):
+        result, is_rounded = squares_left(*together.of(fold), square, amounts)
+        if is_rounded:
             y = self._y if fold is None else self._y[fold : fold + 1]
             left = [values[together.rows].copy() for values in y]
             start = 0
             for s in signatures:
-                stop, at = start + self.target(s).shape[2], np.searchsorted(together.rows, s.rows)
+                stop, at = start + s.columns, np.searchsorted(together.rows, s.rows)
                 for values, columns in zip(left, self._by_fold(s)[part], strict=True):
                     values[at] -= columns @ amounts[start:stop]
                 start = stop
@@ -650,7 +649,7 @@ def leftover(
     """Whitened residual without what signatures with these parameters add, (B, R)."""
     left, start = white.y.copy(), 0
     for s in signatures:
-        stop = start + s.values.shape[2]
+        stop = start + s.parameters
         left[:, s.rows] -= s.values @ parameters[start:stop] + s.offset
         start = stop
     return left
@@ -669,35 +668,3 @@ def connected(signatures: Sequence[Signature]) -> list[list[int]]:
                 apart.append(group)
         groups = [*apart, (rows, members)]
     return [sorted(members) for _, members in groups]
-
-
-def bounded_least_squares(
-    gram: np.ndarray,
-    right: np.ndarray,
-    lowest: np.ndarray,
-    highest: np.ndarray | float = np.inf,
-) -> np.ndarray:
-    """Least squares with parameters between their bounds: what would be beyond is held there."""
-    free, theta = np.ones(len(right), dtype=bool), np.zeros(len(right))
-    while free.any():
-        if free.all():
-            theta = _least_squares(gram, right)
-        else:
-            rest = right[free] - gram[np.ix_(free, ~free)] @ theta[~free]
-            theta[free] = _least_squares(gram[np.ix_(free, free)], rest)
-        beyond = free & ((theta < lowest) | (theta > highest))
-        if not beyond.any():
-            break
-        bound = np.minimum(np.maximum(theta, lowest), highest)
-        theta[beyond], free = bound[beyond], free & ~beyond
-    return theta
-
-
-def _least_squares(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solution of the normal equations; that of least norm if columns are collinear."""
-    factor, failed = dpotrf(gram)
-    if not failed:
-        pivots = np.diagonal(factor)
-        if pivots.min() > _COLLINEAR * pivots.max():
-            return dpotrs(factor, right)[0]
-    return np.linalg.lstsq(gram, right, rcond=1e-10)[0]
