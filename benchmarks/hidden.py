@@ -146,7 +146,7 @@ def cases(seeds: int, sizes: Sequence[str], *, quick: bool) -> list[Case]:
     effects = {
         name: effect
         for name, effect in library().items()
-        if not (effect.composite or effect.needs_sampled_torque)
+        if not (effect.composite or effect.needs_sampled_torque or effect.needs_fixed_base)
     }
     result = [
         Case(f"decoy-{seed}", "decoy", "decoy", rollout=seed < _ROLLED_DECOYS)

@@ -82,21 +82,30 @@ def test_rotors_are_found_without_the_first_jerk_of_the_walk(run: Run, cut: int)
     assert rms(error) < 0.05
 
 
-def test_noise_of_a_velocity_is_no_acceleration():
-    """Only what is beyond three standard deviations of the change counts."""
+def test_noise_of_a_velocity_or_of_a_force_is_no_acceleration():
+    """Only what is beyond three standard deviations of the change counts, and is read as well:
+    the velocity that a model foresees has the noise of its forces."""
     n, sigma, T = 2, 5e-4, 1e-3
     known = record(variance=np.full(3 + n, sigma**2))
     noise = {name: np.ones(3 + n) for name in ("noise", "bend_noise")}
-    x = record(velocity=np.zeros(3 + n), **noise, regressor=np.ones((n, 3)))
+    x = record(
+        velocity=np.zeros(3 + n), reading=np.zeros(3 + n), **noise, regressor=np.ones((n, 3))
+    )
     tick = record(velocity=np.sqrt(2.0) * sigma * np.array([2.9, -3.1]), duration=T)
-    put_acceleration(x[()], tick[()], known[()])
+    x["reading"][3:], last = 1.1 * tick["velocity"], record(reading=np.zeros(3 + n))
+    put_acceleration(x[()], last[()], tick[()], known[()])
     np.testing.assert_allclose(x["regressor"][:, -1], [0.0, tick["velocity"][1] / T])
     np.testing.assert_array_equal(x["regressor"][:, :-1], 1.0)
     # Noise that only a model sees is the model's error, if it is far beyond that of the readings.
     for noisier, accelerates in ((24.0, False), (26.0, True)):
         x["noise"] = noisier
-        put_acceleration(x[()], tick[()], known[()])
+        put_acceleration(x[()], last[()], tick[()], known[()])
         assert (x["regressor"][1, -1] != 0.0) == accelerates
+    # Forces that are noisier than believed: the reading does not follow, or goes the other way.
+    for followed in (0.4, -1.1):
+        x["reading"][3:] = followed * tick["velocity"]
+        put_acceleration(x[()], last[()], tick[()], known[()])
+        np.testing.assert_array_equal(x["regressor"][:, -1], 0.0)
 
 
 @pytest.mark.parametrize("is_doubt", [False, True])

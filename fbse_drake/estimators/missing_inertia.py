@@ -8,17 +8,22 @@ import numpy as np
 from numba import njit
 
 from fbse_drake.estimators.records import Record
-from fbse_drake.estimators.whole_body_updates import GATE, NOTICED
+from fbse_drake.estimators.whole_body_updates import GATE, NOTICED, confirmed
+
+# So much of an acceleration has to be read. (More would choose by the reading's noise.)
+_READ = 0.5
 
 
 @njit(cache=True)
-def put_acceleration(x: Record, tick: Record, known: Record) -> None:
+def put_acceleration(x: Record, last: Record, tick: Record, known: Record) -> None:
     """Fills the regressor: the acceleration of a joint, or 0 where that is no more than noise.
 
-    Noise of a velocity is in its innovation as well, and would be learned as inertia.
+    Noise of a velocity is in its innovation as well, and would be learned as inertia; so would that
+    of the forces, which the velocity that is foreseen has, but not the one that is read.
 
     Args:
-        x: record with the `velocity` (r,) where a tick begins.
+        x: record with the `velocity` (r,) where a tick begins, and the `reading` (r,) where it
+            ends; last: with the reading before.
         tick: record with that of the joints where it ends, (n,), and its `duration` [s].
         known: record with the `variance` (r,) of the readings.
     """
@@ -29,7 +34,9 @@ def put_acceleration(x: Record, tick: Record, known: Record) -> None:
         # Without a rotor, a light link is foreseen to move so much that its readings seem noise.
         if factor > GATE**2 * x.bend_noise[row]:
             factor = x.bend_noise[row]
-        accelerates = change**2 > NOTICED**2 * 2.0 * factor * known.variance[row]
+        beyond_noise = change**2 > NOTICED**2 * 2.0 * factor * known.variance[row]
+        read = confirmed(change, x.reading[row] - last.reading[row])
+        accelerates = beyond_noise and read > _READ * abs(change)
         x.regressor[joint, -1] = change / tick.duration if accelerates else 0.0
 
 

@@ -304,7 +304,7 @@ def _expect(
     x, last, tick, known = posterior[()], last[()], tick[()], known[()]
     A = np.ascontiguousarray(tick.inertia)
     linearise(x, tick.velocity, law, shaped, tick.believed)
-    put_acceleration(x, tick, known)
+    put_acceleration(x, last, tick, known)
     expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
     own = own_covariance(x, A, inverse, impulse_covariance(x, tick), tick)
     innovation, S = x.reading - expected, own.copy()
@@ -413,7 +413,7 @@ def _finish(
     tick, velocity_now = tick[()], measured.joint_velocity
     if tick.duration > 0.0:
         linearise(x, tick.velocity, law, shaped, tick.believed)
-        put_acceleration(x, tick, known)
+        put_acceleration(x, last, tick, known)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
         make_dissipative(x, tick.believed)
         make_inertia_possible(x, known)
