@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from fbse_drake.estimators.innovations import AGREEMENT_TIME
+from fbse_drake.estimators.missing_inertia import is_read
 from fbse_drake.estimators.records import Record
 from fbse_drake.estimators.whole_body_updates import DOUBT_TIME, GATE, NOTICED, is_contradicted
 
@@ -29,7 +30,7 @@ def _is_law_contradicted(x: Record, judged: Record, joint: int) -> bool:
 
 
 @njit(cache=True)
-def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
+def learning_states(x: Record, last: Record, T: float, known: Record) -> np.ndarray:
     """Which states are corrected: 1, but 0 for laws of joints that teach nothing, (size,).
 
     A joint whose velocity has not been known from zero for some time says nothing of its law:
@@ -37,16 +38,20 @@ def learning_states(x: Record, last: Record, known: Record) -> np.ndarray:
     law that is known by now nobody knows whether it is the law or what it is learned from. So it is
     where torque keeps being lacking in the joint's row, where innovations are no noise, and in a
     tick whose innovation is an outlier. What contradicts many rows is wrong with the base or with a
-    foot: innovations that are near noise already teach laws that are well known no more.
+    foot: innovations that are near noise already teach laws that are well known no more. And an
+    acceleration that is not read says nothing of an inertia.
 
     Args:
         x: record with the innovations of this tick.
+        T: duration of the tick [s].
     """
     learning, r, (n, m) = np.ones(len(last.covariance)), len(last.velocity), last.weights.shape
     doubted = x.contradiction > x.innovation_variance
     many = doubted.sum() > _MANY * r
     for joint in range(n):
         row = 3 + joint
+        if not is_read(x, last, joint, T):
+            learning[2 * r + m * (joint + 1) - 1] = 0.0
         rests = last.rested[joint] > DOUBT_TIME
         if (
             rests

@@ -15,15 +15,13 @@ _READ = 0.5
 
 
 @njit(cache=True)
-def put_acceleration(x: Record, last: Record, tick: Record, known: Record) -> None:
+def put_acceleration(x: Record, tick: Record, known: Record) -> None:
     """Fills the regressor: the acceleration of a joint, or 0 where that is no more than noise.
 
-    Noise of a velocity is in its innovation as well, and would be learned as inertia; so would that
-    of the forces, which the velocity that is foreseen has, but not the one that is read.
+    Noise of a velocity is in its innovation as well, and would be learned as inertia.
 
     Args:
-        x: record with the `velocity` (r,) where a tick begins, and the `reading` (r,) where it
-            ends; last: with the reading before.
+        x: record with the `velocity` (r,) where a tick begins.
         tick: record with that of the joints where it ends, (n,), and its `duration` [s].
         known: record with the `variance` (r,) of the readings.
     """
@@ -34,10 +32,24 @@ def put_acceleration(x: Record, last: Record, tick: Record, known: Record) -> No
         # Without a rotor, a light link is foreseen to move so much that its readings seem noise.
         if factor > GATE**2 * x.bend_noise[row]:
             factor = x.bend_noise[row]
-        beyond_noise = change**2 > NOTICED**2 * 2.0 * factor * known.variance[row]
-        read = confirmed(change, x.reading[row] - last.reading[row])
-        accelerates = beyond_noise and read > _READ * abs(change)
+        accelerates = change**2 > NOTICED**2 * 2.0 * factor * known.variance[row]
         x.regressor[joint, -1] = change / tick.duration if accelerates else 0.0
+
+
+@njit(cache=True)
+def is_read(x: Record, last: Record, joint: int, T: float) -> bool:
+    """Does a joint's reading follow the acceleration that is its regressor?
+
+    The velocity that is foreseen has the noise of the forces, which would be learned as inertia.
+
+    Args:
+        x: record with the regressor and the `reading` (r,) where a tick ends; last: with that
+            before.
+        T: duration of the tick [s].
+    """
+    change = T * x.regressor[joint, -1]
+    read = confirmed(change, x.reading[3 + joint] - last.reading[3 + joint])
+    return read >= _READ * abs(change)
 
 
 @njit(cache=True)

@@ -304,7 +304,7 @@ def _expect(
     x, last, tick, known = posterior[()], last[()], tick[()], known[()]
     A = np.ascontiguousarray(tick.inertia)
     linearise(x, tick.velocity, law, shaped, tick.believed)
-    put_acceleration(x, last, tick, known)
+    put_acceleration(x, tick, known)
     expected, inverse = implicit_step(x, x.velocity, A, tick.push, tick.duration)
     own = own_covariance(x, A, inverse, impulse_covariance(x, tick), tick)
     innovation, S = x.reading - expected, own.copy()
@@ -349,7 +349,7 @@ def _update(
     x.residual[:] = (tick.push - np.ascontiguousarray(then.inertia) @ change / T)[3:]
     missed = T * T * (inverse**2 @ tick.missed)
     excess, weight, correction = judge(x, last, missed, T, known)
-    learning = learning_states(x, last, known)
+    learning = learning_states(x, last, T, known)
     listen(x, excess, weight, learning, T, known)
     remember_speeds(x, tick.velocity, learning)
     listen_to_feet(x, last, then, measured, learning, T, known)
@@ -413,7 +413,7 @@ def _finish(
     tick, velocity_now = tick[()], measured.joint_velocity
     if tick.duration > 0.0:
         linearise(x, tick.velocity, law, shaped, tick.believed)
-        put_acceleration(x, last, tick, known)
+        put_acceleration(x, tick, known)
         _update(x, last, _tick_of_forces(x, past), tick, measured, known)
         make_dissipative(x, tick.believed)
         make_inertia_possible(x, known)
