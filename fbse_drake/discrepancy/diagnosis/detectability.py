@@ -53,7 +53,7 @@ def _sizes_that_reach(fits: Fits, base: Explanation, effect: type[Effect]) -> di
             )
             result[candidate.targets[0]] = float(
                 np.sqrt(
-                    (fits.needed(s.values.shape[2]) + fits.systematic(s.rows) + candidate.spurious)
+                    (fits.needed(s.parameters) + fits.systematic(s.rows) + candidate.spurious)
                     / max(power, 1e-30)
                 )
             )
@@ -153,7 +153,7 @@ def separation(
     gains = []
     for s in (c.signature for c in fits.fixed_candidates if c.effect is rival):
         # What it adds whatever its parameters are has none to be fitted.
-        size, apart = s.values.shape[2], signal[:, s.rows] - s.offset
+        size, apart = s.parameters, signal[:, s.rows] - s.offset
         right = np.einsum("brp,br->p", s.values, apart)
         gram = fits.regression.products(s, s)[2].sum(axis=0)[:size, :size]
         fitted = float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])

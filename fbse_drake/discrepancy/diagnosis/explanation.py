@@ -72,7 +72,7 @@ class Candidate:
     def fitted_names(self) -> list[str]:
         """Of its columns."""
         names = [*self.linear_names, *self.nonlinear_names]
-        return names[: self.signature.values.shape[2]]
+        return names[: self.signature.parameters]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Explanation:
     def start(self, candidate: Candidate) -> int:
         """Place of a candidate's first parameter."""
         return sum(
-            c.signature.values.shape[2]
+            c.signature.parameters
             for c in itertools.takewhile(lambda c: c is not candidate, self.candidates)
         )
 

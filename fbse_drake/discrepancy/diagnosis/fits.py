@@ -86,7 +86,7 @@ class Alike:
         rows = np.unique(np.concatenate([s.rows for s in signatures]))
         values = []
         for s in signatures:
-            values.append(np.zeros((len(s.values), len(rows), s.values.shape[2])))
+            values.append(np.zeros((len(s.values), len(rows), s.parameters)))
             values[-1][:, np.searchsorted(rows, s.rows)] = s.values
         return Signature(rows, np.concatenate(values, axis=2))
 
@@ -94,7 +94,7 @@ class Alike:
     def shared(self) -> list[np.ndarray]:
         """What makes one value of the values of all, side by side: (members p, p) each. Joints may
         be wrong to either side, for their axes are mirrored or not."""
-        n, p = len(self.members), self.members[0].signature.values.shape[2]
+        n, p = len(self.members), self.members[0].signature.parameters
         either = (1.0, -1.0) if self.members[0].effect.acts_on == "joint" else (1.0,)
         signs = product((1.0,), *[either] * (n - 1))
         return [np.kron(np.array(of_each)[:, None], np.eye(p)) for of_each in signs]
@@ -253,7 +253,7 @@ class Fits:
         if not candidates and not self.always:
             return Explanation((), None, white.sse, white.sse, white.deviance(white.sse))
         fit = self.regression.fit([*(c.signature for c in candidates), *self.always])
-        charge = COMPLEXITY * sum(c.signature.values.shape[2] for c in candidates)
+        charge = COMPLEXITY * sum(c.signature.parameters for c in candidates)
         factor = self.torque_factor(candidates, fit.parameters)
         sse, held_out_sse = fit.sse * factor, fit.held_out_sse * factor
         return Explanation(
@@ -286,7 +286,7 @@ class Fits:
         taken: dict[int, np.ndarray] = {}
         start = 0
         for c in candidates:
-            stop = start + c.signature.values.shape[2]
+            stop = start + c.signature.parameters
             if c in taking:
                 added = c.raw.values @ parameters[start:stop] + c.raw.offset
                 for row, values in zip(c.raw.rows, added.T, strict=True):
@@ -522,7 +522,7 @@ class Fits:
 
     def required(self, candidate: Candidate) -> float:
         """Drop of the deviance that a candidate must bring before it counts."""
-        rows, parameters = candidate.signature.rows, candidate.signature.values.shape[2]
+        rows, parameters = candidate.signature.rows, candidate.signature.parameters
         return float(
             self.threshold[min(12, parameters)] + self.systematic(rows) + candidate.spurious
         )

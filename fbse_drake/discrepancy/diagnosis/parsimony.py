@@ -254,7 +254,7 @@ class Judge:
             rest: the explanation without them.
         """
         gain = self.gain(rest, whole)
-        required = self._fits.needed_drop(sum(c.signature.values.shape[2] for c in members))
+        required = self._fits.needed_drop(sum(c.signature.parameters for c in members))
         plain = gain >= _PLAIN * required and all(
             self._stands_out(rest, whole, member.signature.rows, 1.0)
             and not _is_repeated(rest, member)
@@ -370,7 +370,7 @@ def in_fits(fits: Fits, explanation: Explanation) -> Explanation:
 
 
 def _size(explanation: Explanation) -> int:
-    return sum(c.signature.values.shape[2] for c in explanation.candidates)
+    return sum(c.signature.parameters for c in explanation.candidates)
 
 
 def are_more_than_nothing(explanation: Explanation, members: Sequence[Candidate]) -> bool:

@@ -93,7 +93,7 @@ def _about_found(fits: Fits, members: tuple[Candidate, ...]) -> tuple[Candidate,
     explanation = fits.explain(members)
     moved, start = [], 0
     for candidate in members:
-        size, m = candidate.signature.values.shape[2], len(candidate.nonlinear)
+        size, m = candidate.signature.parameters, len(candidate.nonlinear)
         shift = explanation.solved.parameters[start + size - m : start + size]
         start += size
         if not issubclass(candidate.effect, JointTorqueEffect):
@@ -198,7 +198,7 @@ def _held(candidate: Candidate) -> Candidate:
     s, m = candidate.signature, len(candidate.nonlinear)
     if m == 0 or not issubclass(candidate.effect, JointTorqueEffect):
         return candidate
-    linear = np.arange(s.values.shape[2]) < s.values.shape[2] - m
+    linear = np.arange(s.parameters) < s.parameters - m
     lowest, highest = (np.where(linear, bound, 0.0) for bound in (s.lowest, s.highest))
     return replace(candidate, signature=replace(s, lowest=lowest, highest=highest))
 
@@ -219,7 +219,7 @@ def consistent(
         *(c.signature for c in explanation.candidates),
         fits.white.whiten_signature(fits.dictionary.inertia.signature()),
     ]
-    sizes = [s.values.shape[2] for s in signatures]
+    sizes = [s.parameters for s in signatures]
     weight = 1.0 / np.sqrt(fits.white.scale(explanation.sse))
     X, y = np.zeros((*fits.white.y.shape, sum(sizes))), fits.white.y.copy()
     prior, lowest, free = (
@@ -389,7 +389,7 @@ def _beside_interplay(fits: Fits, explanation: Explanation, left: Residual) -> E
     value = left.value.copy()
     for candidate in (c for c in explanation.candidates if c not in moved):
         raw, start = candidate.raw, explanation.start(candidate)
-        parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
+        parameters = explanation.solved.parameters[start : start + raw.parameters]
         value[:, raw.rows] += raw.values @ parameters + raw.offset
     residual = fits.white.residual
     both = residual.known & left.known

@@ -62,9 +62,9 @@ class Remainder:
             tied: are all rows tied together, by inertia that is fitted along?
         """
         self._regression, self._signatures, self.scale = regression, signatures, scale
-        stops = np.cumsum([s.values.shape[2] for s in signatures], dtype=int)
+        stops = np.cumsum([s.parameters for s in signatures], dtype=int)
         self._slices = [
-            slice(stop - s.values.shape[2], stop) for s, stop in zip(signatures, stops, strict=True)
+            slice(stop - s.parameters, stop) for s, stop in zip(signatures, stops, strict=True)
         ]
         self._parameters = parameters
         groups = [[*range(len(signatures))]] if tied else connected(signatures)
@@ -179,7 +179,7 @@ class Remainder:
         ]
         fitted = np.concatenate(
             [
-                np.arange(len(right)) < s.values.shape[2]
+                np.arange(len(right)) < s.parameters
                 for s, right in zip(signatures, rights, strict=True)
             ]
         )

@@ -62,7 +62,7 @@ class Significance:
     def shares(self, explanation: Explanation, candidate: Candidate) -> np.ndarray:
         """The same in each row of the member's, (r,), NaN for those without a size."""
         start, raw = explanation.start(candidate), candidate.raw
-        parameters = explanation.solved.parameters[start : start + raw.values.shape[2]]
+        parameters = explanation.solved.parameters[start : start + raw.parameters]
         added = rms(raw.values @ parameters + raw.offset, self._known[:, raw.rows])
         sizes = self._sizes[raw.rows]
         measured = np.isfinite(sizes) & np.isfinite(added) & (sizes > 0)
