@@ -6,6 +6,7 @@ from conftest import swinging_legs
 from recorded_arm import ARM
 from test_regression import white_of
 
+from benchmarks.recorded.course import Course, inverse_dynamics
 from fbse_drake import Log
 from fbse_drake.discrepancy.diagnosis import selection
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
@@ -15,6 +16,7 @@ from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals, largest_drop
 from fbse_drake.discrepancy.diagnosis.remainder import Remainder
 from fbse_drake.discrepancy.identification.regression import Regression, Signature
+from fbse_drake.effects.actuation import TorqueBias
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
 
@@ -65,6 +67,33 @@ def test_a_row_that_gains_much_is_not_weighed_down_by_one_that_does_not() -> Non
     residual[:, 0] += 10.0 * columns[:, 0, 0]
     bound, drop = bound_and_drop(residual, columns)
     assert 500 < drop <= bound
+
+
+def test_what_frees_a_member_from_its_bound_may_take_off_all_of_it() -> None:
+    """A joint mostly turns forwards: beside a constant torque it has friction, which would be
+    negative without it and is held at none."""
+    joint, time = ARM.joints[0], ARM.course().time
+    robot = ARM.robot(ARM.by_joint(ARM.rotor_inertia))
+    position, velocity, acceleration = ARM.motion(1, time)
+    position[:, 0] += 1.5 * time
+    velocity[:, 0] += 1.5
+    torque = inverse_dynamics(robot, position, velocity, acceleration)
+    course = Course(time, position, velocity, acceleration, torque)
+    assert 0.5 < np.sign(velocity[:, 0]).mean() < 0.95
+    lost = np.zeros_like(torque)
+    lost[:, 0] = -150.0 + 20.0 * np.tanh(velocity[:, 0] / 0.01)
+    log = ARM.log(course, torque + lost)
+    proposals = Proposals(Fits(Dictionary(ARM.predictor(log), [CoulombFriction, TorqueBias])))
+    both = proposals.fits.explain([])
+    for effect in (TorqueBias, CoulombFriction):
+        both = proposals.beside(both, effect, (joint,))
+    base = proposals.fits.explain([c for c in both.candidates if c.effect is CoulombFriction])
+    assert both.values(both.candidates[-1])[0]["coulomb"] == pytest.approx(20.0, rel=0.02)
+    assert base.values(base.candidates[0])[0]["coulomb"] == 0.0
+    drop = base.deviance - both.deviance
+    assert drop > 1000
+    found = [c for c in proposals.promising(base, None, drop) if c.targets == (joint,)]
+    assert [c.effect for c in found] == [TorqueBias]
 
 
 def test_rivals_may_be_on_those_joints_of_a_group_that_are_free() -> None:

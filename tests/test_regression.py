@@ -254,6 +254,23 @@ def test_what_is_left_for_new_columns_is_that_of_a_wider_fit(tied: bool, across:
 
 
 @pytest.mark.parametrize("tied", [False, True])
+def test_what_a_bound_holds_back_is_what_a_fit_without_it_takes_off_more(tied: bool) -> None:
+    rng = np.random.default_rng(8)
+    columns = rng.normal(size=(400, 1, 2))
+    values = rng.normal(size=(400, ROWS))
+    values[:, 0] += columns[:, 0] @ [-3.0, 2.0]
+    white = white_of(values)
+    found = Regression(white)
+    bounded = Signature(np.array([0]), columns, lowest=np.array([0.0, -np.inf]))
+    held, free = (found.fit([s]) for s in (bounded, Signature(np.array([0]), columns)))
+    beside = Remainder(found, (bounded,), held.parameters, np.ones(ROWS), tied=tied)
+    taken = held.sse[0] - free.sse[0]
+    assert taken > 1000
+    assert beside.beside(0).held_back == pytest.approx(taken, rel=1e-9)
+    assert beside.beside(1).held_back == 0.0
+
+
+@pytest.mark.parametrize("tied", [False, True])
 def test_columns_that_stay_as_they_are_leave_what_their_whitened_copies_leave(tied: bool) -> None:
     """With differenced noise, other in every block, and gaps."""
     rng, blocks = np.random.default_rng(7), 300

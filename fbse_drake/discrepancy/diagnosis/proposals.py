@@ -238,13 +238,21 @@ class Proposals:
     ) -> bool:
         """May a candidate lower the deviance as much as is wanted?
 
+        Beside it members may have values that they may not have without it: friction is none, and
+        not negative, where what it shows beside is missing.
+
         Args:
             alone: what it would take off the sum of squares of each of these rows with values that
-                suit this row best.
+                suit this row best, of what members with any values leave.
         """
         if wanted <= 0:
             return True
-        return largest_drop(self.fits.white, base.sse, rows, [*alone]) > CATCHES_UP * wanted
+        beside = self.fits.remainder(base)
+        most = [
+            of_row + beside.beside(row).held_back
+            for row, of_row in zip(map(int, rows), alone, strict=True)
+        ]
+        return largest_drop(self.fits.white, base.sse, rows, most) > CATCHES_UP * wanted
 
     def _best_on(
         self,

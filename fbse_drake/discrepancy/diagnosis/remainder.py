@@ -28,6 +28,8 @@ class _Beside:
     # is left would change in the parameters.
     root: np.ndarray
     shift: np.ndarray
+    # What that fit would take off the sum of squares, which bounds and beliefs hold back.
+    held_back: float
 
     @cached_property
     def key(self) -> tuple[object, ...]:
@@ -154,18 +156,23 @@ class Remainder:
         there = [k for k, s in enumerate(self._signatures) if row in s.rows]
         signatures = tuple(self._signatures[k] for k in there)
         if not signatures:
-            return _Beside((), np.zeros(0), np.zeros(0, bool), np.zeros((0, 0)), np.zeros(0))
+            return _Beside((), np.zeros(0), np.zeros(0, bool), np.zeros((0, 0)), np.zeros(0), 0.0)
         gram, right, fitted = self._row_moments(row, signatures)
         amounts = np.ones(len(right))
         amounts[fitted] = np.concatenate([self._parameters[self._slices[k]] for k in there])
+        of_fitted, left = gram[np.ix_(fitted, fitted)], right[fitted] - gram[fitted] @ amounts
+
+        def beside(root: np.ndarray, shift: np.ndarray) -> _Beside:
+            held_back = max(0.0, float(2.0 * shift @ left - shift @ of_fitted @ shift))
+            return _Beside(signatures, amounts, fitted, root, shift, held_back)
+
         if there[0] in self._tied_to:
             at = np.concatenate([np.arange(len(self._parameters))[self._slices[k]] for k in there])
             inverse, correction = self._of_group(self._tied_to[there[0]])
             root = _root(inverse[np.ix_(at, at)] / self.scale[row])
-            return _Beside(signatures, amounts, fitted, root, correction[at])
-        root = _inverse_root(gram[np.ix_(fitted, fitted)])
-        left = right[fitted] - gram[fitted] @ amounts
-        return _Beside(signatures, amounts, fitted, root, root @ (root.T @ left))
+            return beside(root, correction[at])
+        root = _inverse_root(of_fitted)
+        return beside(root, root @ (root.T @ left))
 
     def _row_moments(
         self, row: int, signatures: tuple[Signature, ...]
