@@ -5,6 +5,7 @@ The logs come from the equations of motion written down by hand.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -134,3 +135,38 @@ def test_a_joint_without_limits_may_go_round(scenario: Scenario) -> None:
     }
     with pytest.raises(InputError, match="are these degrees"):
         check_sensors(Predictor(scenario, replace(log, channels=log.channels | channels)).motion)
+
+
+def test_what_a_heavy_cart_lacks_may_be_its_mass_or_its_rotor(tmp_path: Path) -> None:
+    """On a level rail both only have to be accelerated."""
+    heavy, lacking, time = 300.0, 130.0, np.arange(0.0, 8.0, PERIOD)
+    limb = '<mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    (tmp_path / "cart.urdf").write_text(
+        f"""<robot name="cart"><link name="stand"><inertial>{limb.format(1)}</inertial></link>
+        <link name="cart"><inertial>{limb.format(heavy)}</inertial></link>
+        <joint name="rail" type="prismatic"><parent link="stand"/><child link="cart"/>
+        <axis xyz="1 0 0"/><limit lower="-3" upper="3" effort="5000" velocity="30"/></joint>
+        </robot>"""
+    )
+    description = tmp_path / "cart.yaml"
+    description.write_text("base: stand\nurdf: cart.urdf\njoints: [rail]\nfixed_base: true\n")
+    believed = Scenario(
+        duration=8.0,
+        robot=RobotConfig(str(description)),
+        recording=RecordingConfig(rows="instantaneous", torque_noise={"all": 5.0}),
+    )
+    rates, sizes = np.array([2.7, 5.9, 11.3]), np.array([0.2, 0.05, 0.01])
+    phase = rates * time[:, None]
+    noise = 5.0 * np.random.default_rng(2).standard_normal(len(time))
+    force = -(heavy + lacking) * (sizes * rates**2 * np.sin(phase)).sum(axis=1) + noise
+    channels = {
+        "joint/position": (sizes * np.sin(phase)).sum(axis=1, keepdims=True),
+        "joint/velocity": (sizes * rates * np.cos(phase)).sum(axis=1, keepdims=True),
+        "joint/torque_command": force[:, None],
+    }
+    log = Log({"time": time, **channels}, {"joints": ["rail"], "period": PERIOD, "sides": []})
+    tried = [library()[name] for name in ("ReflectedInertia", "BodyMass")]
+    (finding,) = diagnose(Predictor(believed, log), tried).chosen
+    assert {finding.effect, *finding.confusable_with} == {"ReflectedInertia", "BodyMass"}
+    (value,) = finding.parameters.values()
+    assert value.value == pytest.approx(lacking, rel=0.01)

@@ -393,3 +393,29 @@ def test_a_good_log_passes_and_a_missing_channel_is_named(walk: tuple[Scenario, 
                 scenario,
                 replace(log, channels={k: v for k, v in log.channels.items() if k != name}),
             )
+
+
+def test_the_larger_noise_of_two_models_is_at_least_that_of_both(
+    walk: tuple[Scenario, Log],
+) -> None:
+    """As matrices, row by row: noise that is differenced moves together from block to block, and
+    what is larger here may be smaller there."""
+    one = Predictor(*walk).residual
+    rng = np.random.default_rng(4)
+    more = 10.0 ** rng.uniform(-1, 1, one.variance.shape[1])
+    doubt = one.variance * rng.uniform(0, 1, one.variance.shape)
+    other = replace(
+        one, variance=more * one.variance + doubt, covariance=more * one.covariance, doubt=doubt
+    )
+    both = one.by_larger_noise(other)
+    assert both.by_larger_noise(one).variance == pytest.approx(both.variance)
+
+    def matrix(residual: Residual, row: int) -> np.ndarray:
+        beside = np.diag(residual.covariance[:-1, row], 1)
+        return np.diag(residual.variance[:, row]) + beside + beside.T
+
+    for row in kinds(one, "joint")[:3] + kinds(one, "base")[:3]:
+        larger = max(one, other, key=lambda residual: residual.noise_floor[row])
+        least = np.linalg.eigvalsh(matrix(both, row) - matrix(larger, row)).min()
+        assert least > -1e-12 * both.variance[:, row].max()
+        assert np.all(both.variance[:, row] >= one.variance[:, row])

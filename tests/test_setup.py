@@ -12,9 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from fbse_drake import InputError, load_scenario
 from fbse_drake.discrepancy.diagnosis.diagnose import diagnose
+from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
 from fbse_drake.discrepancy.diagnosis.experiment import planned_log
+from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
+from fbse_drake.discrepancy.diagnosis.refinement import added
 from fbse_drake.discrepancy.hygiene.hygiene import inspect
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.residual.evidence import HygieneFinding
 from fbse_drake.effects.effect import Effect
 from fbse_drake.effects.geometry import BaseTilt
@@ -278,3 +282,19 @@ def test_a_slope_is_told_by_the_gravity_on_it(slope: tuple[float, float]) -> Non
     np.testing.assert_allclose(again, gravity, atol=1e-12)
     if np.hypot(*slope) < np.pi:
         np.testing.assert_allclose(slope_of_gravity(gravity), slope, atol=1e-12)
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_what_is_left_with_a_tilt_in_the_model_is_measured_by_one_noise(factor: float) -> None:
+    """What a search took for noise before it knew of friction is none in a model that has it, and
+    effects seem to leave more there than without them."""
+    predictor = Predictor(*arm_that_moves(mount=BaseTilt(*TILT)))
+    told = predictor.residual
+    noisier = dataclasses.replace(
+        told, variance=factor * told.variance, covariance=factor * told.covariance
+    )
+    fits = Fits(Dictionary(predictor, [BaseTilt]), WhitenedResidual(noisier))
+    linear = fits.explain(fits.fixed_candidates)
+    final, _, left = added(fits, linear)
+    assert final.sse.sum() == pytest.approx(linear.sse.sum(), rel=0.1)
+    assert (left**2).sum() == pytest.approx(factor * final.sse.sum(), rel=0.02)

@@ -18,6 +18,8 @@ from fbse_drake.robot.plant import PointMass, Robot
 # The model's masses and centres of mass are suspected in bodies heavier than this share of the
 # robot.
 _LIGHT_BODY = 0.01
+# A body may plausibly weigh that much more or less than its model says, as a share of it.
+_PLAUSIBLE_SHARE = 0.25
 # Share of an inertia that may be lost in rounding.
 _ROUNDING = 1e-9
 
@@ -160,6 +162,14 @@ class BodyMass(InertiaEffect):
     }
 
     mass: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def parameters_on(cls, robot: Robot, target: str) -> dict[str, Parameter]:
+        """A body that is most of a heavy machine may be wrong by a share of what it weighs."""
+        parameters = super().parameters_on(robot, target)
+        most = _PLAUSIBLE_SHARE * robot.body(target).default_mass()
+        high = max(parameters["mass"].plausible[1], most)
+        return {"mass": replace(parameters["mass"], plausible=(-high, high))}
 
     @classmethod
     def lowest_values(cls, robot: Robot, target: str) -> np.ndarray:

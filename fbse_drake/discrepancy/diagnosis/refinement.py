@@ -347,7 +347,9 @@ def beside_model(
 
 @dataclass(frozen=True)
 class _InModel:
-    """What is left when effects are in the model, with as many squares as before, (R,)."""
+    """What is left when effects are in the model, whitened by the noise that is measured then; and
+    its squares, (R,): as many as before, by the noise that was measured before where that is
+    larger."""
 
     residual: Residual
     white: WhitenedResidual
@@ -356,10 +358,10 @@ class _InModel:
 
 def _in_model(fits: Fits, explanation: Explanation) -> _InModel:
     residual = _predictor_with(fits, explanation.effects).residual
-    white = WhitenedResidual(residual)
-    share = fits.white.count / np.maximum(white.count, 1)
+    compared = WhitenedResidual(residual.by_larger_noise(fits.white.residual))
+    share = fits.white.count / np.maximum(compared.count, 1)
     factor = fits.torque_factor(explanation.candidates, explanation.solved.parameters)
-    return _InModel(residual, white, white.sse * share * factor)
+    return _InModel(residual, WhitenedResidual(residual), compared.sse * share * factor)
 
 
 def _predictor_with(fits: Fits, found: Sequence[Effect]) -> Predictor:

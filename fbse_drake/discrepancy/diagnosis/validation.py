@@ -1,15 +1,14 @@
 """Errors of models: is a completed one better on data that was set aside before anything was looked
 at?
 
-Both models are put against the same blocks, whitened by the same noise, so that what both do not
-know cancels in the change of the error: row by row by that of the one which passes on more of the
-sensors' noise, as one with more inertia or softer ground does, which would seem worse otherwise.
+Both models are put against the same blocks, whitened by the same noise (see
+`Residual.by_larger_noise`), so that what both do not know cancels in the change of the error.
 (Unwhitened, noise that is differentiated would drown what is slow.) Its intervals are those of a
 ratio of sums by batch means: consecutive blocks are taken together until their sums are hardly
 correlated (with B blocks, a multiple of sqrt(B) at a time; Flegal and Jones 2010).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -107,16 +106,8 @@ def validated(given: Predictor, completed: Predictor, level: float = LEVEL) -> V
         level: of the intervals.
     """
     first, last, n = given.residual, completed.residual, len(given.robot.joint_names)
-    known = first.known & last.known
-    more = rms(np.sqrt(last.variance), known) > rms(np.sqrt(first.variance), known)
-    white = WhitenedResidual(
-        replace(
-            first,
-            known=known,
-            variance=np.where(more, last.variance, first.variance),
-            covariance=np.where(more, last.covariance, first.covariance),
-        )
-    )
+    white = WhitenedResidual(first.by_larger_noise(last))
+    known = white.residual.known
     before, after = (
         (values**2).sum(axis=1)
         for values in (

@@ -54,6 +54,24 @@ class Residual:
         """What is left when a prediction (B, R) is taken off."""
         return replace(self, value=self.value - predicted)
 
+    def by_larger_noise(self, other: "Residual") -> "Residual":
+        """The same where both are known, with the larger noise of both in every block.
+
+        What two models leave is compared by one noise. One with more inertia or softer ground
+        passes on more of the sensors' noise, and would seem worse otherwise; and where friction was
+        taken off, what was noise of the torque before is none any more.
+        """
+        known = self.known & other.known
+        mine, others = (rms(np.sqrt(r.variance), known) for r in (self, other))
+        return replace(
+            self,
+            known=known,
+            variance=np.maximum(self.variance, other.variance),
+            # Its noise moves together in blocks as that of the one that has more of it.
+            covariance=np.where(others > mine, other.covariance, self.covariance),
+            doubt=np.where(other.variance > self.variance, other.doubt, self.doubt),
+        )
+
 
 def rms(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Root mean square over the first axis where known; NaN where nothing is."""
