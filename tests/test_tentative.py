@@ -20,10 +20,12 @@ from fbse_drake.discrepancy.diagnosis.diagnose import (
     diagnosis_json,
 )
 from fbse_drake.discrepancy.diagnosis.dictionary import Dictionary
+from fbse_drake.discrepancy.diagnosis.explanation import Candidate
 from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.naming import is_named
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.refinement import converged
+from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import leftover_structure
 from fbse_drake.effects.effect import library
 from fbse_drake.report.sentences import diagnosis_outcome
@@ -125,3 +127,24 @@ def test_a_hump_that_takes_less_than_is_left_is_not_named(stranger: float):
     (member,) = final.candidates
     left = leftover_structure(predictor.motion, fits.white, fits.leftover(final))
     assert is_named(proposals, final, member, nothing, left) == (stranger == 1.0)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.3, False), (0.7, True), (10.0, True)])
+def test_play_that_would_rather_be_less_than_any_that_is_sought_is_not_named(
+    share: float, expected: bool
+):
+    """The smallest gap that is tried is half the least that is plausible."""
+    play, course = library()["Backlash"], MACHINE.course(1)
+    predictor = MACHINE.predictor(MACHINE.log(course))
+    dictionary, clean = Dictionary(predictor, [play]), predictor.residual
+    least = dictionary.parameters(play, "axis_1")["gap"].plausible[0]
+
+    def with_gap(fits: Fits, gap: float) -> Candidate:
+        values = np.array([gap, MACHINE.rotor_inertia[0], 1e-3])
+        return fits.candidate(play, ("axis_1",), values, fits.remainder(fits.explain([])))
+
+    there = replace(clean, value=clean.value.copy())
+    there.value[:, 0] += with_gap(Fits(dictionary), share * least).raw.offset[:, 0]
+    fits = Fits(dictionary, WhitenedResidual(there))
+    member, nothing = with_gap(fits, max(0.5, share) * least), fits.explain([])
+    assert is_named(Proposals(fits), fits.explain([member]), member, nothing, []) == expected

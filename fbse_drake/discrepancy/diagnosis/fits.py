@@ -1,6 +1,7 @@
 """Fits of explanations to one residual: how well effects explain it together, and what they
 leave."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -42,6 +43,8 @@ _SPURIOUS = 3.0
 # factors of them.
 _SLOPE_STEP = 0.02
 _NEARBY = (0.4, 1.6)
+# They are sought that many times beyond the ends of their plausible ranges.
+_BEYOND = 2.0
 # So many explanations are kept, and so many numbers in columns.
 _KEPT = 500
 _MOST_NUMBERS = 5_000_000
@@ -580,6 +583,12 @@ def _beliefs(
     }
 
 
+def is_smallest(parameter: Parameter, value: float) -> bool:
+    """Is a nonlinear value the smallest that is sought?"""
+    smallest = parameter.plausible[0] / _BEYOND
+    return value < smallest or math.isclose(value, smallest, rel_tol=1e-6)
+
+
 def _nearby(
     parameters: Mapping[str, Parameter], nonlinear: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -587,6 +596,6 @@ def _nearby(
     not far beyond their plausible ranges either."""
     ranges = np.array([p.plausible for p in parameters.values() if not p.linear]).reshape(-1, 2)
     least, most = (factor * nonlinear for factor in _NEARBY)
-    down = np.maximum(least, 0.5 * ranges[:, 0]) - nonlinear
-    up = np.minimum(most, 2.0 * ranges[:, 1]) - nonlinear
+    down = np.maximum(least, ranges[:, 0] / _BEYOND) - nonlinear
+    up = np.minimum(most, ranges[:, 1] * _BEYOND) - nonlinear
     return np.minimum(down, 0.0), np.maximum(up, 0.0)

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from fbse_drake.discrepancy.diagnosis.explanation import Candidate, Explanation
+from fbse_drake.discrepancy.diagnosis.fits import is_smallest
 from fbse_drake.discrepancy.diagnosis.parsimony import with_smaller_law
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
 from fbse_drake.discrepancy.identification.structure import Structure, tolerated
 from fbse_drake.effects.actuation import TorqueReadingLag
+from fbse_drake.effects.effect import Parameter
 
 # A member that takes less than this share of what exceeds the noise in its rows without it is
 # tentative: it leaves more than it takes.
@@ -74,12 +76,14 @@ def _takes_most(
 
 def _may_be_none(final: Explanation, member: Candidate) -> bool:
     """Does the interval of a size without which there is no effect hold zero, as a gap's may, or
-    the mass of a payload?"""
-    _, intervals = final.values(member)
-    return any(
-        parameter.neutral == 0.0 and intervals[name][0] <= 0.0 <= intervals[name][1]
-        for name, parameter in member.parameters.items()
-    )
+    the mass of a payload? So it does where less than the smallest that is sought would fit."""
+    values, intervals = final.values(member)
+
+    def may_be_zero(name: str, parameter: Parameter) -> bool:
+        low, high = intervals[name]
+        return low <= 0.0 <= high or is_smallest(parameter, values[name])
+
+    return any(p.neutral == 0.0 and may_be_zero(name, p) for name, p in member.parameters.items())
 
 
 def _is_more_than_smaller(
