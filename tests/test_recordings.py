@@ -92,8 +92,9 @@ def test_outcomes(tmp_path: Path, said: dict, expected: str) -> None:
 
 
 def test_what_a_link_has_is_said_of_its_joint_and_the_other_way_round(tmp_path: Path) -> None:
-    """About a vertical axis a centre of mass elsewhere is nothing but an inertia, as a rotor's; and
-    where a joint's zero is off, the weight of its link is elsewhere."""
+    """About a vertical axis a centre of mass elsewhere is nothing but an inertia, as a rotor's;
+    where a joint's zero is off, the weight of its link is elsewhere; and in a joint to which
+    gravity has one direction only a mount that is askew may be a counterbalance."""
     drawn = record(5, tmp_path)
     for has, at, named, target, confusable, expected in (
         ("BodyCentreOfMass", "link_1", "ReflectedInertia", "joint_1", "BodyCentreOfMass", "right"),
@@ -102,6 +103,9 @@ def test_what_a_link_has_is_said_of_its_joint_and_the_other_way_round(tmp_path: 
         ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_2", "EncoderOffset", "right"),
         ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_1", "EncoderOffset", "wrong"),
         ("EncoderOffset", "joint_2", "BodyCentreOfMass", "link_2", "JointSpring", "wrong"),
+        ("BaseTilt", "robot", "Counterbalance", "joint_2", "BaseTilt", "right"),
+        ("BaseTilt", "robot", "Counterbalance", "joint_2", "JointSpring", "wrong"),
+        ("TorqueBias", "joint_1", "JointSpring", "joint_2", "TorqueBias", "wrong"),
     ):
         hidden = (Hidden((has,), (at,)),)
         one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
@@ -143,14 +147,14 @@ def test_a_loss_is_as_large_as_it_is_said_to_be() -> None:
     assert met == laws
 
 
-@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029, 17013, 17034, 20036])
+@pytest.mark.parametrize("number", [10, 17, 232, 4045, 6004, 6029, 17013, 17034, 20036, 7331, 7405])
 def test_what_was_wrong_once(tmp_path: Path, number: int) -> None:
     """Nothing hidden, and angles alone that nobody tells the noise of; filtered velocities whose
     torques have the noise that is told; the same where nobody tells it; a centre of mass of which
     only the moment about one axis shows; a drag in one joint of two; friction that follows the load
     of a link that is too light in the model, by torques in coarse steps; two joints that stick more
     than they slide, by other humps than the library's; a mount that is askew about an axis that
-    shows."""
+    shows; a bias beside friction that would be negative without it; and a mass on a slide."""
     drawn = record(number, tmp_path)
     found = diagnose(Predictor(drawn.scenario, drawn.log))
     assert outcome(drawn, diagnosis_json(found)) == "right"

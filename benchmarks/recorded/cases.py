@@ -146,17 +146,19 @@ def judge(material: Material) -> dict[str, str]:
 def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
     """How a recording's diagnosis is: right if everything that shows is named and nothing else.
 
-    What the whole robot has may be declared confusable with what a joint has: a mount's tilt is an
-    encoder offset of a joint that is level.
+    What the whole robot has may be declared confusable with what a joint has, and the other way
+    round: a mount's tilt is an encoder offset of a joint that is level, and a spring or a
+    counterbalance of one that shows no other direction of gravity.
     """
     truth = recording.truth
     everywhere = set().union(*truth.values())
+    of_robot = {name for h in recording.hidden if "robot" in h.targets for name in h.names}
     chosen = [finding for finding in diagnosis["ranking"] if finding["chosen"]]
 
     def is_right(finding: Mapping[str, Any], target: str) -> bool:
         said = {finding["effect"], *finding["confusable_with"]}
-        there = everywhere if target == "robot" else truth.get(target, set())
-        return bool(said & there)
+        there = truth.get(target, set()) | of_robot
+        return bool(said & (everywhere if target == "robot" else there))
 
     wrong = [f for f in chosen if not all(is_right(f, target) for target in f["joints"])]
     if wrong:
