@@ -113,6 +113,19 @@ def test_what_a_link_has_is_said_of_its_joint_and_the_other_way_round(tmp_path: 
         assert outcome(one, said) == expected
 
 
+@pytest.mark.parametrize(("place", "expected"), [("joint_2", "right"), ("joint_3", "wrong")])
+def test_what_is_declared_confusable_may_be_elsewhere(
+    tmp_path: Path, place: str, expected: str
+) -> None:
+    """Where a joint's zero is off, the next link weighs elsewhere as well."""
+    drawn = record(5, tmp_path)
+    hidden = (Hidden(("EncoderOffset",), ("joint_2",)),)
+    one = Recording(drawn.machine, drawn.recorder, hidden, drawn.scenario, drawn.log)
+    said = diagnosis("effect_found", ("BodyCentreOfMass", ["link_3"], ["EncoderOffset"]))
+    rival = {**said["ranking"][0], "effect": "EncoderOffset", "joints": [place], "chosen": False}
+    assert outcome(one, said | {"ranking": [*said["ranking"], rival]}) == expected
+
+
 def test_what_does_not_show_is_not_missed(tmp_path: Path) -> None:
     """What would show in sizes of 0.1 in two joints does not in others, nor if it is smaller."""
     drawn = record(5, tmp_path)

@@ -158,7 +158,15 @@ def outcome(recording: Recording, diagnosis: Mapping[str, Any]) -> Outcome:
     def is_right(finding: Mapping[str, Any], target: str) -> bool:
         said = {finding["effect"], *finding["confusable_with"]}
         there = truth.get(target, set()) | of_robot
-        return bool(said & (everywhere if target == "robot" else there))
+        if said & (everywhere if target == "robot" else there):
+            return True
+        # It may be declared confusable with another effect elsewhere, which then is listed.
+        return any(
+            listed["effect"] in finding["confusable_with"]
+            and all(listed["effect"] in truth.get(place, ()) for place in listed["joints"])
+            for listed in diagnosis["ranking"]
+            if not listed["chosen"]
+        )
 
     wrong = [f for f in chosen if not all(is_right(f, target) for target in f["joints"])]
     if wrong:
