@@ -28,8 +28,9 @@ _UNEVEN = 0.01
 _SMOOTHING = 0.005
 # How much of the way in which forces change the other sensors must explain to tell their delay.
 _EXPLAINED = 0.9
-# The logarithm of how likely a delay is at least (one in a thousand), for it may begin at any time.
-_LEAST_LIKELY = -math.log(1000.0)
+# The logarithm of how likely a delay is at least (one in a thousand), for it may begin at any time;
+# and of how likely one is in whose place another has shown (one in a hundred thousand).
+_LEAST_LIKELY, _LEAST_USUAL = -math.log(1.0e3), -math.log(1.0e5)
 # How much likelier than any other a delay must be by what is counted to be one that shows, as the
 # logarithm of the ratio, and for how long it counts what has shown [s].
 _SHOWN, _USUAL_TIME = 3.0, 2.0
@@ -196,13 +197,15 @@ def watch_force_delay(
     alike = 1.0 + 2.0 * _SMOOTHING / period
     likelihood, now = x.likelihood[:, :delays], round(x.delay / period)
     doubled = 2.0 * variance * alike
+    usual = _usual_delay(x.usual[:delays], mismatch, doubled, elapsed, now)
+    least = _LEAST_USUAL if usual >= 0 and abs(now - usual) <= 1 else _LEAST_LIKELY
     for way in range(2):
         largest = -math.inf
         for late in range(delays):
             likelihood[way, late] -= off[way, late] / doubled
             largest = max(largest, likelihood[way, late])
         for late in range(delays):
-            likelihood[way, late] = max(_LEAST_LIKELY, likelihood[way, late] - largest)
+            likelihood[way, late] = max(least, likelihood[way, late] - largest)
     best = 0
     for late in range(1, delays):
         if likelihood[0, late] + likelihood[1, late] > likelihood[0, best] + likelihood[1, best]:
@@ -211,7 +214,6 @@ def watch_force_delay(
     # as in the other.
     is_likelier = likelihood[0, best] > likelihood[0, now]
     is_likelier = is_likelier and likelihood[1, best] > likelihood[1, now]
-    usual = _usual_delay(x.usual[:delays], mismatch, doubled, elapsed, now)
     if is_likelier and mismatch[best] < (1.0 - _EXPLAINED) * push_square:
         # At the longest delay the true one may be longer, and nobody knows it.
         x.delay = best * period if best < last else 0.0
