@@ -21,6 +21,7 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable
+from fbse_drake.discrepancy.diagnosis.search import in_its_parts
 from fbse_drake.discrepancy.diagnosis.selection import (
     best_additions,
     is_disbelieved,
@@ -586,6 +587,29 @@ def test_what_a_large_effect_leaves_over_is_noise(hidden: str) -> None:
     assert [f.effect for f in diagnosis.chosen] == [hidden[1:].split()[0]]
     assert not diagnosis.unexplained
     assert diagnosis.held_out_after < 1.1 < 5.0 < diagnosis.held_out_before
+
+
+@pytest.mark.parametrize(
+    ("hidden", "expected"),
+    [
+        ("!BodyMass {mass: {left_foot: 3.5}}", "BodyMass"),
+        ("!Payload {mass: {left_foot: 2.0}, x: {left_foot: 0.06}}", "Payload"),
+    ],
+)
+def test_a_payload_is_compared_with_a_mass_where_a_foot_lands_as_hard_as_it_is_heavy(
+    hidden: str, expected: str
+) -> None:
+    """That is in the model; made linear, a payload takes some of what smoothed accelerations do not
+    tell of an impact."""
+    effects = [library()[name] for name in ("BodyMass", "Payload")]
+    proposals = Proposals(Fits(Dictionary(Predictor(scenario(), log_with(hidden)), effects)))
+    fits, nothing = proposals.fits, proposals.fits.explain([])
+    (payload,) = (
+        c for c in fits.fixed_candidates if (c.name, c.targets) == ("Payload", ("left_foot",))
+    )
+    explanation = fits.explain([proposals.settled(payload, nothing)])
+    (member,) = in_its_parts(proposals, explanation).candidates
+    assert member.name == expected
 
 
 def test_a_ripple_is_not_seen_in_a_joint_that_stands_still() -> None:
