@@ -21,7 +21,7 @@ from fbse_drake.discrepancy.diagnosis.fits import Fits
 from fbse_drake.discrepancy.diagnosis.prediction import Predictor
 from fbse_drake.discrepancy.diagnosis.proposals import Proposals
 from fbse_drake.discrepancy.diagnosis.rivals import indistinguishable
-from fbse_drake.discrepancy.diagnosis.search import in_its_parts
+from fbse_drake.discrepancy.diagnosis.search import simplified_in_model
 from fbse_drake.discrepancy.diagnosis.selection import (
     best_additions,
     is_disbelieved,
@@ -608,7 +608,7 @@ def test_a_payload_is_compared_with_a_mass_where_a_foot_lands_as_hard_as_it_is_h
         c for c in fits.fixed_candidates if (c.name, c.targets) == ("Payload", ("left_foot",))
     )
     explanation = fits.explain([proposals.settled(payload, nothing)])
-    (member,) = in_its_parts(proposals, explanation).candidates
+    (member,) = simplified_in_model(proposals, explanation).candidates
     assert member.name == expected
 
 

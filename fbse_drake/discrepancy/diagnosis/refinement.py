@@ -301,14 +301,15 @@ def added(fits: Fits, explanation: Explanation) -> tuple[Explanation, WhitenedRe
         if fits.white.deviance(again.sse) > fits.white.deviance(inside.sse) - MARGIN:
             break
         explanation, inside = corrected, again
+    white = WhitenedResidual(inside.residual)
     return (
         replace(
             explanation,
             sse=inside.sse,
             held_out_sse=inside.sse + explanation.held_out_sse - explanation.sse,
         ),
-        inside.white,
-        inside.white.y,
+        white,
+        white.y,
     )
 
 
@@ -347,21 +348,19 @@ def beside_model(
 
 @dataclass(frozen=True)
 class _InModel:
-    """What is left when effects are in the model, whitened by the noise that is measured then; and
-    its squares, (R,): as many as before, by the noise that was measured before where that is
-    larger."""
+    """What is left when effects are in the model, and its squares, (R,): as many as before, by the
+    noise that was measured before where that is larger."""
 
     residual: Residual
-    white: WhitenedResidual
     sse: np.ndarray
 
 
 def _in_model(fits: Fits, explanation: Explanation) -> _InModel:
     residual = _predictor_with(fits, explanation.effects).residual
-    compared = WhitenedResidual(residual.by_larger_noise(fits.white.residual))
-    share = fits.white.count / np.maximum(compared.count, 1)
+    white = WhitenedResidual(residual.by_larger_noise(fits.white.residual))
+    share = fits.white.count / np.maximum(white.count, 1)
     factor = fits.torque_factor(explanation.candidates, explanation.solved.parameters)
-    return _InModel(residual, WhitenedResidual(residual), compared.sse * share * factor)
+    return _InModel(residual, white.sse * share * factor)
 
 
 def _predictor_with(fits: Fits, found: Sequence[Effect]) -> Predictor:

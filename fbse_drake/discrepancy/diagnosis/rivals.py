@@ -6,7 +6,7 @@ looks worse than the bias that it resembles. So a rival is fitted by itself, non
 and all, before it is compared.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -71,22 +71,34 @@ def in_parts(proposals: Proposals, final: Explanation) -> dict[int, list[Explana
     """
     fits, found = proposals.fits, {}
     for k, member in enumerate(final.candidates):
-        parts = member.effect.parts if issubclass(member.effect, InertiaEffect) else ()
-        others = [c for c in final.candidates if c is not member]
         pairs: list[Explanation] = []
-        for part in fits.fixed_candidates:
-            if part.effect not in parts or part.targets != member.targets:
-                continue
-            base = fits.explain([*others, proposals.settled(part, fits.explain(others))])
+        for base in with_parts(proposals, final, member):
             most = final.deviance + fits.threshold[-1]
             for wider in best_additions(proposals, base, member.signature.rows, most):
-                if wider.candidates[-1].effect in (*parts, member.effect):
+                *_, added = wider.candidates
+                if added.effect is member.effect or added.effect in _parts(member):
                     continue
                 pair = fitted(fits, wider)
                 *rest, one, other = pair.candidates
                 pairs += [pair, fits.explain([*rest, other, one])]
         found[k] = pairs
     return found
+
+
+def with_parts(
+    proposals: Proposals, final: Explanation, member: Candidate
+) -> Iterator[Explanation]:
+    """Explanations with a simpler effect on the same body, which comes last, in the place of a
+    member that can do much, as a payload can."""
+    fits = proposals.fits
+    others = [c for c in final.candidates if c is not member]
+    for part in fits.fixed_candidates:
+        if part.effect in _parts(member) and part.targets == member.targets:
+            yield fits.explain([*others, proposals.settled(part, fits.explain(others))])
+
+
+def _parts(member: Candidate) -> tuple[type[InertiaEffect], ...]:
+    return member.effect.parts if issubclass(member.effect, InertiaEffect) else ()
 
 
 def rival_name(rival: Candidate, member: Candidate) -> str:

@@ -29,7 +29,13 @@ from fbse_drake.discrepancy.diagnosis.refinement import (
     remeasured,
     with_slopes,
 )
-from fbse_drake.discrepancy.diagnosis.rivals import in_parts, indistinguishable, rivals, settled
+from fbse_drake.discrepancy.diagnosis.rivals import (
+    in_parts,
+    indistinguishable,
+    rivals,
+    settled,
+    with_parts,
+)
 from fbse_drake.discrepancy.diagnosis.selection import select
 from fbse_drake.discrepancy.identification.inertial import IdentifiedInertia
 from fbse_drake.discrepancy.identification.regression import WhitenedResidual
@@ -45,7 +51,6 @@ from fbse_drake.discrepancy.identification.untold_noise import likeliest_noise
 from fbse_drake.discrepancy.residual.noise import Noise
 from fbse_drake.effects.actuation import TorqueReadingLag
 from fbse_drake.effects.effect import Effect
-from fbse_drake.effects.inertia import InertiaEffect
 from fbse_drake.progress import Interrupted, Progress
 
 # Where torques are read earlier, the error may be so many times as large: noise is measured anew.
@@ -395,13 +400,13 @@ def _settled_and_frugal(
         smaller = frugal(proposals, final)
         if smaller.deviance > explanation.deviance + MARGIN:
             smaller = explanation
-    smaller = in_its_parts(proposals, without_stand_ins(proposals.fits, smaller))
+    smaller = simplified_in_model(proposals, without_stand_ins(proposals.fits, smaller))
     found = found if smaller is final else rivals(proposals, smaller)
     pairs = in_parts(proposals, smaller)
     return smaller, {k: [*of_member, *pairs[k]] for k, of_member in found.items()}
 
 
-def in_its_parts(proposals: Proposals, final: Explanation) -> Explanation:
+def simplified_in_model(proposals: Proposals, final: Explanation) -> Explanation:
     """An explanation with a part of a member that can do much in its place, as the mass of a body
     in that of a payload, where this explains as much when it is in the model.
 
@@ -410,19 +415,18 @@ def in_its_parts(proposals: Proposals, final: Explanation) -> Explanation:
     """
     fits = proposals.fits
 
-    def lost(explanation: Explanation) -> float:
+    def in_model(explanation: Explanation) -> float:
         return fits.white.deviance(added(fits, explanation)[0].sse)
 
     for member in final.candidates:
-        parts = member.effect.parts if issubclass(member.effect, InertiaEffect) else ()
-        for part in fits.fixed_candidates:
-            if part.effect not in parts or part.targets != member.targets:
-                continue
-            others = fits.explain([c for c in final.candidates if c is not member])
-            simpler = fits.explain([*others.candidates, proposals.settled(part, others)])
-            more = len(final.solved.parameters) - len(simpler.solved.parameters)
-            if lost(simpler) < lost(final) + fits.threshold[min(12, more)]:
-                final = simpler
+        simpler = [*with_parts(proposals, final, member)]
+        if not simpler:
+            continue
+        deviance, parameters = in_model(final), len(final.solved.parameters)
+        for explanation in simpler:
+            more = parameters - len(explanation.solved.parameters)
+            if in_model(explanation) < deviance + fits.threshold[min(12, more)]:
+                final = explanation
                 break
     return final
 
